@@ -1,0 +1,63 @@
+"""The benchmark's constants, in one place: objects and their split, views, working range, units.
+
+Sources: paper Section 3 (50 objects, 6 views by 60 degrees, 80/10/10 split by object, range 1.5-2.1 m) and the public
+list of its objects. Which object stands in which split is ours, fixed here, with the four objects that the paper's
+test figures show in test.
+"""
+
+SCHEMA_VERSION = "1.0.0"
+
+MM_PER_M = 1000.0
+GREY_LEVELS = 255
+
+WORKING_RANGE_MM = (1500.0, 2100.0)
+STANDOFF_M = 1.8
+BACKGROUND_M = 3.2
+
+SPLITS = ("train", "validation", "test")
+PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
+
+VIEW_DEGREES = (0, 60, 120, 180, 240, 300)
+VIEWS = tuple(f"A{degrees}" for degrees in VIEW_DEGREES)
+
+YCB_OBJECTS = (
+    "master_chef_can", "cracker_box", "sugar_box", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "pudding_box",
+    "gelatin_box", "potted_meat_can", "banana", "pitcher", "bleach_cleanser", "bowl", "mug", "power_drill",
+    "wood_block", "scissors", "marker", "large_clamp",
+)  # fmt: skip
+WAREHOUSE_OBJECTS = (
+    "eyeglasses", "open_book", "spray_bottle", "cleaning_bucket", "container_bottle", "container_tin", "vial",
+    "lighting_candles", "magazine_stack", "wooden_boards", "paint_container_bottle", "paint_container_jar",
+    "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
+    "paint_brush", "paint_brush_large", "pallet_knife", "pallet_knife_large", "spraygun", "paint_thinner", "battery",
+    "battery_case", "chalk_stick", "pen", "cork", "clamp", "boxcutter", "hammer", "duct_tape",
+)  # fmt: skip
+OBJECTS = YCB_OBJECTS + WAREHOUSE_OBJECTS
+
+VALIDATION_OBJECTS = ("mustard_bottle", "mug", "paint_brush_large", "paint_container_jar", "spraygun")
+TEST_OBJECTS = ("power_drill", "magazine_stack", "container_bottle", "wooden_boards", "large_clamp")
+
+# The mini preset: every split, both test figures' extremes (a concave union and the deepest object), six objects.
+MINI_OBJECTS = ("bowl", "cracker_box", "banana", "mug", "power_drill", "wooden_boards")
+MINI_SIZE = 480
+FULL_SIZE = 960
+
+
+def split_of(name: str) -> str:
+    """Split of one of the 50 objects: ``train``, ``validation`` or ``test``."""
+    if name in TEST_OBJECTS:
+        return "test"
+    return "validation" if name in VALIDATION_OBJECTS else "train"
+
+
+def sample_name(name: str, view: str) -> str:
+    """``{object}_{view}``, the stem of every file of a sample (published layout)."""
+    return f"{name}_{view}"
+
+
+def split_sample_name(sample: str) -> tuple[str, str]:
+    """Object and view of a sample name, cut at the LAST underscore: object names hold underscores themselves."""
+    name, _, view = sample.rpartition("_")
+    if not name or not view:
+        raise ValueError(f"expected a sample name like 'power_drill_A60', got {sample!r}")
+    return name, view

@@ -1,0 +1,56 @@
+"""What can go wrong, as one small tree.
+
+::
+
+    FppBenchError                 anything this package refuses; commands print it and exit with status 2
+    ├── RigError                  a rig file or rig value that is no usable camera-projector pair
+    ├── DecodeError               frames that can't be decoded at all (shape, dtype, missing frames)
+    ├── MeshError                 a mesh that can't be read, is empty, or does not fit the working range
+    ├── DatasetError              a dataset folder that is absent, incomplete, damaged or of another version
+    │   ├── LayoutError           a published tree that breaks a rule of its layout
+    │   └── BuildError            a build that can't start or go on (locked, other settings, disk full)
+    ├── PredictionError           predictions that can't be scored: missing, extra, mis-shaped, not finite
+    └── SubmissionError           a submission.yaml or result file that does not say what it must
+
+A message says what was expected, what came, in which file or sample, and what to do.
+"""
+
+
+class FppBenchError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class RigError(FppBenchError, ValueError):
+    """A rig that is no usable camera-projector pair."""
+
+
+class DecodeError(FppBenchError, ValueError):
+    """Frames that can't be decoded at all."""
+
+
+class MeshError(FppBenchError, ValueError):
+    """A mesh that can't be read, is empty, or does not fit the working range."""
+
+
+class DatasetError(FppBenchError):
+    """A dataset folder that is absent, incomplete, damaged or of another version."""
+
+
+class LayoutError(DatasetError):
+    """A published tree that breaks a rule of its layout."""
+
+
+class BuildError(DatasetError):
+    """A build that can't start or can't go on."""
+
+
+class PredictionError(FppBenchError, ValueError):
+    """Predictions that can't be scored; ``problems`` holds one line for each offender."""
+
+    def __init__(self, summary: str, problems: list[str] | None = None) -> None:
+        self.problems = problems or []
+        super().__init__("\n  ".join([summary, *self.problems]))
+
+
+class SubmissionError(FppBenchError, ValueError):
+    """A submission description or result file that does not say what it must."""

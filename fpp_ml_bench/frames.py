@@ -1,0 +1,109 @@
+"""The projected sequence: which frame is which, and which frames a configuration needs.
+
+The order is the paper's (Section 3.2): N horizontal sinusoids, N vertical sinusoids, horizontal Gray code, vertical
+Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52 frames. *Horizontal* fringes have horizontal stripes: they vary
+along the projector's rows and measure its coordinate ``v``. *Vertical* fringes vary along its columns and measure ``u``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+Direction = Literal["horizontal", "vertical"]
+Kind = Literal["sinusoid", "gray", "black", "white"]
+
+DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
+CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One projected frame: ``step`` is n of a sinusoid (phase shift 2 pi n / N) or the Gray bit, most significant 0."""
+
+    index: int
+    kind: Kind
+    direction: Direction | None = None
+    step: int = 0
+
+    @property
+    def column(self) -> str:
+        """Name of this frame's dataset column."""
+        return f"frame_{self.index:02d}"
+
+    @property
+    def title(self) -> str:
+        """What a person reads under the picture."""
+        if self.kind == "sinusoid":
+            return f"{self.index}: {self.direction} sinusoid, step {self.step}"
+        return f"{self.index}: {self.direction} Gray bit {self.step}" if self.kind == "gray" else f"{self.index}: {self.kind}"
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The frames of one capture: ``steps`` sinusoids a direction and ``bits`` Gray-code frames a direction."""
+
+    steps: int = 18
+    bits_horizontal: int = 7
+    bits_vertical: int = 7
+
+    def __post_init__(self) -> None:
+        if self.steps < 3:
+            raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
+        if min(self.bits_horizontal, self.bits_vertical) < 1 or max(self.bits_horizontal, self.bits_vertical) > 15:
+            raise ValueError(
+                f"Gray bits must be 1 to 15 a direction, got {self.bits_horizontal} horizontal, {self.bits_vertical} vertical"
+            )
+
+    def __len__(self) -> int:
+        return 2 * self.steps + self.bits_horizontal + self.bits_vertical + 2
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+    def bits(self, direction: Direction) -> int:
+        return self.bits_horizontal if direction == "horizontal" else self.bits_vertical
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        described: list[tuple[Kind, Direction | None, int]] = []
+        for direction in DIRECTIONS:
+            described += [("sinusoid", direction, n) for n in range(self.steps)]
+        for direction in DIRECTIONS:
+            described += [("gray", direction, bit) for bit in range(self.bits(direction))]
+        described += [("black", None, 0), ("white", None, 0)]
+        return tuple(Frame(i, *d) for i, d in enumerate(described))
+
+    def sinusoids(self, direction: Direction) -> range:
+        """Frame indices of one direction's sinusoids, in the order of their phase shift."""
+        first = 0 if direction == "horizontal" else self.steps
+        return range(first, first + self.steps)
+
+    def gray(self, direction: Direction) -> range:
+        """Frame indices of one direction's Gray code, most significant bit first."""
+        first = 2 * self.steps + (0 if direction == "horizontal" else self.bits_horizontal)
+        return range(first, first + self.bits(direction))
+
+    @property
+    def black(self) -> int:
+        return len(self) - 2
+
+    @property
+    def white(self) -> int:
+        return len(self) - 1
+
+    def config(self, name: str) -> tuple[int, ...]:
+        """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``."""
+        horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
+        table = {
+            "single_shot": (0,),
+            "horizontal": horizontal,
+            "vertical": vertical,
+            "sinusoidal": horizontal + vertical,
+            "all": tuple(range(len(self))),
+        }
+        if name not in table:
+            raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
+        return table[name]
+
+
+PAPER_SEQUENCE = Sequence()

@@ -1,0 +1,53 @@
+"""The three pixel sets every score is reported on, and the depth edges that split the object set.
+
+One rule, used by ground-truth statistics, training masks and the evaluator alike (paper Section 5.3.2): a pixel belongs
+to the object where the target depth is above 0 mm, else to the background.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import FULL_SIZE
+
+DEPTH_EDGE_JUMP_MM = 10.0
+"""A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
+At 1.8 m a pixel covers 0.79 mm, so 10 mm a pixel is a surface 85 degrees off the image plane."""
+
+
+def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels of the object: target depth above 0. ``depth_mm`` (H, W) in mm, 0 = background; bool (H, W)."""
+    return depth_mm > 0
+
+
+def background_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels of the background: every pixel that is not object, so that the two sets always make up the image."""
+    return ~object_mask(depth_mm)
+
+
+def edge_jump_mm(size_px: int) -> float:
+    """Depth step in mm that counts as an edge in an image ``size_px`` wide."""
+    return DEPTH_EDGE_JUMP_MM * FULL_SIZE / size_px
+
+
+def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
+    """Distance of each pixel to the nearest depth edge, float32 (H, W), in px.
+
+    An edge runs between two 4-neighbours of which one is object and one background, or whose depths differ by more
+    than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels beside an edge have distance 0, their neighbours
+    1, and so on; an image without edges has distance inf everywhere.
+    """
+    import cv2
+
+    jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
+    inside = object_mask(depth_mm)
+    edge = np.zeros(depth_mm.shape, dtype=bool)
+    for axis in (0, 1):
+        here = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        there = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        step = np.abs(depth_mm[there] - depth_mm[here]) > jump
+        step = (step & inside[here] & inside[there]) | (inside[here] != inside[there])
+        edge[here] |= step
+        edge[there] |= step
+    if not edge.any():
+        return np.full(depth_mm.shape, np.inf, dtype=np.float32)
+    return cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
