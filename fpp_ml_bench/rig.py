@@ -1,0 +1,293 @@
+"""The rig: camera and projector as pinholes with lens distortion, and the pose between them.
+
+Conventions: OpenCV's. The camera frame has x right, y down, z forward; a point goes from the camera's frame to the
+projector's by ``X_p = R X_c + t`` in metres; pixel centres lie at integer coordinates, so that an image W px wide spans
+-0.5 to W - 0.5. The default rig is the paper's (Section 2.2 and Table 1).
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.frames import DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
+from fpp_ml_bench.lens import NO_DISTORTION, Coefficients, distort, is_distorted, undistort
+
+ROTATION_TOLERANCE = 1e-6
+"""Largest accepted |R R^T - I|: what seven printed digits of a calibration leave."""
+SMALLEST_PITCH_PX = 4.0
+"""A Gray cell is half a period; below two pixels a cell its edges and centres can't be told apart."""
+LEAST_IMAGE_PX_PER_PERIOD = 4.0
+
+Matrix3 = tuple[tuple[float, float, float], ...]
+Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def number(value: object, name: str, *, positive: bool = False) -> float:
+    """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise RigError(f"{name}: expected a number, got {value!r}")
+    if not math.isfinite(value) or (positive and value <= 0):
+        raise RigError(f"{name}: expected a {'positive ' if positive else ''}finite number, got {value!r}")
+    return float(value)
+
+
+def numbers(value: object, count: int, name: str) -> tuple[float, ...]:
+    """``value`` as ``count`` finite floats; raises `RigError` naming the key and the entry."""
+    if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
+        raise RigError(f"{name}: expected {count} numbers, got {value!r}")
+    entries = list(value)
+    if len(entries) != count:
+        raise RigError(f"{name}: expected {count} numbers, got {len(entries)}")
+    return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera, or a projector as an inverse camera: size and intrinsics in px, distortion (k1, k2, p1, p2, k3).
+
+    Raises `RigError` for sizes that are no positive integers, focal lengths that are not positive, non-finite values.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Coefficients = NO_DISTORTION
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= 65536:
+                raise RigError(f"{name}: expected a whole number of pixels from 1 to 65536, got {value!r}")
+            object.__setattr__(self, name, int(value))
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, number(getattr(self, name), name, positive=name in ("fx", "fy")))
+        object.__setattr__(self, "distortion", numbers(self.distortion, 5, "distortion"))
+
+    @property
+    def is_distorted(self) -> bool:
+        return is_distorted(self.distortion)
+
+    def scaled(self, width: int) -> "Pinhole":
+        """The same view with ``width`` pixels across: c -> (c + 0.5) s - 0.5, since pixel areas scale, not centres."""
+        s = width / self.width
+        return replace(
+            self,
+            width=width,
+            height=max(1, round(self.height * s)),
+            fx=self.fx * s,
+            fy=self.fy * s,
+            cx=(self.cx + 0.5) * s - 0.5,
+            cy=(self.cy + 0.5) * s - 0.5,
+        )
+
+    def normalised(self, u: ArrayLike, v: ArrayLike) -> Maps:
+        """Ideal normalised coordinates (x, y) of pixels (u, v), float64; NaN where the lens model has no inverse."""
+        x = (np.asarray(u, dtype=np.float64) - self.cx) / self.fx
+        y = (np.asarray(v, dtype=np.float64) - self.cy) / self.fy
+        return undistort(x, y, self.distortion)
+
+    def pixels(self, x: ArrayLike, y: ArrayLike) -> Maps:
+        """Pixels (u, v) of ideal normalised coordinates, float64; NaN beyond the fold of the lens model."""
+        xd, yd = distort(x, y, self.distortion)
+        return xd * self.fx + self.cx, yd * self.fy + self.cy
+
+    def rays(self) -> Maps:
+        """Ideal normalised coordinates (x, y) of every pixel: two float64 (H, W) read-only maps; the ray is (x, y, 1).
+
+        Pixels whose distortion can't be inverted are NaN. The two latest cameras' maps are kept.
+        """
+        return _rays(self)
+
+    def project(self, points_m: ArrayLike) -> Maps:
+        """Pixels (u, v) of points (..., 3) in this device's frame, metres; NaN for points at or behind the centre."""
+        points = np.asarray(points_m, dtype=np.float64)
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        depth = np.where(z > 0, z, np.nan)
+        return self.pixels(x / depth, y / depth)
+
+
+@lru_cache(maxsize=2)
+def _rays(pinhole: Pinhole) -> Maps:
+    u, v = np.meshgrid(np.arange(pinhole.width, dtype=np.float64), np.arange(pinhole.height, dtype=np.float64))
+    maps = pinhole.normalised(u, v)
+    for axis in maps:
+        axis.setflags(write=False)
+    return maps
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Camera, projector, the pose between them, and the sequence that is projected.
+
+    ``rotation`` (three rows) and ``translation_m`` take any sequence or array and are kept as tuples, so that a rig is
+    hashable and compares by value; `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal
+    fringes along the projector's rows, ``pitch_vertical_px`` that of the vertical ones along its columns. Raises
+    `RigError` for a pose that is no rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit.
+    """
+
+    camera: Pinhole
+    projector: Pinhole
+    rotation: Matrix3
+    translation_m: tuple[float, float, float]
+    pitch_horizontal_px: float = 18.0
+    pitch_vertical_px: float = 18.0
+    sequence: Sequence = PAPER_SEQUENCE
+    working_range_mm: tuple[float, float] = WORKING_RANGE_MM
+    standoff_m: float = STANDOFF_M
+    background_m: float = BACKGROUND_M
+    R: NDArray[np.float64] = field(init=False, repr=False, compare=False)
+    t: NDArray[np.float64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.rotation, str | dict) or not isinstance(self.rotation, Iterable):
+            raise RigError(f"rotation: expected three rows of three numbers, got {self.rotation!r}")
+        rows = tuple(numbers(row, 3, f"rotation[{i}]") for i, row in enumerate(self.rotation))
+        if len(rows) != 3:
+            raise RigError(f"rotation: expected three rows of three numbers, got {len(rows)} rows")
+        translation = numbers(self.translation_m, 3, "translation_m")
+        near_far = numbers(self.working_range_mm, 2, "working_range_mm")
+        settings = {"rotation": rows, "translation_m": translation, "working_range_mm": near_far}
+        for name in ("pitch_horizontal_px", "pitch_vertical_px", "standoff_m", "background_m"):
+            settings[name] = number(getattr(self, name), name, positive=True)  # type: ignore[assignment]
+        settings["R"], settings["t"] = np.array(rows), np.array(translation)  # type: ignore[assignment]
+        for name, value in settings.items():
+            object.__setattr__(self, name, value)
+        self.R.setflags(write=False)
+        self.t.setflags(write=False)
+        self._check_pose()
+        self._check_range()
+        for direction in DIRECTIONS:
+            self._check_code(direction)
+
+    def _check_pose(self) -> None:
+        error = float(np.abs(self.R @ self.R.T - np.eye(3)).max())
+        if error > ROTATION_TOLERANCE:
+            raise RigError(
+                f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROTATION_TOLERANCE:g}; "
+                "write more digits or give a rotation vector"
+            )
+        if np.linalg.det(self.R) < 0:
+            raise RigError("rotation: determinant is -1, a mirror image; check the sign of one axis")
+        if not np.any(self.t):
+            raise RigError("translation_m: the baseline is zero, so no depth can be triangulated")
+
+    def _check_range(self) -> None:
+        near, far = self.working_range_mm
+        if not 0 < near < far:
+            raise RigError(f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm")
+        if not near <= self.standoff_m * MM_PER_M <= far:
+            raise RigError(f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm")
+        if self.background_m * MM_PER_M <= far:
+            raise RigError(
+                f"background_m: {self.background_m:g} m must lie beyond the working range, which ends at {far:g} mm"
+            )
+
+    def _check_code(self, direction: Direction) -> None:
+        pitch, length = self.pitch(direction), self.pattern_length(direction)
+        if not SMALLEST_PITCH_PX <= pitch <= length:
+            raise RigError(
+                f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} px to the pattern's {length} px, got {pitch:g} px"
+            )
+        bits, needed = self.sequence.bits(direction), bits_needed(length, pitch)
+        if bits < needed:
+            raise RigError(
+                f"sequence.bits_{direction}: {cell_count(length, pitch)} Gray cells of half a period ({pitch / 2:g} px) "
+                f"on {length} px need {needed} bits, got {bits}"
+            )
+
+    def pitch(self, direction: Direction) -> float:
+        """Fringe period in projector px."""
+        return self.pitch_horizontal_px if direction == "horizontal" else self.pitch_vertical_px
+
+    def pattern_length(self, direction: Direction) -> int:
+        """Projector px along which the fringes of ``direction`` vary: rows for horizontal, columns for vertical ones."""
+        return self.projector.height if direction == "horizontal" else self.projector.width
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance of the two centres of projection."""
+        return math.sqrt(sum(t * t for t in self.translation_m))
+
+    def scaled(self, size: int) -> "Rig":
+        """The rig with a camera image ``size`` px wide; the projector, and with it the ambiguity, stays as it is."""
+        return replace(self, camera=self.camera.scaled(size))
+
+    def project(self, points_m: ArrayLike) -> Maps:
+        """Projector pixels (u_p, v_p) of points (..., 3) in the CAMERA's frame, metres; NaN behind the projector."""
+        return self.projector.project(np.asarray(points_m, dtype=np.float64) @ self.R.T + self.t)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, lists and mappings, as stored with a dataset; see `fpp_ml_bench.rig_io`."""
+        from fpp_ml_bench.rig_io import rig_to_dict
+
+        return rig_to_dict(self)
+
+    def _central_coordinate(self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0) -> NDArray:
+        """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths (K,)."""
+        centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
+        axis = 0 if direction == "vertical" else 1
+        pixel = [c + (shift_px if i == axis else 0.0) for i, c in enumerate(centre)]
+        x, y = self.camera.normalised(*pixel)
+        depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))
+        seen = self.project(np.stack([x * depth, y * depth, depth], axis=-1))[axis]
+        if not np.all(np.isfinite(seen)):
+            raise RigError(
+                "the projector does not look at what the camera's central pixel sees: check rotation and signs"
+            )
+        return seen
+
+    def periods_in_range(self, direction: Direction) -> float:
+        """Fringe periods that the central camera pixel's ray crosses within the working range (2.4 and 1.9 here)."""
+        near, far = self._central_coordinate(direction, np.array(self.working_range_mm) / MM_PER_M)
+        return abs(float(near - far)) / self.pitch(direction)
+
+    def image_px_per_period(self, direction: Direction) -> float:
+        """Image px a fringe period covers at the image centre, on a plane square to the axis at the standoff.
+
+        Central difference over one image px along the axis that the fringes vary; 22.56 for the paper's rig at 960 px.
+        """
+        left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
+        change = abs(float(right - left))
+        return self.pitch(direction) / change if change > 0 else math.inf
+
+    def check_sampling(self) -> None:
+        """Raise `RigError` where the image samples a fringe period with fewer than 4 px, naming a pitch that would do."""
+        for direction in DIRECTIONS:
+            seen = self.image_px_per_period(direction)
+            if seen < LEAST_IMAGE_PX_PER_PERIOD:
+                needed = self.pitch(direction) * LEAST_IMAGE_PX_PER_PERIOD / seen
+                raise RigError(
+                    f"{direction} fringes: a period of {self.pitch(direction):g} projector px covers only {seen:.2f} px of "
+                    f"a {self.camera.width} px image, {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger size, or a "
+                    f"pitch of at least {math.ceil(needed * 100) / 100:g} px"
+                )
+
+
+def cell_count(length_px: int, pitch_px: float) -> int:
+    """Gray-code cells of half a period on a pattern ``length_px`` long."""
+    return math.floor((length_px - 1) / (pitch_px / 2)) + 1
+
+
+def bits_needed(length_px: int, pitch_px: float) -> int:
+    """Gray bits that tell all cells apart: ceil(log2(cells)), at least 1."""
+    return max(1, (cell_count(length_px, pitch_px) - 1).bit_length())
+
+
+def paper_rig(size: int = FULL_SIZE) -> Rig:
+    """The paper's rig (Table 1 and the public simulator's coordinates), its camera image ``size`` px square."""
+    focal = FULL_SIZE * 50 / 20.9995  # 50 cm focal length, 20.9995 cm horizontal aperture, square pixels
+    centre = (FULL_SIZE - 1) / 2
+    camera = Pinhole(FULL_SIZE, FULL_SIZE, focal, focal, centre, centre)
+    projector = Pinhole(912, 1140, 1824.0, 1824.0, 911 / 2, 1139 / 2)
+    rig = Rig(camera, projector, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.125, -0.1, 0.0))
+    return rig if size == FULL_SIZE else rig.scaled(size)
