@@ -1,0 +1,144 @@
+"""How bright each pixel is: projector light by cosine and inverse square on a matte surface, weak specular, ambient.
+
+The material is the paper's (Section 2.2: matte, roughness 0.95, specular 0.15, the same on object and background
+plane). A surface turned away from the projector gets ambient light only; cast shadows are an option, off as in the paper.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.loaders.raycast import Hits, TracedObject
+from fpp_ml_bench.rig import Rig
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Exposure and material. ``white_grey``: grey level of a white pattern on a surface that faces the projector at the
+    near end of the working range, so that nothing in range saturates; ``ambient_grey``: light besides the projector."""
+
+    white_grey: float = 225.0
+    ambient_grey: float = 6.0
+    specular: float = 0.15
+    roughness: float = 0.95
+    shadows: bool = False
+
+
+@dataclass(frozen=True)
+class PatternLookup:
+    """Where each pixel reads a 1-D pattern profile: entry ``index`` (uint16) and the next, blended by ``weight`` (float32)."""
+
+    index: NDArray[np.uint16]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, coordinate_px: NDArray[np.float64], length: int) -> "PatternLookup":
+        """Lookup of projector coordinates (n,) in px; beyond the outer pixel centres the outer pixel is read."""
+        inside = np.clip(np.nan_to_num(coordinate_px), 0.0, length - 1.0)
+        index = np.minimum(np.floor(inside), length - 2)
+        return cls(index.astype(np.uint16), (inside - index).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class LitPixels:
+    """Everything that the 52 exposures of a set of pixels share; arrays of length n.
+
+    ``lookup`` per direction, ``gain`` grey levels per unit of pattern light, ``ambient`` grey levels, both float32.
+    """
+
+    lookup: dict[Direction, PatternLookup]
+    gain: NDArray[np.float32]
+    ambient: NDArray[np.float32]
+    shadow_rays: int = field(default=0)
+
+    def patched(self, where: NDArray[np.int64], other: "LitPixels") -> "LitPixels":
+        """A copy in which the pixels at flat indices ``where`` are those of ``other``."""
+
+        def patch(mine: NDArray, theirs: NDArray) -> NDArray:
+            copy = mine.copy()
+            copy[where] = theirs
+            return copy
+
+        lookup = {
+            direction: PatternLookup(
+                patch(mine.index, other.lookup[direction].index), patch(mine.weight, other.lookup[direction].weight)
+            )
+            for direction, mine in self.lookup.items()
+        }
+        return LitPixels(lookup, patch(self.gain, other.gain), patch(self.ambient, other.ambient), other.shadow_rays)
+
+
+def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
+    """The projector's centre of projection in camera coordinates, metres (3,)."""
+    return -rig.R.T @ rig.t
+
+
+def light_surface(
+    points_m: NDArray[np.float64], normals: NDArray[np.float64], rig: Rig, lighting: Lighting,
+    occluder: TracedObject | None = None,
+) -> LitPixels:  # fmt: skip
+    """Illumination of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera; NaN points stay dark."""
+    centre_m = projector_centre_m(rig)
+    toward = centre_m - points_m
+    distance_m = np.linalg.norm(toward, axis=1)
+    toward /= distance_m[:, None]
+    cosine = np.einsum("ij,ij->i", normals, toward)
+    view = -points_m / np.linalg.norm(points_m, axis=1, keepdims=True)
+    halfway = toward + view
+    halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+    # Blinn-Phong with the exponent that a microfacet roughness of this size has (2 / roughness^4 - 2).
+    exponent = max(2.0 / lighting.roughness**4 - 2.0, 0.0)
+    gloss = np.clip(np.einsum("ij,ij->i", normals, halfway), 0.0, None) ** exponent
+    reflected = (1.0 - lighting.specular) * cosine + lighting.specular * gloss * cosine
+    reference_m = rig.working_range_mm[0] / MM_PER_M
+    gain = lighting.white_grey * (reference_m / distance_m) ** 2 * reflected
+    u, v = rig.project(points_m)
+    lit = (cosine > 0) & in_pattern(u, v, rig)
+    shadow_rays = 0
+    if lighting.shadows and occluder is not None:
+        candidates = np.flatnonzero(lit)
+        lit[candidates] = ~occluder.shadowed(points_m[candidates], centre_m)
+        shadow_rays = candidates.size
+    seen = np.isfinite(points_m).all(axis=1)
+    lookup: dict[Direction, PatternLookup] = {
+        direction: PatternLookup.of(coordinate_px, rig.pattern_length(direction))
+        for direction, coordinate_px in _by_direction(u, v)
+    }
+    return LitPixels(
+        lookup,
+        np.where(lit, gain, 0.0).astype(np.float32),
+        np.where(seen, lighting.ambient_grey, 0.0).astype(np.float32),
+        shadow_rays,
+    )
+
+
+def _by_direction(u: NDArray, v: NDArray) -> tuple[tuple[Direction, NDArray], tuple[Direction, NDArray]]:
+    """Vertical fringes read u, horizontal ones v."""
+    return ("vertical", u), ("horizontal", v)
+
+
+def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:
+    """Which projector pixels (n,), (n,) lie on the pattern, its outer pixels included whole; NaN does not; bool (n,)."""
+    return (u >= -0.5) & (u <= rig.projector.width - 0.5) & (v >= -0.5) & (v <= rig.projector.height - 0.5)
+
+
+def background_plane(rig: Rig, lighting: Lighting) -> LitPixels:
+    """The empty scene: the plane square to the axis at the rig's background distance, for every pixel of the image."""
+    x, y = (rays.ravel() for rays in rig.camera.rays())
+    points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background_m
+    normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), points_m.shape)
+    return light_surface(points_m, normals, rig, lighting)
+
+
+def lit_object(hits: Hits, rig: Rig, lighting: Lighting, occluder: TracedObject) -> LitPixels:
+    """Illumination of the pixels that see the object, in the order of ``hits.pixels``."""
+    return light_surface(hit_points_m(hits, rig), hits.normals, rig, lighting, occluder)
+
+
+def hit_points_m(hits: Hits, rig: Rig) -> NDArray[np.float64]:
+    """Surface points of the hits in camera coordinates; float64 (n, 3)."""
+    x, y = (rays.ravel()[hits.pixels] for rays in rig.camera.rays())
+    return np.column_stack([x, y, np.ones_like(x)]) * hits.depth_m[:, None]
