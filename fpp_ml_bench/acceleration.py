@@ -8,7 +8,7 @@ numba can't be imported.
 import os
 from collections.abc import Callable
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -39,8 +39,9 @@ def njit(function: Function) -> Function:
         return function
     import numba
 
-    options = {"nogil": True, "error_model": "numpy"}
+    compiled: Any
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # neither the package folder nor the user's cache folder can be written
-        return numba.njit(**options)(function)
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    return compiled

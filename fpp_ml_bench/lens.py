@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Coefficients = tuple[float, float, float, float, float]
+Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 NO_DISTORTION: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 INVERSE_TOLERANCE = 1e-12
@@ -26,14 +27,14 @@ def is_distorted(coefficients: Coefficients) -> bool:
 
 
 def fold_radius_squared(coefficients: Coefficients) -> float:
-    """r^2 at which the radial polynomial stops growing, ``inf`` where it never does: d/dr [r (1 + k1 r^2 + ...)] = 0."""
+    """r^2 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing, ``inf`` where it never does."""
     k1, k2, _, _, k3 = coefficients
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and root.real > 0]
     return min(real, default=math.inf)
 
 
-def _distort(x: NDArray, y: NDArray, coefficients: Coefficients) -> tuple[NDArray, NDArray]:
+def _distort(x: NDArray, y: NDArray, coefficients: Coefficients) -> Pair:
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -44,7 +45,7 @@ def _distort(x: NDArray, y: NDArray, coefficients: Coefficients) -> tuple[NDArra
     )
 
 
-def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     """Distorted normalised coordinates of ideal ones (any equal shapes), float64; NaN beyond the fold of the model."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not is_distorted(coefficients):
@@ -55,9 +56,7 @@ def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> tuple[NDA
     return np.where(folded, np.nan, xd), np.where(folded, np.nan, yd)
 
 
-def undistort(
-    x: ArrayLike, y: ArrayLike, coefficients: Coefficients
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     """Ideal normalised coordinates of distorted ones, by Newton's method in float64, checked by distorting again.
 
     Where no ideal point within the fold reproduces the input to `INVERSE_TOLERANCE`, both coordinates are NaN.

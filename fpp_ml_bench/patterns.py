@@ -45,7 +45,7 @@ def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
 
 
 def pattern_profiles(rig: Rig) -> NDArray[np.uint8]:
-    """All F profiles as one table, uint8 (F, max(W, H)): row i starts with `pattern_profile` i, its last value repeated."""
+    """All F profiles in one table, uint8 (F, max(W, H)): row i is `pattern_profile` i, its last value repeated."""
     length = max(rig.projector.width, rig.projector.height)
     profiles = (pattern_profile(rig, i) for i in range(len(rig.sequence)))
     return np.stack([np.pad(p, (0, length - len(p)), mode="edge") for p in profiles])

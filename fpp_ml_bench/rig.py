@@ -8,7 +8,6 @@ projector's by ``X_p = R X_c + t`` in metres; pixel centres lie at integer coord
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.frames import DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
-from fpp_ml_bench.lens import NO_DISTORTION, Coefficients, distort, is_distorted, undistort
+from fpp_ml_bench.pinhole import Maps, number, numbers
+from fpp_ml_bench.pinhole import Pinhole as Pinhole
 
 ROTATION_TOLERANCE = 1e-6
 """Largest accepted |R R^T - I|: what seven printed digits of a calibration leave."""
@@ -26,103 +26,6 @@ SMALLEST_PITCH_PX = 4.0
 LEAST_IMAGE_PX_PER_PERIOD = 4.0
 
 Matrix3 = tuple[tuple[float, float, float], ...]
-Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def number(value: object, name: str, *, positive: bool = False) -> float:
-    """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise RigError(f"{name}: expected a number, got {value!r}")
-    if not math.isfinite(value) or (positive and value <= 0):
-        raise RigError(f"{name}: expected a {'positive ' if positive else ''}finite number, got {value!r}")
-    return float(value)
-
-
-def numbers(value: object, count: int, name: str) -> tuple[float, ...]:
-    """``value`` as ``count`` finite floats; raises `RigError` naming the key and the entry."""
-    if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
-        raise RigError(f"{name}: expected {count} numbers, got {value!r}")
-    entries = list(value)
-    if len(entries) != count:
-        raise RigError(f"{name}: expected {count} numbers, got {len(entries)}")
-    return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """A camera, or a projector as an inverse camera: size and intrinsics in px, distortion (k1, k2, p1, p2, k3).
-
-    Raises `RigError` for sizes that are no positive integers, focal lengths that are not positive, non-finite values.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: Coefficients = NO_DISTORTION
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= 65536:
-                raise RigError(f"{name}: expected a whole number of pixels from 1 to 65536, got {value!r}")
-            object.__setattr__(self, name, int(value))
-        for name in ("fx", "fy", "cx", "cy"):
-            object.__setattr__(self, name, number(getattr(self, name), name, positive=name in ("fx", "fy")))
-        object.__setattr__(self, "distortion", numbers(self.distortion, 5, "distortion"))
-
-    @property
-    def is_distorted(self) -> bool:
-        return is_distorted(self.distortion)
-
-    def scaled(self, width: int) -> "Pinhole":
-        """The same view with ``width`` pixels across: c -> (c + 0.5) s - 0.5, since pixel areas scale, not centres."""
-        s = width / self.width
-        return replace(
-            self,
-            width=width,
-            height=max(1, round(self.height * s)),
-            fx=self.fx * s,
-            fy=self.fy * s,
-            cx=(self.cx + 0.5) * s - 0.5,
-            cy=(self.cy + 0.5) * s - 0.5,
-        )
-
-    def normalised(self, u: ArrayLike, v: ArrayLike) -> Maps:
-        """Ideal normalised coordinates (x, y) of pixels (u, v), float64; NaN where the lens model has no inverse."""
-        x = (np.asarray(u, dtype=np.float64) - self.cx) / self.fx
-        y = (np.asarray(v, dtype=np.float64) - self.cy) / self.fy
-        return undistort(x, y, self.distortion)
-
-    def pixels(self, x: ArrayLike, y: ArrayLike) -> Maps:
-        """Pixels (u, v) of ideal normalised coordinates, float64; NaN beyond the fold of the lens model."""
-        xd, yd = distort(x, y, self.distortion)
-        return xd * self.fx + self.cx, yd * self.fy + self.cy
-
-    def rays(self) -> Maps:
-        """Ideal normalised coordinates (x, y) of every pixel: two float64 (H, W) read-only maps; the ray is (x, y, 1).
-
-        Pixels whose distortion can't be inverted are NaN. The two latest cameras' maps are kept.
-        """
-        return _rays(self)
-
-    def project(self, points_m: ArrayLike) -> Maps:
-        """Pixels (u, v) of points (..., 3) in this device's frame, metres; NaN for points at or behind the centre."""
-        points = np.asarray(points_m, dtype=np.float64)
-        x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        depth = np.where(z > 0, z, np.nan)
-        return self.pixels(x / depth, y / depth)
-
-
-@lru_cache(maxsize=2)
-def _rays(pinhole: Pinhole) -> Maps:
-    u, v = np.meshgrid(np.arange(pinhole.width, dtype=np.float64), np.arange(pinhole.height, dtype=np.float64))
-    maps = pinhole.normalised(u, v)
-    for axis in maps:
-        axis.setflags(write=False)
-    return maps
 
 
 @dataclass(frozen=True)
@@ -196,13 +99,13 @@ class Rig:
         pitch, length = self.pitch(direction), self.pattern_length(direction)
         if not SMALLEST_PITCH_PX <= pitch <= length:
             raise RigError(
-                f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} px to the pattern's {length} px, got {pitch:g} px"
+                f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px"
             )
         bits, needed = self.sequence.bits(direction), bits_needed(length, pitch)
         if bits < needed:
             raise RigError(
-                f"sequence.bits_{direction}: {cell_count(length, pitch)} Gray cells of half a period ({pitch / 2:g} px) "
-                f"on {length} px need {needed} bits, got {bits}"
+                f"sequence.bits_{direction}: {length} px hold {cell_count(length, pitch)} Gray cells of half a period "
+                f"({pitch / 2:g} px), which need {needed} bits, got {bits}"
             )
 
     def pitch(self, direction: Direction) -> float:
@@ -210,7 +113,7 @@ class Rig:
         return self.pitch_horizontal_px if direction == "horizontal" else self.pitch_vertical_px
 
     def pattern_length(self, direction: Direction) -> int:
-        """Projector px along which the fringes of ``direction`` vary: rows for horizontal, columns for vertical ones."""
+        """Projector px along which the fringes vary: the rows for horizontal, the columns for vertical ones."""
         return self.projector.height if direction == "horizontal" else self.projector.width
 
     @property
@@ -261,15 +164,15 @@ class Rig:
         return self.pitch(direction) / change if change > 0 else math.inf
 
     def check_sampling(self) -> None:
-        """Raise `RigError` where the image samples a fringe period with fewer than 4 px, naming a pitch that would do."""
+        """Raise `RigError` where a fringe period covers fewer than 4 image px, naming the pitch that would do."""
         for direction in DIRECTIONS:
             seen = self.image_px_per_period(direction)
             if seen < LEAST_IMAGE_PX_PER_PERIOD:
                 needed = self.pitch(direction) * LEAST_IMAGE_PX_PER_PERIOD / seen
                 raise RigError(
-                    f"{direction} fringes: a period of {self.pitch(direction):g} projector px covers only {seen:.2f} px of "
-                    f"a {self.camera.width} px image, {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger size, or a "
-                    f"pitch of at least {math.ceil(needed * 100) / 100:g} px"
+                    f"{direction} fringes: a period of {self.pitch(direction):g} projector px covers only {seen:.2f} "
+                    f"px of a {self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger "
+                    f"size, or a pitch of at least {math.ceil(needed * 100) / 100:g} px"
                 )
 
 
