@@ -4,6 +4,8 @@ One rule, used by ground-truth statistics, training masks and the evaluator alik
 to the object where the target depth is above 0 mm, else to the background.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,15 +31,12 @@ def edge_jump_mm(size_px: int) -> float:
     return DEPTH_EDGE_JUMP_MM * FULL_SIZE / size_px
 
 
-def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
-    """Distance of each pixel to the nearest depth edge, float32 (H, W), in px.
+def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.bool_]:
+    """Pixels beside a depth edge, bool (H, W).
 
     An edge runs between two 4-neighbours of which one is object and one background, or whose depths differ by more
-    than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels beside an edge have distance 0, their neighbours
-    1, and so on; an image without edges has distance inf everywhere.
+    than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels beside it are marked.
     """
-    import cv2
-
     jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
     inside = object_mask(depth_mm)
     edge = np.zeros(depth_mm.shape, dtype=bool)
@@ -48,6 +47,50 @@ def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = Non
         step = (step & inside[here] & inside[there]) | (inside[here] != inside[there])
         edge[here] |= step
         edge[there] |= step
+    return edge
+
+
+def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
+    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px.
+
+    Both pixels beside an edge have distance 0, their neighbours 1, and so on; an image without edges has distance inf
+    everywhere.
+    """
+    import cv2
+
+    edge = depth_edges(depth_mm, jump_mm)
     if not edge.any():
         return np.full(depth_mm.shape, np.inf, dtype=np.float32)
     return cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:
+    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W): the same set, found by dilating edges.
+
+    For the few pixels of a score's edge band this is several times faster than a distance transform, and needs no
+    OpenCV (whose import alone takes longer than scoring ten samples).
+    """
+    near = np.zeros(depth_mm.shape, dtype=bool)
+    inside = object_mask(depth_mm)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    if band_px < 1 or not rows.size:
+        return near
+    # Every edge touches the object, so the object's box and one pixel around it hold all of them.
+    box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
+    edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
+    height, width = edge.shape
+    band = near[box]
+    run, half = edge.copy(), 0  # edge, dilated sideways by half
+    reach = min(band_px - 1, height - 1)
+    for dy in range(band_px - 1, -1, -1):
+        # Widest sideways offset still inside the open disk dx^2 + dy^2 < band^2; it grows as dy shrinks.
+        limit = math.isqrt(band_px * band_px - 1 - dy * dy)
+        while half < min(limit, width - 1):
+            half += 1
+            run[:, half:] |= edge[:, :-half]
+            run[:, :-half] |= edge[:, half:]
+        if dy <= reach:
+            band[: height - dy] |= run[dy:]
+            band[dy:] |= run[: height - dy]
+    band &= inside[box]
+    return near

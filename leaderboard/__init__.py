@@ -1,0 +1,1 @@
+"""Leaderboard: result files ranked by group, and the paper's own rows beside them."""
