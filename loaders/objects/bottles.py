@@ -1,0 +1,137 @@
+"""Bottles and sprayers: lofted or turned bodies with closures. Drawn upright in millimetres at their real size."""
+
+import numpy as np
+
+from fpp_ml_bench.loaders.objects.lettering import text_plate, text_section, wrapped
+from fpp_ml_bench.loaders.objects.solids import (
+    SEGMENTS,
+    Solid,
+    block,
+    cut,
+    disc,
+    facing,
+    lathe,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    union,
+)
+from fpp_ml_bench.loaders.objects.sweeps import curve, loft, tube
+
+
+def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
+    """Screw cap standing on z = 0 with vertical grips."""
+    angle = 2 * np.pi * np.arange(ribs) / ribs
+    grips = [
+        rod((radius * c, radius * s, 1.5), (radius * c, radius * s, height - 2.5), 0.07 * radius)
+        for c, s in zip(np.cos(angle).tolist(), np.sin(angle).tolist(), strict=True)
+    ]
+    return union(lathe([(radius, 0), (radius, height - 2), (radius - 2, height)]), *grips)
+
+
+def mustard_bottle() -> Solid:
+    """Oval squeeze bottle, 96 x 58 x 190 mm, with a pointed nozzle."""
+    body = loft(
+        [(0, 84, 46, 2.6), (3, 92, 55, 2.6), (10, 95, 58, 2.6), (60, 95, 58, 2.6), (112, 94, 57, 2.5),
+         (132, 84, 53, 2.4), (146, 62, 46, 2.2), (153, 46, 42, 2.0), (155, 42, 41, 2.0)], smooth=8,
+    )  # fmt: skip
+    closure = lathe(
+        np.concatenate([[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]),
+    )
+    label = facing(text_plate("MUSTARD", 70, 3.0)).translate((-27.5, 0, 78))
+    grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
+    panel = facing(plate(rectangle(70, 78, 14), 8)).translate((-24.6, 0, 66))
+    strip = facing(plate(rectangle(46, 3) + rectangle(34, 3, 0, (0, -8)), 6)).translate((-27, 0, 56))
+    return place(union(body, closure, label, panel, strip, *grips), turn=(0, -6, 8))
+
+
+def bleach_cleanser() -> Solid:
+    """Cleanser bottle, 98 x 66 x 250 mm: square shoulders, a waist to hold it by and a ribbed cap."""
+    body = loft(
+        [(0, 88, 54, 4), (3, 96, 64, 4), (10, 98, 66, 4), (90, 98, 66, 4), (112, 93, 60, 3.6), (135, 86, 54, 3.2),
+         (158, 86, 54, 3.0), (178, 84, 52, 2.8), (194, 70, 46, 2.4), (206, 46, 38, 2.0), (212, 36, 35, 2)], smooth=8,
+    )  # fmt: skip
+    neck = rod((0, 0, 205), (0, 0, 222), 16)
+    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
+    words = union(
+        facing(text_plate("BLEACH", 76, 1.8)).translate((-33, 0, 70)),
+        facing(plate(rectangle(78, 2.4) + rectangle(60, 2.4, 0, (0, -10)) + rectangle(66, 2.4, 0, (0, -20)), 4)).translate(
+            (-32.6, 0, 50)
+        ),
+    )
+    return place(union(body, neck, cap, words), turn=(0, -5, 10))
+
+
+def container_bottle() -> Solid:
+    """Canister with a handle through its shoulder, 170 x 105 x 280 mm, and a wide screw cap."""
+    body = loft(
+        [(0, 152, 90, 3.4), (4, 164, 101, 3.4), (12, 168, 105, 3.4), (120, 168, 105, 3.4), (165, 166, 102, 3.2),
+         (205, 152, 92, 2.8), (232, 118, 78, 2.4), (248, 76, 62, 2.1), (254, 58, 56, 2), (262, 56, 56, 2)], smooth=8,
+    )  # fmt: skip
+    hole = place(tube(curve([(-90, 46, 205), (0, 46, 205), (90, 46, 205)], 2), 15.0, 2.1), (0, 0, -18))
+    thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
+    cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
+    panel = facing(plate(rectangle(118, 96, 12), 3)).translate((-52, 0, 78))
+    stripes = facing(plate(rectangle(90, 8, 3, (0, 24)) + rectangle(90, 8, 3) + rectangle(60, 8, 3, (-15, -24)), 3))
+    scale = [facing(plate(rectangle(12, 2.5), 3)).translate((-52, -72, z)) for z in range(40, 150, 18)]
+    return place(union(cut(body, hole, *thinner), cap, panel, stripes.translate((-53.4, 0, 78)), *scale), turn=(0, -5, -8))
+
+
+def spray_bottle() -> Solid:
+    """Trigger sprayer, 92 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
+    body = lathe(
+        np.concatenate([
+            [(34, 0), (40, 1)],
+            curve([(43, 5), (43, 60), (42, 100), (36, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
+            [(14.5, 205)],
+        ])
+    )  # fmt: skip
+    collar = ribbed_cap(19, 20, 30).translate((0, 0, 196))
+    head = polygon(
+        [(-18, 214), (18, 214), (20, 226), (34, 236), (36, 262), (20, 275), (-34, 275), (-62, 266), (-64, 248), (-20, 244)], 3
+    )
+    trigger = plate(
+        polygon(np.concatenate([
+            curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
+            curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
+        ])), 13, 0)  # fmt: skip
+    nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), rod((-76, 257, 0), (-80, 257, 0), 5)))
+    grip = [ring(43.2, 0.9, z) for z in (16, 22, 28)]
+    words = wrapped(text_section("SPRAY", 58), 42.6, 74, 1.3)
+    return place(union(body, collar, facing(plate(head, 26)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 8))
+
+
+def vial() -> Solid:
+    """Medicine vial, 24 x 58 mm: round shoulder, crimped cap over a rubber stopper, a label."""
+    glass = lathe([(10.5, 0), (12, 1.5), (12, 36), (11.3, 39), (9, 42), (7, 44), (6.6, 46), (6.6, 51)], 0.8)
+    crimp = lathe([(8.5, 49), (9.4, 50), (9.4, 57), (8.6, 58.2)])
+    stopper = union(lathe([(6, 57), (6, 59.4), (5, 60.2)]), ring(7.4, 0.5, 58.2))
+    label = wrapped(rectangle(62, 22), 12, 20, 0.25)
+    words = wrapped(text_section("VIAL", 16), 12.2, 25, 0.35)
+    lines = [wrapped(rectangle(15, 1.1), 12.2, z, 0.3) for z in (18.5, 15.5, 12.5)]
+    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, -14, 0))
+
+
+def cork() -> Solid:
+    """Tapered stopper, 34 mm wide, with lenticels and pits."""
+    body = lathe([(11.5, 0), (12.6, 1.2), (16.2, 40.6), (15.2, 42)], segments=SEGMENTS)
+    pits = []
+    for k in range(46):
+        angle, z = 2.39996 * k, 2.5 + 36.5 * ((k * 0.618034) % 1.0)
+        radius = 12.7 + 0.09 * z
+        long = 1.0 + 1.6 * ((k * 0.381966) % 1.0)
+        start = (radius * float(np.cos(angle)), radius * float(np.sin(angle)), z)
+        side = angle + 0.09 * long
+        end = (radius * float(np.cos(side)), radius * float(np.sin(side)), z + 0.5)
+        pits.append(rod(start, end, 0.45, 0.8, rounded=True))
+    holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
+    split = block(10, 0.8, 14, 0, (-14, 4, 36))
+    return place(cut(body, *pits, *holes, split), turn=(0, -24, 0))
+
+
+def plain_disc_mark(radius: float, relief: float) -> Solid:
+    """Drawn round mark rising ``relief`` mm from z = 0."""
+    return plate(disc(radius), 2 * relief)

@@ -1,0 +1,112 @@
+"""Tinned goods: rimmed round and rectangular cans. Drawn upright in millimetres at their real size."""
+
+import numpy as np
+
+from fpp_ml_bench.loaders.objects.lettering import text_plate, text_section, wrapped
+from fpp_ml_bench.loaders.objects.solids import (
+    Point2,
+    Solid,
+    block,
+    cut,
+    disc,
+    facing,
+    lathe,
+    place,
+    plate,
+    rectangle,
+    ring,
+    rod,
+    softened,
+    union,
+)
+from fpp_ml_bench.loaders.objects.sweeps import curve, loft, tube
+
+
+def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid:
+    """Can body with a seamed rim at both ends, a sunk lid and raised ribs at the heights given."""
+    rim = radius + 1.4
+    wall: list[Point2] = [(rim - 1, 0), (rim, 0.8), (rim, 2.6), (radius, 3.6)]
+    for z in ribs:
+        wall += [(radius, z - 1.8), (radius + 0.9, z - 0.6), (radius + 0.9, z + 0.6), (radius, z + 1.8)]
+    wall += [(radius, height - 3.6), (rim, height - 2.6), (rim, height - 0.8), (rim - 1, height)]
+    sunk_lid = rod((0, 0, height - 3), (0, 0, height + 1), radius - 1.2)
+    return cut(lathe(wall), sunk_lid)
+
+
+def _pull_tab(scale: float = 1.0) -> Solid:
+    """Ring-pull lying on z = 0, its rivet at the origin and its ring towards -x."""
+    tab = (rectangle(22, 15, 7.4, (-9, 0)) - softened(rectangle(10, 9, 4.4, (-13, 0)), 1)).scale((scale, scale))
+    return union(plate(tab, 1.6).translate((0, 0, 1.2)), rod((0, 0, -1), (0, 0, 2.6), 3.0 * scale))
+
+
+def _around(count: int) -> list[Point2]:
+    """Unit vectors at ``count`` equal steps round the axis."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return [(float(c), float(s)) for c, s in zip(np.cos(angle), np.sin(angle), strict=True)]
+
+
+def master_chef_can() -> Solid:
+    """Coffee can, 102 x 139 mm, with an overhanging plastic lid and its name on a label that does not quite close."""
+    body = _rimmed(50, 132)
+    lid = cut(
+        lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]),
+        rod((0, 0, 137), (0, 0, 141), 46),
+    )
+    label = wrapped(rectangle(292, 112), 50, 65, 0.6)
+    name = union(
+        wrapped(text_section("MASTER", 76), 50.6, 92, 1.0),
+        wrapped(text_section("CHEF", 58), 50.6, 70, 1.0),
+        wrapped(disc(17), 50.6, 36, 1.0),
+    )
+    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in _around(60)]
+    return place(union(body, lid, label, name, *grips), turn=(0, -14, 0))
+
+
+def tomato_soup_can() -> Solid:
+    """Soup can, 66 x 101 mm, with ring-pull, two ribs and a label."""
+    body = _rimmed(32.5, 101, ribs=(10, 91))
+    label = wrapped(rectangle(188, 68), 32.5, 50.5, 0.5)
+    name = union(
+        wrapped(text_section("TOMATO", 62), 33, 66, 0.9),
+        wrapped(text_section("SOUP", 50), 33, 48, 0.9),
+        wrapped(disc(8), 33, 29, 1.0),
+    )
+    return place(union(body, label, name, _pull_tab().translate((-8, 0, 98))), turn=(0, -20, 0))
+
+
+def tuna_fish_can() -> Solid:
+    """Flat can, 85 x 33 mm, tipped to show its lid with the ring-pull and steps."""
+    body = _rimmed(42, 33, ribs=(9, 24))
+    steps = union(ring(36, 1.3, 30), ring(30, 1.0, 30))
+    name = wrapped(text_section("TUNA", 40), 42, 16.5, 1.0)
+    fish_body = plate(disc(10).scale((1.5, 0.75)) + rectangle(9, 9).rotate(45).translate((17, 0)), 2)
+    fish = place(fish_body, (12, 0, 30), (0, 0, 90))
+    return place(union(body, steps, name, fish, _pull_tab(1.2).translate((-14, 0, 30))), turn=(0, -48, 0))
+
+
+def potted_meat_can() -> Solid:
+    """Rectangular meat tin with round corners, 97 x 50 x 82 mm, a sunk lid with ring-pull."""
+    outline = 5.0
+    rows = [
+        (0, 95, 48, outline), (1, 97.5, 50.5, outline), (3, 97.5, 50.5, outline), (4, 95, 48, outline),
+        (78, 95, 48, outline), (79, 97.5, 50.5, outline), (81, 97.5, 50.5, outline), (82, 95, 48, outline),
+    ]  # fmt: skip
+    lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
+    label = facing(plate(rectangle(84, 60), 2)).translate((-23.6, 0, 40))
+    name = facing(text_plate("MEAT", 68, 1.2)).translate((-24.6, 0, 48))
+    strip = facing(text_plate("POTTED", 56, 1.0)).translate((-24.6, 0, 26))
+    tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
+    return place(union(cut(loft(rows), lid), label, name, strip, tab), turn=(0, -22, 12))
+
+
+def container_tin() -> Solid:
+    """Lever-lid tin with a wire handle, 110 x 130 mm."""
+    body = _rimmed(54, 128, ribs=(30, 34, 98, 102))
+    collar = cut(lathe([(54, 124), (54, 131), (44, 131)]), rod((0, 0, 126), (0, 0, 133), 44))
+    lid = cut(lathe([(43.5, 120), (43.5, 130), (45, 130), (45, 132.5), (40, 132.5)]), rod((0, 0, 129), (0, 0, 134), 37))
+    ears = [rod((0, s * 52, 112), (0, s * 59, 112), 8, 5) for s in (-1, 1)]
+    bail = [(0.0, -58.0, 112.0), (-12.0, -60.0, 95.0), (-34.0, -44.0, 62.0), (-42.0, -18.0, 46.0), (-44.0, 0.0, 43.0)]
+    mirrored = [(x, -y, z) for x, y, z in bail[-2::-1]]
+    handle = tube(curve([(x * 1.45, y * 1.05, z) for x, y, z in bail + mirrored]), 1.8, up=(1, 0, 0.3))
+    rivet = block(6, 10, 16, 2, (54, 0, 64))
+    return place(union(body, collar, lid, *ears, handle, rivet), turn=(0, -24, 0))

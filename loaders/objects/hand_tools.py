@@ -1,0 +1,181 @@
+"""Hand tools: hammer, scissors, clamps, boxcutter, brushes and palette knives. Drawn flat in millimetres, real size."""
+
+import numpy as np
+
+from fpp_ml_bench.loaders.objects.solids import (
+    Point2,
+    Solid,
+    ball,
+    block,
+    cut,
+    disc,
+    facing,
+    lathe,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    softened,
+    stroke,
+    union,
+)
+from fpp_ml_bench.loaders.objects.sweeps import curve, loft, skin, superellipse, tube
+
+
+def _outline(points: np.ndarray) -> list[Point2]:
+    return [(float(x), float(y)) for x, y in points]
+
+
+def hammer() -> Solid:
+    """Claw hammer, 330 mm long: turned face, cheek, forked claw, waisted grip with a bulged end."""
+    handle = loft(
+        [(0, 26, 34, 2.4), (4, 30, 39, 2.4), (18, 29, 37, 2.4), (60, 25, 30, 2.3), (100, 26, 33, 2.3), (140, 23, 28, 2.2),
+         (200, 18, 23, 2.0), (250, 18, 23, 2.0), (292, 20, 26, 2.4), (312, 20, 26, 2.4)], smooth=6, sides=64,
+    )  # fmt: skip
+    handle = handle.rotate((0, 0, 90)).rotate((-90, 0, 0)).rotate((0, 0, 0))
+    handle = place(handle, (0, 0, 0), (0, 0, 180)) if handle.bounding_box()[4] < 100 else handle
+    face = place(lathe([(14, 0), (17, 3), (17, 15), (13, 21), (12, 40)], 0.5), (64, 292, 0), (0, -90, 0))
+    cheek = block(46, 34, 30, 5, (4, 292, 0))
+    spine = curve([(-10, 296), (-36, 300), (-62, 291), (-84, 268)])
+    claw_wide = np.interp(np.arange(len(spine)), [0, len(spine) - 1], [15.0, 15.5])
+    thick = np.interp(np.arange(len(spine)), [0, len(spine) - 1], [12.0, 2.0])
+    rings = []
+    for k, point in enumerate(spine):
+        tangent = spine[min(k + 1, len(spine) - 1)] - spine[max(k - 1, 0)]
+        normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
+        section = superellipse(2 * thick[k], 2 * claw_wide[k], 4, 48)
+        rings.append(np.stack([point[0] + normal[0] * section[:, 0], point[1] + normal[1] * section[:, 0], section[:, 1]], axis=1))
+    fork = place(plate(polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)]), 90), (-40, 285, 0), (90, 0, 180)).translate((0, 0, 0))
+    claw = cut(skin(np.array(rings)), fork)
+    grooves = [place(ring(19, 2.0).scale((0.95, 0.8, 1)), (0, y, 0), (-90, 0, 0)) for y in (34, 48, 62, 76, 90)]
+    return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(8, 0, 10))
+
+
+def scissors() -> Solid:
+    """Household scissors, 205 mm long, a little open: two pointed blades, pivot screw, a round and a long bow."""
+    blade = polygon([(-4, -20), (9, -20), (10, 10), (7, 70), (1.5, 108), (0, 108), (-6, 20)], 0.6)
+    shank = stroke(_outline(curve([(2, -16), (-2, -34), (-11, -48), (-16, -56)])), 12)
+    halves = []
+    for side, reach in ((1, 25.0), (-1, 36.0)):
+        bow = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+        loop = np.stack([18.5 * np.cos(bow) - 19, reach * np.sin(bow) - 50 - reach, 0 * bow], axis=1)
+        half = union(
+            plate(blade, 3.2), plate(shank, 8),
+            tube(loop, 5.2, flatten=1.25, closed=True, sides=24),
+        ).rotate((0, 0, 9))  # fmt: skip
+        halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
+    pivot = union(rod((0, 0, -6.5), (0, 0, 6.5), 6), cut(rod((0, 0, 5), (0, 0, 7.6), 5), block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))))
+    return place(facing(union(*halves, pivot)), turn=(10, 0, 0))
+
+
+def large_clamp() -> Solid:
+    """Spring clamp, 200 mm long: two jaws with pads crossing at a coiled spring, handles with sleeves."""
+    jaw = polygon([(-18, 6), (-38, 50), (-40, 84), (-20, 104), (-8, 106), (-4, 96), (-20, 84), (-22, 56), (-2, 12), (12, 0), (2, -14)], 3)
+    lever = stroke(_outline(curve([(4, -4), (26, -34), (42, -66), (50, -100)])), 22)
+    sleeve = stroke(_outline(curve([(30, -44), (42, -68), (50, -100)])), 27)
+    half = union(plate(softened(jaw + lever, 2), 18), plate(softened(sleeve, 1), 24))
+    half = cut(half, plate(stroke([(16, -22), (38, -62)], 8), 40).translate((0, 0, 0)) ^ plate(rectangle(200, 36, 0, (0, -24)), 40))
+    pad = place(block(11, 26, 25, 3), (-5.5, 98, 0), (0, 0, -8))
+    ears = [plate(disc(17), 5).translate((0, 0, z)) for z in (-13, 13)]
+    pin = rod((0, 0, -19), (0, 0, 19), 6.5)
+    coil = [ring(11.5, 2.6, z) for z in (-10.4, -5.2, 0, 5.2, 10.4)]
+    legs = [tube(curve([(s * 10, -4, 0), (s * 24, -26, 0), (s * 34, -40, 0)]), 2.6) for s in (-1, 1)]
+    both = union(half, pad, half.mirror((1, 0, 0)), pad.mirror((1, 0, 0)), pin, *ears, *coil, *legs)
+    return place(facing(both), turn=(0, 10, 0))
+
+
+def clamp() -> Solid:
+    """C-clamp, 150 mm tall: ribbed frame, threaded screw with swivel pad and sliding bar."""
+    frame = stroke([(40, 62), (-34, 66), (-46, 54), (-46, -40), (-34, -52), (40, -48)], 20)
+    frame = softened(frame + disc(14, (40, 62)) + disc(15, (40, -48)), 3)
+    rib = stroke([(34, 62), (-33, 65), (-45, 53), (-45, -39), (-33, -51), (30, -48)], 8)
+    anvil = rod((40, 44, 0), (40, 56, 0), 13)
+    screw = rod((40, -118, 0), (40, 8, 0), 7.5)
+    thread = [place(ring(7.6, 1.3), (40, y, 0), (90, 0, 4)) for y in np.arange(-96, -2, 3.6).tolist()]
+    pad = union(ball(9, (40, 8, 0)), rod((40, 8, 0), (40, 18, 0), 10, 15), rod((40, 17, 0), (40, 22, 0), 15))
+    boss = rod((40, -66, 0), (40, -34, 0), 14)
+    bar = union(rod((2, -112, 8), (78, -112, -8), 4.2), ball(6.4, (2, -112, 8)), ball(6.4, (78, -112, -8)))
+    head = ball(10.5, (40, -112, 0))
+    return place(facing(union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)), turn=(0, 8, 0))
+
+
+def boxcutter() -> Solid:
+    """Snap-off knife, 190 mm with its blade out: score lines, slider in its slot, ribbed grip, end clip."""
+    handle = softened(polygon([(-15, -86), (15, -86), (16, -60), (13, -10), (14, 40), (10, 62), (-10, 62), (-14, 40)]), 3)
+    slot = rectangle(8, 104, 3.5, (2, -4))
+    body = union(plate(handle, 13, 2.5), plate(rectangle(22, 26, 3, (0, -74)), 15, 2))
+    body = cut(body, plate(slot, 8).translate((0, 0, 8)))
+    slider = union(plate(rectangle(13, 26, 3, (2, 22)), 6, 1).translate((0, 0, 7)), *(block(13, 1.6, 2.4, 0, (2, y, 10)) for y in (15, 19, 23, 27, 31)))
+    blade = plate(polygon([(-9, 40), (9, 40), (9, 104), (-9, 122)]), 2.0)
+    scores = [place(block(26, 1.2, 3, 0), (0, y, 1.6), (0, 0, -35)) for y in (66, 77, 88, 99)]
+    backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
+    ribs = [block(35, 2.6, 9, 1, (0, y, 0)) for y in range(-58, -20, 7)]
+    grips = [place(rod((0, 0, -20), (0, 0, 20), 5), (17, y, 0)) for y in (-44, -30, -16)]
+    return place(facing(union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))), turn=(22, 0, 8))
+
+
+def _handle(profile: list[Point2], flatten: float = 1.0) -> Solid:
+    """Turned handle pointing down from the origin (x, y drawn), pressed flat towards the viewer."""
+    shape = np.asarray(profile)
+    turned = lathe(np.concatenate([shape[:1] * (0.5, 1), curve(shape, 8)]), segments=64)
+    return turned.rotate((90, 0, 0)).scale((1, 1, flatten))
+
+
+def paint_brush() -> Solid:
+    """Artist's flat brush, 230 mm: long turned handle, crimped ferrule, bristles coming to a rounded edge."""
+    handle = _handle([(11.5, 0), (14.0, 22), (13.0, 44), (8.0, 90), (6.4, 130), (5.2, 155), (4.0, 162)])
+    ferrule = loft([(-6, 24, 22, 2), (2, 25, 23, 2), (20, 32, 17, 2.4), (38, 36, 14, 2.8)], smooth=4, sides=64)
+    crimps = [place(ring(12.6, 1.2), (0, y, 0), (90, 0, 0)) for y in (0.5, 5.5)]
+    bristles = loft([(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)], smooth=5, sides=96)
+    upright = union(ferrule, bristles).rotate((0, 0, -90)).rotate((-90, 0, 0)).mirror((0, 1, 0)).rotate((0, 180, 0))
+    upright = upright if upright.bounding_box()[4] > 60 else upright.mirror((0, 1, 0))
+    hairs = [place(block(0.9, 46, 16, 0), (x, 68, 0), (0, 0, -0.12 * x)) for x in range(-15, 16, 5)]
+    return place(facing(union(handle, cut(upright, *(h - plate(rectangle(60, 60, 0, (0, 66)), 9) for h in hairs)), *crimps)), turn=(16, 0, 8))
+
+
+def paint_brush_large() -> Solid:
+    """Wall brush, 100 mm wide: thick bristles, nailed ferrule, beaver-tail handle with a hanging hole."""
+    ferrule = block(100, 42, 22, 2.5, (0, 20, 0))
+    bands = [block(102, 4, 24, 1.5, (0, y, 0)) for y in (4, 36)]
+    nails = [rod((x, 20, -12.2), (x, 20, 12.2), 2.2) for x in (-40, -20, 0, 20, 40)]
+    outline = np.concatenate([
+        curve([(-48, 2), (-44, -14), (-22, -30), (-14, -52), (-15, -84), (-20, -112), (-15, -134), (0, -142)]),
+        curve([(0, -142), (15, -134), (20, -112), (15, -84), (14, -52), (22, -30), (44, -14), (48, 2)])[1:],
+    ])  # fmt: skip
+    handle = union(plate(polygon(outline), 14), plate(polygon(outline).offset(-5), 19))
+    handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
+    tuft = loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5)
+    tuft = tuft.rotate((0, 0, 90)).rotate((-90, 0, 0))
+    tuft = tuft if tuft.bounding_box()[4] > 60 else tuft.mirror((0, 1, 0))
+    furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x in range(-45, 46, 6) for s in (-1, 1)]
+    return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(10, -6, 10))
+
+
+def pallet_knife() -> Solid:
+    """Trowel-shaped palette knife, 215 mm: leaf blade on a cranked neck, turned handle with a brass collar."""
+    leaf = polygon(np.concatenate([
+        curve([(0, 120), (10, 106), (22, 76), (24, 54), (14, 36), (0, 30)]),
+        curve([(0, 30), (-14, 36), (-24, 54), (-22, 76), (-10, 106), (0, 120)])[1:],
+    ]), 0.5)  # fmt: skip
+    neck = tube(curve([(0, -6, 0), (0, 8, 1), (0, 20, 9), (0, 32, 16), (0, 46, 17)]), 3.6, flatten=0.8, up=(1, 0, 0))
+    collar = place(lathe([(8, 0), (9, 3), (8, 9), (6, 11)], segments=48), (0, -11, 0), (-90, 0, 0))
+    handle = _handle([(8.5, 8), (11.0, 26), (11.5, 50), (9.0, 76), (10.5, 94), (7.0, 104)])
+    return place(facing(union(plate(leaf, 2.6).translate((0, 0, 17)), neck, collar, handle)), turn=(16, 0, 10))
+
+
+def pallet_knife_large() -> Solid:
+    """Long palette knife, 290 mm: straight round-ended blade, bolster, riveted flat handle."""
+    blade = polygon(np.concatenate([
+        curve([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)]), curve([(0, 174), (-14, 166), (-18, 150), (-17, 90), (-12, 20)])[1:],
+        [(-9, 0), (9, 0)],
+    ]))  # fmt: skip
+    bolster = block(26, 16, 15, 3, (0, 4, 0))
+    grip = polygon(np.concatenate([
+        curve([(-12, 4), (-15, -30), (-12, -62), (-16, -98), (-10, -116), (0, -120)]),
+        curve([(0, -120), (10, -116), (16, -98), (12, -62), (15, -30), (12, 4)])[1:],
+    ]))  # fmt: skip
+    handle = union(plate(grip, 15), plate(grip.offset(-3.5), 20))
+    rivets = [rod((0, y, -11), (0, y, 11), 3.6) for y in (-20, -56, -92)]
+    return place(facing(union(plate(blade, 3.0), bolster, handle, *rivets)), turn=(14, 8, 10))
