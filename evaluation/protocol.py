@@ -7,7 +7,8 @@ A change that can move any number in a result raises `PROTOCOL_VERSION`; a chang
 from typing import Literal, get_args
 
 PROTOCOL_VERSION = "1.0.0"
-RESULT_SCHEMA_VERSION = "1.0.0"
+SchemaVersion = Literal["1.0.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "1.0.0"
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle range"]

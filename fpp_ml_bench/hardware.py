@@ -33,7 +33,7 @@ def describe_hardware() -> Hardware:
     """Describe this machine. Never raises; a value that can't be found is ``"unknown"``, 0.0 GiB or None."""
     return Hardware(
         cpu=_cpu_model(),
-        cores=_usable_cores(),
+        cores=usable_cores(),
         memory_gib=round(_usable_memory_bytes() / _GIB, 1),
         gpu=_gpu_names(),
         platform=f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -52,7 +52,7 @@ def _cpu_model() -> str:
     return (found.group(1).strip() if found else platform.processor()) or "unknown"
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
     """CPUs in the affinity mask, or fewer where the container's quota (cgroup v2 ``cpu.max``) allows less."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     found = re.match(r"(\d+) (\d+)", _read("/sys/fs/cgroup/cpu.max"))

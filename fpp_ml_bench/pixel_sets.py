@@ -61,7 +61,8 @@ def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = Non
     edge = depth_edges(depth_mm, jump_mm)
     if not edge.any():
         return np.full(depth_mm.shape, np.inf, dtype=np.float32)
-    return cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance, dtype=np.float32)
 
 
 def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:

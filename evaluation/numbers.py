@@ -1,0 +1,20 @@
+"""How numbers are written in tables: the same digits in the terminal, in Markdown and on the page."""
+
+
+def millimetres(value: float | None) -> str:
+    """An error in mm to three decimals, in powers of ten where those say nothing, a dash for an empty pixel set."""
+    if value is None:
+        return "-"
+    if value == 0:
+        return "0"
+    return f"{value:.3f}" if 5e-4 <= value < 1e6 else f"{value:.2e}"
+
+
+def percent(share: float | None) -> str:
+    """A share as per cent with one decimal, a dash where there is nothing to take a share of."""
+    return "-" if share is None else f"{100 * share:.1f}%"
+
+
+def seconds(value: float | None) -> str:
+    """A time in seconds to three significant digits, a dash when unknown."""
+    return "-" if value is None else f"{value:.3g}"

@@ -1,0 +1,75 @@
+"""Result files on disk: written complete or not at all, read as strictly as they are written."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.schema import validate
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.loaders.manifest import write_atomically
+
+MAX_BYTES = 64 * 1024 * 1024
+
+
+def result_json(result: Result) -> bytes:
+    """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
+    text = json.dumps(result.model_dump(mode="json"), indent=1, allow_nan=False, ensure_ascii=False)
+    return text.encode("utf-8") + b"\n"
+
+
+def write_result(result: Result, path: Path) -> None:
+    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
+    try:
+        write_atomically(path, result_json(result))
+    except OSError as error:
+        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+
+
+def read_result(path: Path) -> Result:
+    """The result in ``path``; SubmissionError names the file and what is wrong with it."""
+    shown = printable(str(path), 500)
+    try:
+        if not path.is_file():
+            raise SubmissionError(f"{shown}: expected a result file of fpp-eval, found {_kind(path)}")
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise SubmissionError(f"{shown} can't be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise SubmissionError(f"{shown}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
+    try:
+        content = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{shown}: expected UTF-8 text; write it again with fpp-eval --json") from None
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
+        raise SubmissionError(f"{shown} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version != RESULT_SCHEMA_VERSION:
+        came = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
+        raise SubmissionError(
+            f"{shown}: expected a result file with schema_version {RESULT_SCHEMA_VERSION}, got {came}; "
+            "score the predictions again with this version's fpp-eval"
+        )
+    result: Result = validate(Result, content, path, "result of fpp-eval")
+    return result
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"key {printable(key, 60)!r} stands twice")
+        content[key] = value
+    return content
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number a score can have")
+
+
+def _kind(path: Path) -> str:
+    return "a folder" if path.is_dir() else "no such file"

@@ -1,0 +1,59 @@
+"""Building blocks of the strict file models: text that is text, numbers that are numbers, errors a person reads."""
+
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.text import printable, text_problem
+
+MAX_PROBLEMS = 50
+Model = TypeVar("Model", bound="StrictModel")
+
+
+def _checked(value: str) -> str:
+    problem = text_problem(value)
+    if problem is not None:
+        raise ValueError(problem)
+    return value
+
+
+Text = Annotated[str, AfterValidator(_checked)]
+Scalar = Text | bool | int | float | None
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class StrictModel(BaseModel):
+    """No unknown keys, no coercion (``"3"`` is no 3, ``true`` no 1), no NaN or infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def problems_of(error: ValidationError) -> list[str]:
+    """One line a problem: where, what is wrong, what came; safe to print."""
+    lines = []
+    for item in error.errors(include_url=False, include_context=False)[:MAX_PROBLEMS]:
+        where = ".".join(printable(str(part), 60) for part in item["loc"]) or "the file as a whole"
+        message = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "missing":
+            lines.append(f"{where}: is missing")
+        elif item["type"] == "extra_forbidden":
+            lines.append(f"{where}: is not a key of this file; remove it or correct its spelling")
+        elif item["loc"] and isinstance(item["input"], str | int | float | bool | type(None)):
+            lines.append(f"{where}: {message} (got {printable(repr(item['input']), 60)})")
+        else:
+            lines.append(f"{where}: {message}")
+    return lines
+
+
+def validate(model: type[Model], value: Any, path: Path, what: str) -> Model:
+    """``value`` as ``model``, or SubmissionError naming ``path`` and every key that is wrong."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        lines = "\n  ".join(problems_of(error))
+        raise SubmissionError(f"{printable(str(path), 500)} is no valid {what}:\n  {lines}") from None

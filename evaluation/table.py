@@ -1,0 +1,97 @@
+"""What `fpp-eval` prints: the three pixel sets, what edges and missing pixels add, and the samples it went worst on."""
+
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
+from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
+from fpp_ml_bench.evaluation.result import Result, SampleResult
+from fpp_ml_bench.evaluation.text import printable
+
+WORST = 5
+
+
+def result_table(result: Result) -> Group:
+    """The result as rich tables; every text from the submission is shown as plain text, never as markup."""
+    return Group(*(part for part in (_title(result), _scores(result), _notes(result), _worst(result)) if part))
+
+
+def _title(result: Result) -> Text:
+    about = result.dataset
+    return Text(
+        f"\n{printable(result.submission.name)}\n"
+        f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
+        f"{about.size[1]}x{about.size[0]} px, against {result.target}, {result.track} track\n"
+    )
+
+
+def _scores(result: Result) -> Table:
+    table = Table(caption="mm; mean and median over samples, pooled over all pixels", caption_justify="left")
+    table.add_column("Pixel set")
+    for title in ("MAE mean", "MAE median", "MAE pooled", "RMSE mean", "RMSE median", "RMSE pooled"):
+        table.add_column(title, justify="right")
+    for pixels in PIXEL_SETS:
+        cells = [
+            millimetres(getattr(part, f"{pixels}_{error}_mm"))
+            for error in ("mae", "rmse")
+            for part in (result.metrics, result.median, result.pooled)
+        ]
+        table.add_row(pixels, *cells, style="bold" if pixels == "object" else None)
+    for pixels, title in (
+        ("interior", f"object, {result.edge_band_px} px or more from edges"),
+        ("edge", "object, nearer"),
+    ):
+        cells = [
+            cell
+            for error in ("mae", "rmse")
+            for cell in (
+                *(
+                    millimetres(getattr(part, f"object_{pixels}_{error}_mm"))
+                    for part in (result.metrics, result.median)
+                ),
+                "",
+            )
+        ]
+        table.add_row(title, *cells)
+    return table
+
+
+def _notes(result: Result) -> Text:
+    scores = result.metrics
+    lines = [
+        f"Object pixels near a depth edge: {percent(scores.object_edge_share)}; not measured: "
+        f"{percent(scores.object_missing_share)}; MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm."
+    ]
+    if result.samples_without_object:
+        lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
+    if result.samples_without_background:
+        lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
+    if result.track == "oracle range":
+        lines.append("Oracle range: the method was given depth_min and depth_max of these very samples.")
+    taken = result.submission.seconds_per_sample
+    frames = len(result.submission.frames_used)
+    time = "unknown time" if taken is None else f"{seconds(taken)} s ({result.submission.seconds_source})"
+    lines.append(f"Frames used: {frames}; {time} a sample.")
+    return Text("\n".join(lines) + "\n")
+
+
+def _worst(result: Result) -> Table | None:
+    rows = [row for row in result.per_sample if row.object_mae_mm is not None]
+    if not rows:
+        return None
+    table = Table(title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples", title_justify="left")
+    table.add_column("Sample")
+    for title in ("Object MAE", "Object RMSE", "Background MAE", "Near edges", "Not measured"):
+        table.add_column(title, justify="right")
+    for row in sorted(rows, key=_badness)[:WORST]:
+        cells: list[Any] = [millimetres(row.object_mae_mm), millimetres(row.object_rmse_mm)]
+        cells += [millimetres(row.background_mae_mm), percent(row.object_edge_share), percent(row.object_missing_share)]
+        table.add_row(Text(printable(row.sample)), *cells)
+    return table
+
+
+def _badness(row: SampleResult) -> tuple[float, str]:
+    return -(row.object_mae_mm or 0.0), row.sample
