@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.frames import DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
+from fpp_ml_bench.gray_code import bits_needed, cell_count
 from fpp_ml_bench.pinhole import Maps, number, numbers
 from fpp_ml_bench.pinhole import Pinhole as Pinhole
 
@@ -174,16 +175,6 @@ class Rig:
                     f"px of a {self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger "
                     f"size, or a pitch of at least {math.ceil(needed * 100) / 100:g} px"
                 )
-
-
-def cell_count(length_px: int, pitch_px: float) -> int:
-    """Gray-code cells of half a period on a pattern ``length_px`` long."""
-    return math.floor((length_px - 1) / (pitch_px / 2)) + 1
-
-
-def bits_needed(length_px: int, pitch_px: float) -> int:
-    """Gray bits that tell all cells apart: ceil(log2(cells)), at least 1."""
-    return max(1, (cell_count(length_px, pitch_px) - 1).bit_length())
 
 
 def paper_rig(size: int = FULL_SIZE) -> Rig:

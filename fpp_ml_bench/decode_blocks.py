@@ -1,0 +1,208 @@
+"""One block of pixels through the decoder: the stages, each compiled or in NumPy, and the verdict on every pixel.
+
+`fpp_ml_bench.decoding` cuts the image into blocks that fit the processor's cache and calls `decode` here.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.gray_code import (
+    AMBIGUOUS_FRACTION,
+    INCONSISTENT_RAD,
+    absolute_phase,
+    cell_centres_rad,
+    decode_cells,
+)
+from fpp_ml_bench.phase import choose_steps, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.pinhole import Maps
+from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.triangulation import depth_from_both, depth_from_coordinate
+
+MIN_MODULATION = 5.0
+"""Grey levels. At read noise of one level and only 3 steps this leaves a phase noise of 0.16 rad: a tenth of the pi/2
+that the fringe order tolerates, and some 7 mm of depth at 1.8 m. Darker than this is shadow, glare or no projector light."""
+CLIPPED_STEPS_DIVISOR = 9
+"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). With so many steps a clipped crest distorts
+the phase by under 5 mrad, since N steps cancel harmonics up to N - 2; with few steps it would bias it by tens of mrad."""
+MAX_DISAGREEMENT_PX = 1.5
+"""Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps gives a
+sigma of 0.5 px; a fringe order wrong by one puts an 18-px fringe more than 10 px off."""
+
+
+class Reason(IntEnum):
+    """Why a pixel has no depth; of several, the lowest is given."""
+
+    DECODED = 0
+    NO_RAY = 1
+    LOW_MODULATION = 2
+    SATURATED = 3
+    INCONSISTENT_ORDER = 4
+    OUTSIDE_PATTERN = 5
+    DIRECTIONS_DISAGREE = 6
+    OUTSIDE_RANGE = 7
+    NOT_ASKED = 8
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a pixel must fulfil to be decoded; the defaults are explained beside their constants."""
+
+    min_modulation: float = MIN_MODULATION
+    max_clipped_steps: int | None = None
+    max_disagreement_px: float = MAX_DISAGREEMENT_PX
+    ambiguous_fraction: float = AMBIGUOUS_FRACTION
+
+
+@dataclass(frozen=True)
+class DirectionPlan:
+    """Everything about decoding one direction that does not depend on the pixel."""
+
+    direction: Direction
+    sinusoids: tuple[int, ...]
+    gray: tuple[int, ...]
+    weights: NDArray[np.float64]
+    centres_rad: NDArray[np.float64]
+    pitch_px: float
+    length_px: int
+    max_clipped_steps: int
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Indices of the frames it reads, in the order of its grey levels."""
+        return self.sinusoids + self.gray
+
+
+def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -> DirectionPlan:
+    """Plan for one direction with ``steps`` of the rig's sinusoids; raises `DecodeError` for an impossible number."""
+    chosen = choose_steps(rig.sequence.steps, steps)
+    available = rig.sequence.sinusoids(direction)
+    pitch, length = rig.pitch(direction), rig.pattern_length(direction)
+    allowed = limits.max_clipped_steps
+    return DirectionPlan(
+        direction=direction,
+        sinusoids=tuple(available[i] for i in chosen),
+        gray=tuple(rig.sequence.gray(direction)),
+        weights=phase_weights(2 * np.pi * np.array(chosen) / rig.sequence.steps),
+        centres_rad=cell_centres_rad(length, pitch),
+        pitch_px=pitch,
+        length_px=length,
+        max_clipped_steps=steps // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
+    )
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """One direction of a block: px, grey levels and rad, float64 (n,), with the reason codes uint8 (n,)."""
+
+    coordinate_px: NDArray[np.float64]
+    modulation: NDArray[np.float64]
+    phase: NDArray[np.float64]
+    reason: NDArray[np.uint8]
+
+
+_STAGE_REASONS = (
+    Reason.LOW_MODULATION,
+    Reason.SATURATED,
+    Reason.INCONSISTENT_ORDER,
+    Reason.OUTSIDE_PATTERN,
+)
+
+
+def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
+    """Projector coordinate of a block from its grey levels, uint8 (frames of the plan, n)."""
+    if numba_enabled():
+        from fpp_ml_bench.decode_kernels import decode_block
+
+        count = grey.shape[1]
+        found = Coordinates(*(np.empty(count) for _ in range(3)), reason=np.empty(count, dtype=np.uint8))
+        thresholds = (
+            float(limits.min_modulation),
+            float(plan.max_clipped_steps),
+            float(limits.ambiguous_fraction),
+            INCONSISTENT_RAD,
+        )
+        codes = np.array(_STAGE_REASONS, dtype=np.uint8)
+        decode_block(
+            grey, plan.weights, len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px), thresholds,
+            codes, found.coordinate_px, found.modulation, found.phase, found.reason,
+        )  # fmt: skip
+        return found
+    steps = len(plan.sinusoids)
+    mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
+    modulation = np.sqrt(cosine * cosine + sine * sine)
+    phase = minus_atan2(sine, cosine)
+    cells, trusted = decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
+    absolute, consistent = absolute_phase(phase, cells, plan.centres_rad)
+    coordinate = absolute * (plan.pitch_px / (2 * np.pi))
+    clipped = (grey[:steps] == GREY_LEVELS).sum(axis=0)
+    faults = (
+        modulation < limits.min_modulation,
+        clipped > plan.max_clipped_steps,
+        ~(trusted & consistent),
+        (coordinate < -0.5) | (coordinate > plan.length_px - 0.5),
+    )
+    reason = np.zeros(grey.shape[1], dtype=np.uint8)
+    for code, fault in reversed(list(zip(_STAGE_REASONS, faults, strict=True))):
+        reason[fault] = code
+    return Coordinates(coordinate, modulation, phase, reason)
+
+
+def _depth_one(rays: Maps, found: Coordinates, plan: DirectionPlan, rig: Rig) -> NDArray[np.float64]:
+    if rig.projector.is_distorted or not numba_enabled():
+        return depth_from_coordinate(rays, found.coordinate_px, rig, plan.direction)
+    from fpp_ml_bench.decode_kernels import depth_one
+
+    device, depth_mm = rig.projector, np.empty(len(found.reason))
+    axis = 0 if plan.direction == "vertical" else 1
+    focal, centre = (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
+    depth_one(*rays, found.coordinate_px, rig.R, rig.t, axis, focal, centre, depth_mm)
+    return depth_mm
+
+
+def _depth_both(
+    rays: Maps, found: dict[Direction, Coordinates], rig: Rig
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    u, v = found["vertical"], found["horizontal"]
+    # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
+    weight_u, weight_v = u.modulation / rig.pitch("vertical"), v.modulation / rig.pitch("horizontal")
+    if rig.projector.is_distorted or not numba_enabled():
+        squared = weight_u * weight_u, weight_v * weight_v
+        return depth_from_both(rays, u.coordinate_px, v.coordinate_px, rig, *squared)
+    from fpp_ml_bench.decode_kernels import depth_both
+
+    device, depth_mm, disagreement = rig.projector, np.empty(len(u.reason)), np.empty(len(u.reason))
+    focal, centre = (device.fx, device.fy), (device.cx, device.cy)
+    depth_both(
+        *rays, u.coordinate_px, v.coordinate_px, weight_u, weight_v, rig.R, rig.t, focal, centre, depth_mm, disagreement
+    )
+    return depth_mm, disagreement
+
+
+def decode(
+    grey: dict[Direction, NDArray[np.uint8]], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], dict[Direction, Coordinates]]:
+    """Depth in mm float32 (n,), 0 = none, reason uint8 (n,), and the coordinates of each direction, of one block."""
+    found = {plan.direction: decode_direction(grey[plan.direction], plan, limits) for plan in plans}
+    first = found[plans[0].direction]
+    if len(plans) == 1:
+        reason = first.reason.copy()
+        depth_mm = _depth_one(rays, first, plans[0], rig)
+    else:
+        second = found[plans[1].direction]
+        lower, upper = np.minimum(first.reason, second.reason), np.maximum(first.reason, second.reason)
+        reason = np.where(lower == 0, upper, lower)
+        depth_mm, disagreement = _depth_both(rays, found, rig)
+        reason[(reason == 0) & (disagreement > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
+    near, far = rig.working_range_mm
+    missing = np.isnan(depth_mm)
+    with np.errstate(invalid="ignore"):
+        outside = ~missing & ((depth_mm < near) | (depth_mm > far))
+    reason[(reason == 0) & outside] = Reason.OUTSIDE_RANGE
+    reason[((reason == 0) & missing) | np.isnan(rays[0])] = Reason.NO_RAY
+    return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason, found

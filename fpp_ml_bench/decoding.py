@@ -1,0 +1,200 @@
+"""The classical decoder: a stack of frames to depth, with a reason for every pixel that has none.
+
+Wrapped phase by N steps, fringe order from the half-period Gray code, triangulation from one or both projector
+coordinates (paper Section 2.1). Frames are read once, in blocks; nothing is filtered, interpolated or guessed: a pixel
+that can't be decoded has depth 0 and says why.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.decode_blocks import Coordinates, DirectionPlan, Limits, Reason, decode, plan_direction
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.frames import DIRECTIONS, Direction
+from fpp_ml_bench.rig import Rig
+
+Directions = Literal["horizontal", "vertical", "both"]
+
+BLOCK_PX = 1 << 15
+"""Pixels worked off at a time: the grey levels of a block, 0.8 MB a direction, and its results stay in the cache."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One direction of the image: ``coordinate_px`` float64 (NaN = not decoded), ``modulation`` float32 grey levels and
+    ``phase`` float64 rad in [-pi, pi), each (H, W)."""
+
+    coordinate_px: NDArray[np.float64]
+    modulation: NDArray[np.float32]
+    phase: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """``depth_mm`` float32 (H, W), 0 = none; ``reason`` uint8 (H, W), a `Reason` code each; ``counts`` pixels per reason
+    (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, if asked for."""
+
+    depth_mm: NDArray[np.float32]
+    reason: NDArray[np.uint8]
+    counts: dict[str, int]
+    frames_used: tuple[int, ...]
+    details: dict[Direction, Measured] = field(default_factory=dict)
+
+
+def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
+    """The frames that are needed, checked and flat."""
+    expected = (rig.camera.height, rig.camera.width)
+    if len(frames) != len(rig.sequence):
+        raise DecodeError(
+            f"expected the {len(rig.sequence)} frames of the rig's sequence, got {len(frames)}; "
+            "put None in the place of a frame that was not captured"
+        )
+    flat = {}
+    for index in used:
+        frame = frames[index]
+        title = f"frame {rig.sequence.frames[index].title}"
+        if frame is None:
+            raise DecodeError(f"{title}: is needed and missing")
+        image = np.asarray(frame)
+        if image.dtype != np.uint8:
+            raise DecodeError(f"{title}: expected uint8 grey levels, got dtype {image.dtype}")
+        if image.shape != expected:
+            raise DecodeError(
+                f"{title}: expected shape (H, W) = {expected} of the rig's camera, got {image.shape}; "
+                "use rig.scaled(width) for a resized image"
+            )
+        flat[index] = image.reshape(-1)
+    return flat
+
+
+def _checked_mask(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.intp] | None:
+    if mask is None:
+        return None
+    if np.asarray(mask).dtype != np.bool_ or np.shape(mask) != shape:
+        raise DecodeError(f"mask: expected bool {shape}, got {np.asarray(mask).dtype} {np.shape(mask)}")
+    return np.flatnonzero(mask)
+
+
+def _checked_limits(limits: Limits) -> None:
+    for name in ("min_modulation", "max_disagreement_px", "ambiguous_fraction"):
+        value = getattr(limits, name)
+        if not (np.isfinite(value) and value > 0):
+            raise DecodeError(f"{name}: expected a positive finite number, got {value!r}")
+    if limits.max_clipped_steps is not None and limits.max_clipped_steps < 0:
+        raise DecodeError(f"max_clipped_steps: expected 0 or more, got {limits.max_clipped_steps!r}")
+
+
+def decode_stack(
+    frames: Sequence[NDArray | None] | NDArray,
+    rig: Rig,
+    direction: Directions = "both",
+    steps: int | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    limits: Limits | None = None,
+    details: bool = False,
+    threads: int = 1,
+) -> Decoded:
+    """Depth in mm from a captured sequence.
+
+    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views (nothing is stacked or kept) or
+    an array (F, H, W); a frame that is not needed may be None. Black and white are never needed: the threshold of the Gray
+    code is the sinusoids' own mean.
+
+    ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
+    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels whose two answers disagree by more
+    than ``limits.max_disagreement_px`` across the epipolar line.
+
+    ``steps``: how many of the N sinusoids a direction to use, 3 to N (default: all), spread as evenly as they go; where
+    they are not quite even (N not a multiple), the phase is the least-squares one.
+
+    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and cost nothing. ``threads``: the result is
+    the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return coordinates,
+    modulation and wrapped phase.
+
+    Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane leaves the
+    depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit.
+    """
+    if direction != "both" and direction not in DIRECTIONS:
+        raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
+    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
+    limits = limits or Limits()
+    _checked_limits(limits)
+    wanted = rig.sequence.steps if steps is None else steps
+    asked: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
+    plans = [plan_direction(rig, one, wanted, limits) for one in asked]
+    used = tuple(sorted(index for plan in plans for index in plan.frames))
+    flat = _used_frames(frames, used, rig)
+    shape = (rig.camera.height, rig.camera.width)
+    chosen = _checked_mask(mask, shape)
+    image = _Image(flat, rig, plans, limits, chosen, details)
+    starts = range(0, image.pixels, BLOCK_PX)
+    if threads == 1 or len(starts) < 2:
+        for start in starts:
+            image.decode_from(start)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(image.decode_from, starts))
+    counts = np.bincount(image.reason, minlength=len(Reason))
+    return Decoded(
+        depth_mm=image.depth_mm.reshape(shape),
+        reason=image.reason.reshape(shape),
+        counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
+        frames_used=used,
+        details={one: image.measured(one, shape) for one in asked} if details else {},
+    )
+
+
+class _Image:
+    """The flat results, and the work on one block of them; blocks touch disjoint pixels."""
+
+    def __init__(
+        self,
+        frames: dict[int, NDArray],
+        rig: Rig,
+        plans: list[DirectionPlan],
+        limits: Limits,
+        chosen: NDArray[np.intp] | None,
+        details: bool,
+    ) -> None:
+        size = rig.camera.height * rig.camera.width
+        self.frames, self.rig, self.plans, self.limits, self.chosen = frames, rig, plans, limits, chosen
+        self.pixels = size if chosen is None else len(chosen)
+        self.depth_mm = np.zeros(size, dtype=np.float32)
+        self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
+        self.rays = tuple(axis.reshape(-1) for axis in rig.camera.rays())
+        self.details: dict[Direction, Coordinates] = {}
+        if details:
+            for plan in plans:
+                maps = (np.full(size, np.nan) for _ in range(3))
+                self.details[plan.direction] = Coordinates(*maps, reason=np.zeros(size, dtype=np.uint8))
+
+    def decode_from(self, start: int) -> None:
+        stop = min(start + BLOCK_PX, self.pixels)
+        where = slice(start, stop) if self.chosen is None else self.chosen[start:stop]
+        grey = {}
+        for plan in self.plans:
+            levels = np.empty((len(plan.frames), stop - start), dtype=np.uint8)
+            for row, index in zip(levels, plan.frames, strict=True):
+                row[:] = self.frames[index][where]
+            grey[plan.direction] = levels
+        rays = self.rays[0][where], self.rays[1][where]
+        depth_mm, reason, found = decode(grey, rays, self.plans, self.rig, self.limits)
+        self.depth_mm[where], self.reason[where] = depth_mm, reason
+        for direction, kept in self.details.items():
+            one = found[direction]
+            kept.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
+            kept.modulation[where], kept.phase[where] = one.modulation, one.phase
+
+    def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
+        kept = self.details[direction]
+        return Measured(
+            kept.coordinate_px.reshape(shape),
+            kept.modulation.astype(np.float32).reshape(shape),
+            kept.phase.reshape(shape),
+        )

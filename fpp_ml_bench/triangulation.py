@@ -1,0 +1,169 @@
+"""Depth from projector coordinates: closed form from one of them, least squares from both, for any rig.
+
+A camera pixel's ray is ``Z (x, y, 1)``; with ``a = R (x, y, 1)`` it runs through ``Z a + t`` in the projector's frame and is
+seen there at ``(Z a_0 + t_0) / (Z a_2 + t_2)``. One ideal projector coordinate x_p therefore gives
+
+    Z = (x_p t_2 - t_0) / (a_0 - x_p a_2)            (and likewise y_p with a_1, t_1),
+
+which for the paper's rig is ``Z = f_p b / (u_p - c_u - f_p x)``. Depth is the camera's z, not the length of the ray.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.frames import DIRECTIONS, Direction
+from fpp_ml_bench.lens import distort
+from fpp_ml_bench.pinhole import Maps
+from fpp_ml_bench.rig import Rig
+
+GAUSS_NEWTON_STEPS = 3
+"""The algebraic start is exact for a projector beside the camera (t_2 = 0) and close otherwise; each step squares the
+relative error, and three leave nothing of it in float64."""
+FIXED_POINT_STEPS = 50
+FIXED_POINT_TOLERANCE = 1e-13
+"""Last change, in normalised units, of a projector coordinate whose distortion has been iterated away."""
+
+
+class DepthFromBoth(NamedTuple):
+    """``depth_mm`` float64, NaN where there is none; ``disagreement_px``: projector px from the epipolar line."""
+
+    depth_mm: NDArray[np.float64]
+    disagreement_px: NDArray[np.float64]
+
+
+def _axis(direction: Direction) -> int:
+    if direction not in DIRECTIONS:
+        raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
+    return 0 if direction == "vertical" else 1
+
+
+def rotated_ray(rays: Maps, rig: Rig, axis: int) -> NDArray[np.float64]:
+    """Component ``axis`` of R (x, y, 1)."""
+    x, y = rays
+    return rig.R[axis, 0] * x + rig.R[axis, 1] * y + rig.R[axis, 2]
+
+
+def _kept(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.float64]:
+    """Depth in mm where it is finite and in front of both devices, else NaN."""
+    good = (depth_m > 0) & (depth_m < np.inf) & (forward * depth_m + rig.t[2] > 0)
+    return np.where(good, depth_m * MM_PER_M, np.nan)
+
+
+def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
+    """Ideal normalised projector coordinate of a distorted one whose partner is unknown.
+
+    The ray supplies the partner: depth from the present estimate, the point's projection, its distortion taken off the
+    measured coordinate, and again. Each round shrinks the error by the distortion's slope (a few percent for real
+    lenses); what has not settled to `FIXED_POINT_TOLERANCE` after `FIXED_POINT_STEPS` is NaN.
+    """
+    device = rig.projector
+    measured = (coordinate - (device.cx, device.cy)[axis]) / (device.fx, device.fy)[axis]
+    a = [rotated_ray(rays, rig, i) for i in range(3)]
+    ideal, change = measured, np.full(np.shape(measured), np.inf)
+    for _ in range(FIXED_POINT_STEPS):
+        depth = (ideal * rig.t[2] - rig.t[axis]) / (a[axis] - ideal * a[2])
+        forward = depth * a[2] + rig.t[2]
+        point = [(depth * a[i] + rig.t[i]) / forward for i in range(2)]
+        following = measured - (distort(point[0], point[1], device.distortion)[axis] - point[axis])
+        change, ideal = np.abs(following - ideal), following
+        if not np.any(change > FIXED_POINT_TOLERANCE):
+            break
+    return np.where(change <= FIXED_POINT_TOLERANCE, ideal, np.nan)
+
+
+def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direction: Direction) -> NDArray[np.float64]:
+    """Depth in mm from one projector coordinate per pixel, float64; NaN where there is none.
+
+    ``rays``: normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for
+    ``direction`` "vertical", v_p for "horizontal", in px, same shape. No depth: NaN input, ray and projector plane
+    parallel, intersection behind either device, or a projector distortion that can't be inverted.
+    """
+    axis = _axis(direction)
+    device = rig.projector
+    coordinate = np.asarray(coordinate_px, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        if device.is_distorted:
+            ideal = _ideal_coordinate(rays, coordinate, rig, axis)
+        else:
+            ideal = (coordinate - (device.cx, device.cy)[axis]) / (device.fx, device.fy)[axis]
+        forward = rotated_ray(rays, rig, 2)
+        depth = (ideal * rig.t[2] - rig.t[axis]) / (rotated_ray(rays, rig, axis) - ideal * forward)
+        return _kept(depth, forward, rig)
+
+
+def depth_from_both(
+    rays: Maps,
+    u_px: ArrayLike,
+    v_px: ArrayLike,
+    rig: Rig,
+    weight_u: ArrayLike = 1.0,
+    weight_v: ArrayLike = 1.0,
+) -> DepthFromBoth:
+    """Depth in mm from both projector coordinates by weighted least squares in projector px, float64; NaN where none.
+
+    ``weight_u`` and ``weight_v`` are 1 / sigma^2 of the coordinates, up to a common factor; with sigma proportional to
+    pitch over modulation that is (B / P)^2. Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear
+    functions: algebraic start, then `GAUSS_NEWTON_STEPS` where the projector is not beside the camera. What is left over
+    lies across the epipolar line: ``disagreement_px`` is the measured point's distance from it, whatever the weights.
+    """
+    device = rig.projector
+    u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)
+    tx, ty, tz = rig.t
+    with np.errstate(all="ignore"):
+        px, py = device.normalised(u, v)
+        forward = rotated_ray(rays, rig, 2)
+        # f (c - d w) / (forward + t_2 w) is the residual in px; c and d are fixed by the measurement.
+        cu, du = device.fx * (rotated_ray(rays, rig, 0) - px * forward), device.fx * (px * tz - tx)
+        cv, dv = device.fy * (rotated_ray(rays, rig, 1) - py * forward), device.fy * (py * tz - ty)
+        w = (weight_u * cu * du + weight_v * cv * dv) / (weight_u * du * du + weight_v * dv * dv)
+        if tz != 0.0:
+            for _ in range(GAUSS_NEWTON_STEPS):
+                q = forward + tz * w
+                ru, rv = (cu - du * w) / q, (cv - dv * w) / q
+                gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
+                w = w + (weight_u * ru * gu + weight_v * rv * gv) / (weight_u * gu * gu + weight_v * gv * gv)
+        q = forward + tz * w
+        ru, rv = (cu - du * w) / q, (cv - dv * w) / q
+        gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
+        disagreement = np.abs(ru * gv - rv * gu) / np.sqrt(gu * gu + gv * gv)
+        return DepthFromBoth(_kept(1.0 / w, forward, rig), disagreement)
+
+
+def depth_noise_mm(
+    rig: Rig,
+    depth_mm: ArrayLike,
+    direction: Direction | str,
+    steps: int,
+    modulation: ArrayLike,
+    noise: ArrayLike = 1.0,
+    rays: Maps | None = None,
+) -> NDArray[np.float64]:
+    """Standard deviation of the depth in mm that intensity noise causes, float64.
+
+    ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical
+    axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / |du/dZ|; for the paper's
+    rig the last is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add. Projector
+    distortion is left out: it changes the slope by its own few percent.
+    """
+    if direction != "both" and direction not in DIRECTIONS:
+        raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
+    if steps < 3:
+        raise DecodeError(f"steps: expected at least 3, got {steps}")
+    z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
+    where: Maps = rays if rays is not None else (np.zeros(()), np.zeros(()))
+    forward = rotated_ray(where, rig, 2)
+    precision: NDArray[np.float64] | float = 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma_phase = np.sqrt(2.0 / steps) * np.asarray(noise) / np.asarray(modulation)
+        for one in DIRECTIONS if direction == "both" else (direction,):
+            axis = 0 if one == "vertical" else 1
+            focal = (rig.projector.fx, rig.projector.fy)[axis]
+            slope = focal * (rotated_ray(where, rig, axis) * rig.t[2] - rig.t[axis] * forward)
+            slope = slope / (forward * z + rig.t[2]) ** 2
+            sigma_px = rig.pitch(one) * sigma_phase / (2 * np.pi)  # type: ignore[arg-type]
+            precision = precision + (slope / sigma_px) ** 2
+        return MM_PER_M / np.sqrt(precision)
