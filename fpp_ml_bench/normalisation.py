@@ -1,0 +1,70 @@
+"""The three representations of depth that the paper trains on, and the way back to mm (paper Section 3.3).
+
+========== =============================== ==================================
+name       forward                         back
+========== =============================== ==================================
+raw        D (mm)                          D
+global     D / 1000 (m)                    1000 D
+individual (D - D_min) / (D_max - D_min)   D (D_max - D_min) + D_min
+========== =============================== ==================================
+
+Background stays 0 in all three. Under ``individual`` the pixels at D_min also become exactly 0 and can't be told from
+background any more: that is the paper's rule, kept as it is. A flat depth map (D_max == D_min) would divide by zero;
+its object becomes 0 like every pixel at D_min, and comes back as D_min.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.pixel_sets import object_mask
+
+Normalisation = Literal["raw", "global", "individual"]
+NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
+
+
+def _check(name: str) -> None:
+    if name not in NORMALISATIONS:
+        raise ValueError(f"unknown normalisation {name!r}; there are {', '.join(NORMALISATIONS)}")
+
+
+def normalise(depth_mm: NDArray, name: Normalisation, depth_min_mm: float, depth_max_mm: float) -> NDArray[np.float32]:
+    """Depth map in mm, 0 = background, to the representation ``name``; float32 of the same shape.
+
+    Computed in float64: in float32 the difference of two depths near 1800 mm keeps only four digits of a thin object.
+    Raises ``ValueError`` for an unknown name or a range that is not finite and ordered.
+    """
+    _check(name)
+    if name == "raw":
+        return depth_mm.astype(np.float32)
+    depth = depth_mm.astype(np.float64)
+    if name == "global":
+        return (depth / MM_PER_M).astype(np.float32)
+    span = _span(depth_min_mm, depth_max_mm)
+    if span == 0:
+        return np.zeros(depth.shape, dtype=np.float32)
+    return np.where(object_mask(depth), (depth - depth_min_mm) / span, 0.0).astype(np.float32)
+
+
+def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth_max_mm: float) -> NDArray[np.float64]:
+    """A network's output in the representation ``name`` back to mm; float64 of the same shape.
+
+    Under ``individual`` every pixel goes through the same affine map, so a predicted 0 becomes D_min (paper Section
+    5.3.2). Raises ``ValueError`` as `normalise`.
+    """
+    _check(name)
+    depth = values.astype(np.float64)
+    if name == "raw":
+        return depth
+    if name == "global":
+        return depth * MM_PER_M
+    return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
+
+
+def _span(depth_min_mm: float, depth_max_mm: float) -> float:
+    low, high = float(depth_min_mm), float(depth_max_mm)
+    if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+        raise ValueError(f"expected a finite depth range with depth_min <= depth_max, got {low} to {high} mm")
+    return high - low

@@ -1,0 +1,220 @@
+"""From planned shards to a finished folder: skip what is done, write the rest, then card, rig and manifest.
+
+Generated and imported datasets go the same way; they differ only in where their rows come from. Each finished shard
+leaves a receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it says.
+"""
+
+import json
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import connection, get_context, parent_process
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.card import write_card
+from fpp_ml_bench.loaders.folder_lock import writing
+from fpp_ml_bench.loaders.manifest import (
+    MANIFEST, Manifest, ShardFile, dataset_files, describe_file, file_hash, read_manifest, write_atomically,
+)  # fmt: skip
+from fpp_ml_bench.loaders.shards import ShardPlan
+
+SETTINGS = "settings.json"
+Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
+Work = Callable[[Path, Path, ShardPlan, Callable[[], None]], Receipt]
+"""Writes one shard: (dataset folder, scratch folder, plan, to call after each row) -> its files and rows. Picklable."""
+Progress = Callable[[int], None]
+_RESERVE_BYTES = 1 << 26
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A dataset to be written: its plans, the work that writes one, and what the manifest says of the whole."""
+
+    plans: list[ShardPlan]
+    work: Work
+    manifest: Manifest
+    bytes_per_row: int
+
+    def key(self) -> dict[str, Any]:
+        """What must be equal for a resumed run to go on with this folder's work."""
+        content = asdict(self.manifest)
+        return {name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")}
+
+
+def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
+    """Write or finish the dataset; ``progress`` is told of finished rows. Returns the manifest that stands at the end."""
+    with writing(folder) as scratch:
+        if (folder / MANIFEST).exists():
+            return _already_there(folder, assembly)
+        _same_settings(folder, scratch, assembly)
+        for leftover in scratch.glob("*.tmp"):
+            leftover.unlink()
+        receipts = {plan.name: receipt for plan in assembly.plans if (receipt := _receipt(folder, scratch, plan))}
+        missing = [plan for plan in assembly.plans if plan.name not in receipts]
+        progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
+        _enough_space(folder, assembly, missing)
+        for plan, receipt in _run(folder, scratch, assembly.work, missing, workers, progress):
+            _keep_receipt(scratch, plan, receipt)
+            receipts[plan.name] = receipt
+        return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
+
+
+def _already_there(folder: Path, assembly: Assembly) -> Manifest:
+    standing = read_manifest(folder)
+    _compare(folder, {key: asdict(standing)[key] for key in assembly.key()}, assembly.key())
+    return standing
+
+
+def _same_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
+    path = scratch / SETTINGS
+    if path.exists():
+        try:
+            begun = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise BuildError(f"{path}: damaged; delete {folder} and start again") from error
+        _compare(folder, begun, assembly.key())
+    write_atomically(path, json.dumps(assembly.key(), indent=1).encode())
+
+
+def _compare(folder: Path, theirs: dict[str, Any], ours: dict[str, Any]) -> None:
+    """Raise `BuildError` naming what differs between the folder's settings and those asked for."""
+    ours = json.loads(json.dumps(ours))
+    theirs = json.loads(json.dumps(theirs))
+    differing = []
+    for key in ours:
+        if ours[key] == theirs.get(key):
+            continue
+        if isinstance(ours[key], dict) and isinstance(theirs.get(key), dict):
+            names = sorted(set(ours[key]) | set(theirs[key]))
+            differing += [
+                f"{name} (there {_short(theirs[key].get(name))}, now {_short(ours[key].get(name))})"
+                for name in names if ours[key].get(name) != theirs[key].get(name)
+            ]  # fmt: skip
+        else:
+            differing.append(f"{key} (there {_short(theirs.get(key))}, now {_short(ours[key])})")
+    if differing:
+        raise BuildError(
+            f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete this one"
+        )
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
+    """Receipt of a shard that is finished and whole, else None."""
+    path = scratch / f"{plan.name}.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        files = [ShardFile(**entry) for entry in content["files"]]
+        rows = content["rows"]
+        whole = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return (files, rows) if whole and [row["sample"] for row in rows] == [name for name, _, _ in plan.samples] else None
+
+
+def _keep_receipt(scratch: Path, plan: ShardPlan, receipt: Receipt) -> None:
+    files, rows = receipt
+    content = {"files": [asdict(file) for file in files], "rows": rows}
+    write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
+
+
+def _enough_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
+    needed = sum(len(plan.samples) for plan in missing) * assembly.bytes_per_row
+    free = shutil.disk_usage(folder).free
+    if needed + _RESERVE_BYTES > free:
+        raise BuildError(
+            f"{folder}: needs {needed / 1e9:.2f} GB more and the disk has {free / 1e9:.2f} GB free; free some space, "
+            "choose another disk, a smaller --size or fewer --objects"
+        )
+
+
+def _run(
+    folder: Path, scratch: Path, work: Work, plans: list[ShardPlan], workers: int, progress: Progress
+) -> Iterator[tuple[ShardPlan, Receipt]]:
+    """Finished shards as they come."""
+    if workers <= 1 or len(plans) <= 1:
+        for plan in plans:
+            yield plan, work(folder, scratch, plan, lambda: progress(1))
+        return
+    context = get_context("spawn")
+    rows_done = context.Value("q", 0)
+    reported = 0
+    with ProcessPoolExecutor(
+        max_workers=min(workers, len(plans)), mp_context=context, initializer=_start_worker, initargs=(rows_done,)
+    ) as pool:
+        # The longest shards first, so that none of them is what everybody waits for at the end.
+        ordered = sorted(plans, key=lambda plan: -len(plan.samples))
+        futures = {pool.submit(_work_in_worker, work, folder, scratch, plan): plan for plan in ordered}
+        waiting = set(futures)
+        try:
+            while waiting:
+                finished, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                done = rows_done.value
+                progress(done - reported)
+                reported = done
+                for future in finished:
+                    yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise BuildError(
+                f"{folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
+                "--workers 1 it needs the least memory"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+_rows_done: Any = None
+
+
+def _start_worker(rows_done: Any) -> None:
+    """Count rows where the parent sees them, and do not outlive it: an orphan would go on writing an unlocked folder."""
+    global _rows_done
+    _rows_done = rows_done
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _work_in_worker(work: Work, folder: Path, scratch: Path, plan: ShardPlan) -> Receipt:
+    return work(folder, scratch, plan, _count_row)
+
+
+def _count_row() -> None:
+    with _rows_done.get_lock():
+        _rows_done.value += 1
+
+
+def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:
+    samples: dict[str, list[dict[str, Any]]] = {}
+    for plan, (_, rows) in zip(assembly.plans, receipts, strict=True):
+        samples.setdefault(plan.split, []).extend(rows)
+    shards = [file for files, _ in receipts for file in files]
+    manifest = replace(assembly.manifest, samples=samples, shards=shards)
+    write_card(folder, manifest)
+    written = {shard.path for shard in shards} | {MANIFEST}
+    others = [
+        describe_file(folder, path)
+        for path in dataset_files(folder)
+        if path.relative_to(folder).as_posix() not in written
+    ]
+    manifest = replace(manifest, others=others)
+    manifest.write(folder)
+    return manifest

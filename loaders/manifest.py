@@ -1,0 +1,150 @@
+"""``manifest.json``: what a finished dataset folder holds, with a checksum for every file.
+
+It is written last, so a folder without one is a build that was interrupted. It holds nothing that differs between two
+builds of the same settings: no date, no path, no machine.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
+from fpp_ml_bench.errors import DatasetError
+
+MANIFEST = "manifest.json"
+WORK_FOLDER = ".build"
+
+
+@dataclass(frozen=True)
+class ShardFile:
+    """One Arrow file: rows of ``split`` from ``first_row``, columns of ``group``; hash of its bytes (XXH3, 128 bit)."""
+
+    path: str
+    split: str
+    group: str
+    first_row: int
+    rows: int
+    bytes: int
+    xxh3_128: str
+
+
+@dataclass(frozen=True)
+class OtherFile:
+    """A file beside the shards (card, rig, meshes) with the hash of its bytes."""
+
+    path: str
+    bytes: int
+    xxh3_128: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything a reader must know before it opens a shard.
+
+    ``samples`` holds, per split, one mapping per row in row order: sample, object, view and what the builder measured
+    of it (cover, distance, ground-truth error). ``stored`` is the configuration whose frames are on disk.
+    """
+
+    origin: str
+    generator: dict[str, str]
+    settings: dict[str, Any]
+    rig: dict[str, Any]
+    size: tuple[int, int]
+    stored: str
+    exact: bool
+    samples: dict[str, list[dict[str, Any]]]
+    shards: list[ShardFile]
+    others: list[OtherFile] = field(default_factory=list)
+    schema_version: str = SCHEMA_VERSION
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over what defines the data: schema, rig, rows and the hash of every shard; 64 hex digits."""
+        content = asdict(self)
+        for key in ("others", "generator"):
+            content.pop(key)
+        return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+    @property
+    def splits(self) -> dict[str, list[str]]:
+        return {split: [row["sample"] for row in rows] for split, rows in self.samples.items()}
+
+    def write(self, folder: Path) -> None:
+        """Write ``manifest.json`` complete or not at all."""
+        content = {**asdict(self), "fingerprint": self.fingerprint}
+        write_atomically(folder / MANIFEST, json.dumps(content, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Manifest of a dataset folder. Raises `DatasetError` for a folder that is none, is unfinished or is damaged."""
+    path = folder / MANIFEST
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such folder; build one with: fpp-bench build {folder} --preset mini")
+    if not path.is_file():
+        if (folder / WORK_FOLDER).is_dir():
+            raise DatasetError(f"{folder}: this build is not finished; run the same command again and it resumes")
+        raise DatasetError(f"{folder}: no {MANIFEST} there, so this is no dataset of fpp-ml-bench")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        claimed = content.pop("fingerprint")
+        version = str(content.get("schema_version"))
+        if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
+            raise DatasetError(f"{path}: schema version {version}, this package reads {SCHEMA_VERSION}; build it again")
+        content["shards"] = [ShardFile(**shard) for shard in content["shards"]]
+        content["others"] = [OtherFile(**other) for other in content["others"]]
+        content["size"] = tuple(content["size"])
+        manifest = Manifest(**content)
+        unknown = set(manifest.samples) - set(SPLITS)
+        if unknown:
+            raise DatasetError(f"{path}: unknown split {sorted(unknown)[0]!r}, expected {', '.join(SPLITS)}")
+        actual = manifest.fingerprint
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DatasetError(f"{path}: damaged ({error}); build or import the dataset again") from error
+    if actual != claimed:
+        raise DatasetError(f"{path}: damaged, its fingerprint does not match its content; build the dataset again")
+    return manifest
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that it is there complete or not at all, also after a power cut."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def file_hash(path: Path) -> str:
+    """XXH3 128-bit hash of a file's bytes, hex; a memory map, so a file in the page cache goes at memory speed."""
+    import mmap
+
+    import xxhash
+
+    digest = xxhash.xxh3_128()
+    if path.stat().st_size:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            view = memoryview(content)
+            for start in range(0, len(view), 1 << 24):
+                digest.update(view[start : start + (1 << 24)])
+            view.release()
+    return digest.hexdigest()
+
+
+def describe_file(folder: Path, path: Path) -> OtherFile:
+    """Manifest entry of a file below the dataset folder."""
+    return OtherFile(path.relative_to(folder).as_posix(), path.stat().st_size, file_hash(path))
+
+
+def dataset_files(folder: Path) -> Iterator[Path]:
+    """Every file below a dataset folder, sorted, without the builder's own work folder and lock."""
+    for path in sorted(folder.rglob("*")):
+        if WORK_FOLDER not in path.relative_to(folder).parts and (path.is_file() or path.is_symlink()):
+            yield path

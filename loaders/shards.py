@@ -1,0 +1,239 @@
+"""Writing shards: the rows of a few objects, one Arrow stream file per column group, complete or not at all."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.frames import Sequence
+from fpp_ml_bench.loaders.manifest import ShardFile, file_hash
+from fpp_ml_bench.loaders.schema import (
+    DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, arrow_schema, group_columns, stored_groups,
+)  # fmt: skip
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+OBJECTS_PER_SHARD = 4
+"""Four objects are 24 rows: a frame-0 batch of that size no longer notices the file's batch boundaries (measured)."""
+
+
+@dataclass
+class Row:
+    """One sample on its way to disk: frames by index uint8 (H, W), depths float32 (H, W) in mm, what was measured."""
+
+    sample: str
+    object: str
+    view: str
+    frames: dict[int, NDArray[np.uint8]]
+    depth_mm: NDArray[np.float32]
+    depth_exact_mm: NDArray[np.float32] | None
+    measured: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ShardPlan:
+    """Which samples go into shard ``index`` of ``of`` of a split: (sample, object, view), and the first one's row."""
+
+    split: str
+    index: int
+    of: int
+    first_row: int
+    samples: tuple[tuple[str, str, str], ...]
+
+    @property
+    def name(self) -> str:
+        return f"{self.split}-{self.index:05d}-of-{self.of:05d}"
+
+    def path(self, group: str) -> str:
+        stem = f"{group}-{self.index:05d}-of-{self.of:05d}.arrow"
+        return f"{self.split}/{stem}" if group == DATA_GROUP else f"frames/{self.split}/{stem}"
+
+
+def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> list[ShardPlan]:
+    """Shards of one split from its objects' samples, four objects or a few more each, in the order given."""
+    names = list(objects)
+    count = max(1, len(names) // OBJECTS_PER_SHARD)
+    plans, first_row = [], 0
+    for index, chunk in enumerate(np.array_split(np.arange(len(names)), count)):
+        samples = tuple(sample for i in chunk for sample in objects[names[i]])
+        plans.append(ShardPlan(split, index, count, first_row, samples))
+        first_row += len(samples)
+    return plans
+
+
+class ShardWriter:
+    """Writes the files of one shard. Rows come in plan order; pixels are copied once, into reused batch buffers."""
+
+    def __init__(
+        self, folder: Path, scratch: Path, plan: ShardPlan, sequence: Sequence, stored: str, exact: bool,
+        size: tuple[int, int],
+    ) -> None:  # fmt: skip
+        self._folder, self._scratch, self._plan = folder, scratch, plan
+        self._sequence, self._exact, self._size = sequence, exact, size
+        self._groups = stored_groups(sequence, stored)
+
+    def write(
+        self, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None
+    ) -> tuple[list[ShardFile], list[dict[str, Any]]]:
+        """Write all rows; returns the files and, per row, its labels and measurements. ``row_done`` follows each row.
+
+        Raises `BuildError` when the disk is full or can't be written; no unfinished file stays behind.
+        """
+        import pyarrow as pa
+
+        stem = f"{self._plan.name}.{os.getpid()}"
+        temporary = {group: self._scratch / f"{stem}.{group}.tmp" for group in self._groups}
+        try:
+            described = self._write_streams(rows, temporary, row_done)
+            files = []
+            for group, path in temporary.items():
+                target = self._folder / self._plan.path(group)
+                entry = ShardFile(
+                    self._plan.path(group), self._plan.split, group, self._plan.first_row, len(self._plan.samples),
+                    path.stat().st_size, file_hash(path),
+                )  # fmt: skip
+                target.parent.mkdir(parents=True, exist_ok=True)
+                path.replace(target)
+                files.append(entry)
+        except (OSError, pa.ArrowException) as error:
+            raise BuildError(
+                f"{self._folder / self._plan.path(DATA_GROUP)}: can't be written ({_reason(error)}); free some space or "
+                "choose another disk, then run the same command again: it resumes"
+            ) from error
+        finally:
+            for path in temporary.values():
+                path.unlink(missing_ok=True)
+        return files, described
+
+    def _write_streams(
+        self, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
+    ) -> list[dict[str, Any]]:
+        import pyarrow as pa
+
+        schemas = {
+            group: arrow_schema(group_columns(self._sequence, group, frames, self._exact), self._size)
+            for group, frames in self._groups.items()
+        }
+        sinks = {group: pa.OSFile(str(path), "wb") for group, path in paths.items()}
+        try:
+            writers = {group: pa.ipc.new_stream(sinks[group], schemas[group]) for group in self._groups}
+            described = []
+            data = _Batch(len(self._plan.samples), self._size)
+            extra: dict[str, _Batch] = {}
+            for place, row in enumerate(self._checked(rows)):
+                described.append({"sample": row.sample, "object": row.object, "view": row.view, **row.measured})
+                data.add_row(row, self._plan.split, self._groups[DATA_GROUP], self._sequence)
+                # Frames beyond the first leave by object: six rows of them are all that is ever held.
+                group_rows, first, last = self._object_rows(place)
+                for group, frames in self._groups.items():
+                    if group == DATA_GROUP:
+                        continue
+                    if first:
+                        extra[group] = extra.get(group) or _Batch(group_rows, self._size)
+                        extra[group].restart(group_rows)
+                    extra[group].add_frames(row, frames, self._sequence)
+                    if last:
+                        writers[group].write_batch(extra[group].record_batch(schemas[group]))
+                row_done()
+            writers[DATA_GROUP].write_batch(data.record_batch(schemas[DATA_GROUP]))
+            for writer in writers.values():
+                writer.close()
+        finally:
+            for sink in sinks.values():
+                sink.close()
+        return described
+
+    def _checked(self, rows: Iterable[Row]) -> Iterator[Row]:
+        rows = iter(rows)
+        for planned, _, _ in self._plan.samples:
+            row = next(rows, None)
+            if row is None or row.sample != planned:
+                came = "nothing" if row is None else f"sample {row.sample!r}"
+                raise BuildError(f"shard {self._plan.name}: expected sample {planned!r}, got {came}")
+            yield row
+
+    def _object_rows(self, place: int) -> tuple[int, bool, bool]:
+        """Rows of the object that row ``place`` shows, and whether it is the first and the last of them."""
+        names = [name for _, name, _ in self._plan.samples]
+        first, count = names.index(names[place]), names.count(names[place])
+        return count, place == first, place == first + count - 1
+
+
+class _Batch:
+    """Columns of one record batch, each a buffer of its own that Arrow takes without a copy."""
+
+    def __init__(self, rows: int, size: tuple[int, int]) -> None:
+        self._capacity, self._size = rows, size
+        self._pixels: dict[str, NDArray] = {}
+        self.restart(rows)
+
+    def restart(self, rows: int) -> None:
+        if rows > self._capacity:
+            self._capacity, self._pixels = rows, {}
+        self._rows, self._filled = rows, 0
+        self._values: dict[str, list[Any]] = {}
+
+    def _put(self, column: str, image: NDArray) -> None:
+        if image.shape != self._size:
+            raise BuildError(f"column {column}: expected an image {self._size}, got {image.shape}")
+        if column not in self._pixels:
+            self._pixels[column] = np.empty((self._capacity, *self._size), dtype=image.dtype)
+        self._pixels[column][self._filled] = image
+
+    def add_frames(self, row: Row, frames: tuple[int, ...], sequence: Sequence) -> None:
+        for index in frames:
+            self._put(sequence.frames[index].column, row.frames[index])
+        self._filled += 1
+
+    def add_row(self, row: Row, split: str, frames: tuple[int, ...], sequence: Sequence) -> None:
+        values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
+        values["depth_min"], values["depth_max"] = depth_range_mm(row.depth_mm, row.sample)
+        for name, value in values.items():
+            self._values.setdefault(name, []).append(value)
+        self._put(DEPTH, row.depth_mm)
+        if row.depth_exact_mm is not None:
+            self._put(DEPTH_EXACT, row.depth_exact_mm)
+        self.add_frames(row, frames, sequence)
+
+    def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
+        import pyarrow as pa
+
+        columns = [
+            pa.array(self._values[field.name], field.type)
+            if field.name in self._values
+            else _image_column(self._pixels[field.name][: self._rows], field.type)
+            for field in schema
+        ]
+        return pa.record_batch(columns, schema=schema)
+
+
+def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
+    """Images (rows, H, W) as a list of lists, on the same memory."""
+    import pyarrow as pa
+
+    rows, height, width = images.shape
+    values = pa.Array.from_buffers(kind.value_type.value_type, images.size, [None, pa.py_buffer(images)])
+    lines = np.arange(rows * height + 1, dtype=np.int64) * width
+    if lines[-1] > np.iinfo(np.int32).max:
+        raise BuildError(f"{rows} images of {height} x {width} px exceed one Arrow batch; use a smaller size")
+    inner = pa.ListArray.from_arrays(pa.array(lines.astype(np.int32)), values)
+    return pa.ListArray.from_arrays(pa.array(np.arange(rows + 1, dtype=np.int32) * height), inner)
+
+
+def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
+    """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for an empty map."""
+    inside = depth_mm[depth_mm > 0]
+    if inside.size == 0:
+        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm, so there is nothing to measure")
+    return float(inside.min()), float(inside.max())
+
+
+def _reason(error: BaseException) -> str:
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error)

@@ -1,0 +1,175 @@
+"""Reading a dataset folder by memory map: zero-copy views of single images, with nothing but NumPy and pyarrow loaded.
+
+This is what the evaluator, the classical method, the torch dataset and the pictures read through.
+`fpp_ml_bench.load_dataset` opens the same files as a ``datasets.Dataset``.
+"""
+
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import SPLITS
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.frames import Sequence
+from fpp_ml_bench.loaders.manifest import Manifest, ShardFile, read_manifest
+from fpp_ml_bench.loaders.schema import DATA_GROUP, DEPTH, DEPTH_EXACT, available_configs, stored_groups
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from fpp_ml_bench.rig import Rig
+
+ALL_SPLITS = "all"
+
+
+class DatasetFolder:
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
+
+    Images come out as read-only memory-mapped views: a frame costs what is read of it. Instances pickle by path, so
+    worker processes map the files anew.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.manifest: Manifest = read_manifest(self.path)
+        self._batches: dict[str, list[pa.RecordBatch]] = {}
+        self._images: dict[tuple[str, str], list[NDArray]] = {}
+        for shard in self.manifest.shards:
+            file = self.path / shard.path
+            size = file.stat().st_size if file.is_file() else None
+            if size != shard.bytes:
+                came = "it is missing" if size is None else f"it has {size}"
+                raise DatasetError(f"{file}: expected {shard.bytes} bytes, {came}; build or copy the dataset again")
+
+    def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
+        return DatasetFolder, (self.path,)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the data's content, 64 hex digits."""
+        return self.manifest.fingerprint
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image height and width in px."""
+        return self.manifest.size
+
+    @cached_property
+    def rig(self) -> "Rig":
+        """The rig whose camera took the images."""
+        from fpp_ml_bench.rig_io import rig_from_dict
+
+        return rig_from_dict(self.manifest.rig)
+
+    @cached_property
+    def sequence(self) -> Sequence:
+        return Sequence(**self.manifest.rig["sequence"])
+
+    @property
+    def configs(self) -> tuple[str, ...]:
+        """Configurations whose frames are stored here."""
+        return available_configs(self.sequence, self.manifest.stored)
+
+    @property
+    def has_exact(self) -> bool:
+        """Whether ``depth_exact`` is known (generated data; published data has decoded depth only)."""
+        return self.manifest.exact
+
+    @cached_property
+    def splits(self) -> dict[str, list[str]]:
+        """Sample names of each split in row order."""
+        return self.manifest.splits
+
+    @cached_property
+    def _place(self) -> dict[str, tuple[str, int]]:
+        return {sample: (split, row) for split, names in self.splits.items() for row, sample in enumerate(names)}
+
+    def samples(self, split: str) -> list[str]:
+        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError` for another name."""
+        if split == ALL_SPLITS:
+            return [name for part in SPLITS for name in self.splits.get(part, [])]
+        if split not in self.splits:
+            raise DatasetError(f"{self.path}: no split {split!r}; there are {', '.join(self.splits)} and {ALL_SPLITS}")
+        return list(self.splits[split])
+
+    def split_of_sample(self, sample: str) -> str:
+        """Split that holds ``sample``. Raises `DatasetError` for an unknown sample."""
+        return self._find(sample)[0]
+
+    def measured(self, sample: str) -> dict:
+        """What the builder measured of a sample: labels, cover, distance, ground-truth error where known."""
+        split, row = self._find(sample)
+        return self.manifest.samples[split][row]
+
+    def _find(self, sample: str) -> tuple[str, int]:
+        if sample not in self._place:
+            from difflib import get_close_matches
+
+            near = get_close_matches(sample, self._place, n=3)
+            hint = f"; near it: {', '.join(near)}" if near else ""
+            raise DatasetError(f"{self.path}: no sample {sample!r}{hint}")
+        return self._place[sample]
+
+    def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
+        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` where known."""
+        if column not in (DEPTH, DEPTH_EXACT):
+            raise DatasetError(f"no depth column is called {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
+        if column == DEPTH_EXACT and not self.has_exact:
+            raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
+        return self._image(sample, DATA_GROUP, column)
+
+    def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
+        """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""
+        for group, frames in stored_groups(self.sequence, self.manifest.stored).items():
+            if index in frames:
+                return self._image(sample, group, self.sequence.frames[index].column)
+        raise DatasetError(
+            f"{self.path}: frame {index} is not stored here (configurations: {', '.join(self.configs)}); build with "
+            "--frames all"
+        )
+
+    def frames(self, sample: str, indices: "tuple[int, ...] | range | list[int]") -> list[NDArray[np.uint8]]:
+        """Several frames of a sample, each uint8 (H, W), in the order asked."""
+        return [self.frame(sample, index) for index in indices]
+
+    def _image(self, sample: str, group: str, column: str) -> NDArray:
+        split, row = self._find(sample)
+        shard = self._shard(split, group, row)
+        row -= shard.first_row
+        for images in self.column_images(shard, column):
+            if row < len(images):
+                return images[row]
+            row -= len(images)
+        raise DatasetError(f"{self.path / shard.path}: fewer rows than its manifest says; run: fpp-bench verify")
+
+    def _shard(self, split: str, group: str, row: int) -> ShardFile:
+        for shard in self.manifest.shards:
+            if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
+                return shard
+        raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
+
+    def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
+        """Record batches of one file, memory-mapped."""
+        if shard.path not in self._batches:
+            import pyarrow as pa
+
+            path = self.path / shard.path
+            try:
+                self._batches[shard.path] = list(pa.ipc.open_stream(pa.memory_map(str(path), "r")))
+            except (pa.ArrowException, OSError) as error:
+                raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
+        return self._batches[shard.path]
+
+    def column_images(self, shard: ShardFile, column: str) -> list[NDArray]:
+        """A column of one file as images: per record batch one read-only view (rows, H, W)."""
+        key = shard.path, column
+        if key not in self._images:
+            self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
+        return self._images[key]
+
+    def _views(self, column: "pa.Array") -> NDArray:
+        storage = getattr(column, "storage", column)  # an Array2D extension where `datasets` has been imported
+        return storage.values.values.to_numpy(zero_copy_only=True).reshape(len(storage), *self.size)

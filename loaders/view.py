@@ -1,0 +1,121 @@
+"""One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what separates the two."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M, sample_name
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.loaders.camera import Exposure
+from fpp_ml_bench.loaders.illumination import (
+    Lighting, LitPixels, background_plane, hit_points_m, light_surface, lit_object,
+)  # fmt: skip
+from fpp_ml_bench.loaders.raycast import Hits, TracedObject
+from fpp_ml_bench.loaders.scene import SolidMesh, place
+from fpp_ml_bench.loaders.schema import stored_frames
+from fpp_ml_bench.loaders.sensor import Noise
+from fpp_ml_bench.loaders.settings import BuildSettings
+from fpp_ml_bench.loaders.shards import Row
+from fpp_ml_bench.pixel_sets import edge_distance_px, object_mask
+
+INTERIOR_PX = 3.0
+"""Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
+
+
+@dataclass
+class Studio:
+    """A rig with its light and background, ready to photograph objects. Buffers are reused from view to view."""
+
+    settings: BuildSettings
+
+    def __post_init__(self) -> None:
+        rig, settings = self.settings.rig, self.settings
+        self.lighting = Lighting(shadows=settings.shadows)
+        self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
+        self._background = background_plane(rig, self.lighting)
+        self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
+        shape = (len(rig.sequence), rig.camera.height, rig.camera.width)
+        self._frames = np.zeros(shape, dtype=np.uint8)
+        self._stored = stored_frames(rig.sequence, settings.stored)
+
+    def photograph(self, mesh: SolidMesh, view: str) -> Row:
+        """Sample of ``mesh`` in ``view``. The frames are views into buffers that the next call overwrites.
+
+        Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
+        pixels alone: the bytes there, and so the decoded depth, are the same either way.
+        """
+        settings, rig = self.settings, self.settings.rig
+        vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
+        traced = TracedObject(mesh, vertices_m)
+        hits = traced.primary(*rig.camera.rays())
+        lit = lit_object(hits, rig, self.lighting, traced)
+        stream = (settings.seed, mesh.name, view)
+        self._expose(hits, lit, traced, stream)
+        exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
+        exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
+        seen = object_mask(exact_mm)
+        depth_mm = decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
+        measured = {
+            "distance_mm": distance_m * MM_PER_M,
+            "rays": hits.rays + lit.shadow_rays,
+            **ground_truth_error(depth_mm, exact_mm),
+        }
+        frames = {index: self._frames[index] for index in self._stored}
+        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
+
+    def _expose(self, hits: Hits, lit: LitPixels, traced: TracedObject, stream: tuple[object, ...]) -> None:
+        background = self._background
+        if self.lighting.shadows:
+            background = self._shadowed_background(traced)
+        whole = background.patched(hits.pixels, lit)
+        pixels = hits.pixels.astype(np.uint32)
+        for index in range(len(self._frames)):
+            image = self._frames[index].reshape(-1)
+            if index in self._stored:
+                self.exposure.expose(index, whole, self._pixels, stream, image)
+            else:
+                image[hits.pixels] = self.exposure.expose(index, lit, pixels, stream)
+
+    def _shadowed_background(self, traced: TracedObject) -> LitPixels:
+        rig = self.settings.rig
+        everywhere = np.full(self._pixels.size, rig.background_m)
+        normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (self._pixels.size, 3))
+        plane = Hits(self._pixels.astype(np.int64), everywhere, normals, rays=0)
+        return light_surface(hit_points_m(plane, rig), normals, rig, self.lighting, traced)
+
+
+def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32]) -> dict[str, Any]:
+    """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64.
+
+    Over pixels that both have: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and the first two again
+    for pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object pixels without a
+    decoded depth: they are background in ``depth``.
+    """
+    seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
+    both = seen & decoded
+    error = depth_mm[both].astype(np.float64) - exact_mm[both]
+    inside = error[edge_distance_px(exact_mm)[both] >= INTERIOR_PX]
+    return {
+        "object_px": int(decoded.sum()),
+        "exact_px": int(seen.sum()),
+        "undecoded_px": int((seen & ~decoded).sum()),
+        "exact_min_mm": float(exact_mm[seen].min(initial=np.inf)) if seen.any() else None,
+        "exact_max_mm": float(exact_mm.max()) if seen.any() else None,
+        "gt_mae_mm": _mean(np.abs(error)),
+        "gt_rmse_mm": _root(_mean(error**2)),
+        "gt_bias_mm": _mean(error),
+        "gt_max_mm": float(np.abs(error).max()) if error.size else None,
+        "gt_interior_px": int(inside.size),
+        "gt_interior_mae_mm": _mean(np.abs(inside)),
+        "gt_interior_rmse_mm": _root(_mean(inside**2)),
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    return float(values.mean()) if values.size else None
+
+
+def _root(value: float | None) -> float | None:
+    return None if value is None else float(np.sqrt(value))
