@@ -19,7 +19,7 @@ from fpp_ml_bench.evaluation.summary import mean_over_samples, median_over_sampl
 AGREES = 1e-9
 """Relative difference at which two computations of one average still count as the same number."""
 
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}\Z")]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Headline(StrictModel):
@@ -84,7 +84,7 @@ class Result(StrictModel):
     """Everything `fpp-eval` found out. Deterministic but for ``created`` and the machine in ``environment``."""
 
     schema_version: SchemaVersion
-    protocol_version: Annotated[str, Field(pattern=r"^\d{1,4}\.\d{1,4}\.\d{1,4}\Z")]
+    protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
     created: str
     submission: Submission
     dataset: DatasetInfo

@@ -1,0 +1,92 @@
+"""A tiny real dataset folder with known depth, and predictions for it: what the evaluator's tests score."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from fpp_ml_bench.frames import PAPER_SEQUENCE
+from fpp_ml_bench.loaders.manifest import Manifest
+from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.rig import paper_rig
+
+OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
+VIEWS = ("A0", "A60")
+DESCRIPTION: dict[str, Any] = {
+    "name": "A method",
+    "method": "test",
+    "units": "mm",
+    "frames_used": [0],
+    "uses_ground_truth_range": False,
+    "seconds_per_sample": 0.25,
+    "seconds_source": "measured",
+    "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"},
+    "software": {"numpy": "2.0.0"},
+    "settings": {"steps": 18},
+}
+
+
+def disk_depth(size: tuple[int, int], seed: int) -> NDArray[np.float32]:
+    """A tilted disk at 1.8 m with a step in it on an empty background, float32 (H, W) in mm; a place per seed."""
+    height, width = size
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width]
+    row, column = rng.uniform(0.4, 0.6, 2) * size
+    inside = (rows - row) ** 2 + (columns - column) ** 2 < (rng.uniform(0.15, 0.3) * min(size)) ** 2
+    depth = 1800.0 + 0.2 * (columns - column) + 200.0 * (rows > row)
+    return np.where(inside, depth, 0.0).astype(np.float32)
+
+
+def make_dataset(folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True) -> DatasetFolder:
+    """Write a `single_shot` dataset of eight samples; ``depth_exact`` is ``depth`` and 0.5 mm on the object."""
+    scratch = folder / ".build"
+    scratch.mkdir(parents=True)
+    shards, samples = [], {}
+    for number, (split, names) in enumerate(OBJECTS.items()):
+        objects = {name: [(f"{name}_{view}", name, view) for view in VIEWS] for name in names}
+        for plan in plan_shards(split, objects):
+            rows = []
+            for index, (sample, name, view) in enumerate(plan.samples):
+                depth = disk_depth(size, 10 * number + index)
+                frame = np.full(size, index, dtype=np.uint8)
+                rows.append(
+                    Row(sample, name, view, {0: frame}, depth, depth + np.float32(0.5) * (depth > 0) if exact else None)
+                )
+            written, described = ShardWriter(folder, scratch, plan, PAPER_SEQUENCE, "single_shot", exact, size).write(
+                rows
+            )
+            shards += written
+            samples.setdefault(split, []).extend(described)
+    scratch.rmdir()
+    Manifest(
+        origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=size, stored="single_shot",
+        exact=exact, samples=samples, shards=shards,
+    ).write(folder)  # fmt: skip
+    return DatasetFolder(folder)
+
+
+def write_description(folder: Path, **changes: Any) -> None:
+    """``submission.yaml`` with `DESCRIPTION` and ``changes``; a key set to ``...`` is left out."""
+    content = {key: value for key, value in {**DESCRIPTION, **changes}.items() if value is not ...}
+    (folder / "submission.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+
+
+def write_predictions(
+    folder: Path,
+    dataset: DatasetFolder,
+    split: str = "test",
+    offset_mm: float = 0.0,
+    noise_mm: float = 0.0,
+    **changes: Any,
+) -> Path:
+    """Predictions for a split: the target, an offset everywhere, and noise that leaves no depth negative."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, sample in enumerate(dataset.samples(split)):
+        depth = dataset.depth_mm(sample)
+        noise = np.abs(np.random.default_rng(index).normal(0.0, noise_mm, depth.shape)) if noise_mm else 0.0
+        np.save(folder / f"{sample}.npy", (depth + offset_mm + noise).astype(np.float32))
+    write_description(folder, **changes)
+    return folder
