@@ -13,8 +13,9 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.manifest import ShardFile, file_hash
 from fpp_ml_bench.loaders.schema import (
-    DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, arrow_schema, group_columns, stored_groups,
+    DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, arrow_schema, group_columns, stored_groups,
 )  # fmt: skip
+from fpp_ml_bench.pixel_sets import object_mask
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -127,8 +128,19 @@ class ShardWriter:
             data = _Batch(len(self._plan.samples), self._size)
             extra: dict[str, _Batch] = {}
             for place, row in enumerate(self._checked(rows)):
-                described.append({"sample": row.sample, "object": row.object, "view": row.view, **row.measured})
-                data.add_row(row, self._plan.split, self._groups[DATA_GROUP], self._sequence)
+                least, greatest = depth_range_mm(row.depth_mm, row.sample)
+                described.append(
+                    {
+                        "sample": row.sample,
+                        "object": row.object,
+                        "view": row.view,
+                        "object_px": int(np.count_nonzero(object_mask(row.depth_mm))),
+                        "depth_min_mm": least,
+                        "depth_max_mm": greatest,
+                        **row.measured,
+                    }
+                )
+                data.add_row(row, (least, greatest), self._plan.split, self._groups[DATA_GROUP], self._sequence)
                 # Frames beyond the first leave by object: six rows of them are all that is ever held.
                 group_rows, first, last = self._object_rows(place)
                 for group, frames in self._groups.items():
@@ -191,9 +203,11 @@ class _Batch:
             self._put(sequence.frames[index].column, row.frames[index])
         self._filled += 1
 
-    def add_row(self, row: Row, split: str, frames: tuple[int, ...], sequence: Sequence) -> None:
+    def add_row(
+        self, row: Row, range_mm: tuple[float, float], split: str, frames: tuple[int, ...], sequence: Sequence
+    ) -> None:
         values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
-        values["depth_min"], values["depth_max"] = depth_range_mm(row.depth_mm, row.sample)
+        values.update(zip(RANGE, range_mm, strict=True))
         for name, value in values.items():
             self._values.setdefault(name, []).append(value)
         self._put(DEPTH, row.depth_mm)
@@ -228,7 +242,7 @@ def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
 
 def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
     """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for an empty map."""
-    inside = depth_mm[depth_mm > 0]
+    inside = depth_mm[object_mask(depth_mm)]
     if inside.size == 0:
         raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm, so there is nothing to measure")
     return float(inside.min()), float(inside.max())

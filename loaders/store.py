@@ -16,6 +16,7 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.manifest import Manifest, ShardFile, read_manifest
 from fpp_ml_bench.loaders.schema import DATA_GROUP, DEPTH, DEPTH_EXACT, available_configs, stored_groups
+from fpp_ml_bench.pixel_sets import object_mask
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -120,6 +121,17 @@ class DatasetFolder:
         if column == DEPTH_EXACT and not self.has_exact:
             raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
         return self._image(sample, DATA_GROUP, column)
+
+    def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
+        """What a prediction is scored against, float32 (H, W) in mm, 0 = background.
+
+        The object is the same set of pixels for either column, those with a decoded ``depth``: a surface that the
+        projector does not reach has no ground truth in this benchmark. ``depth_exact`` only gives them exact values.
+        """
+        depth_mm = self.depth_mm(sample)
+        if column == DEPTH:
+            return depth_mm
+        return np.where(object_mask(depth_mm), self.depth_mm(sample, column), np.float32(0))
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
         """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""

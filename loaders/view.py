@@ -98,11 +98,8 @@ def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float
     error = depth_mm[both].astype(np.float64) - exact_mm[both]
     inside = error[edge_distance_px(exact_mm)[both] >= INTERIOR_PX]
     return {
-        "object_px": int(decoded.sum()),
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),
-        "exact_min_mm": float(exact_mm[seen].min(initial=np.inf)) if seen.any() else None,
-        "exact_max_mm": float(exact_mm.max()) if seen.any() else None,
         "gt_mae_mm": _mean(np.abs(error)),
         "gt_rmse_mm": _root(_mean(error**2)),
         "gt_bias_mm": _mean(error),

@@ -1,0 +1,49 @@
+"""What a person sees of a long job: a progress bar on standard error, and tables on standard output."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterator[Callable[[int], None]]:
+    """A rich progress bar over ``total`` steps; yields the function that advances it.
+
+    Shows ``unit`` counted as ``per_step`` a step (52 images a sample), their rate and the time left.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task: object) -> Text:
+            speed = getattr(task, "speed", None) or getattr(task, "finished_speed", None)
+            return Text(f"{speed * per_step:,.0f} {unit}/s" if speed else "", style="cyan")
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"), Rate(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda steps: progress.advance(task, steps)
+
+
+def gigabytes(count: float) -> str:
+    """A number of bytes for people."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def millimetres(value: float | None) -> str:
+    """A length for a table; a dash where there is none."""
+    return "-" if value is None else f"{value:.3f}"
+
+
+def usable_cpus() -> int:
+    """Processors that this process may use."""
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
