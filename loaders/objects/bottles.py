@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from fpp_ml_bench.loaders.objects.lettering import text_plate, text_section, wrapped
+from fpp_ml_bench.loaders.objects.lettering import text_section, wrapped
 from fpp_ml_bench.loaders.objects.solids import (
     SEGMENTS,
     Solid,
     block,
     cut,
-    disc,
+    embossed,
     facing,
     lathe,
     place,
@@ -41,11 +41,10 @@ def mustard_bottle() -> Solid:
     closure = lathe(
         np.concatenate([[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]),
     )
-    label = facing(text_plate("MUSTARD", 70, 3.0)).translate((-27.5, 0, 78))
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
-    panel = facing(plate(rectangle(70, 78, 14), 8)).translate((-24.6, 0, 66))
-    strip = facing(plate(rectangle(46, 3) + rectangle(34, 3, 0, (0, -8)), 6)).translate((-27, 0, 56))
-    return place(union(body, closure, label, panel, strip, *grips), turn=(0, -6, 8))
+    panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
+    words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
+    return place(union(body, closure, panel, embossed(body, words, 2.2), *grips), turn=(0, -1, 30))
 
 
 def bleach_cleanser() -> Solid:
@@ -56,13 +55,10 @@ def bleach_cleanser() -> Solid:
     )  # fmt: skip
     neck = rod((0, 0, 205), (0, 0, 222), 16)
     cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
-    words = union(
-        facing(text_plate("BLEACH", 76, 1.8)).translate((-33, 0, 70)),
-        facing(plate(rectangle(78, 2.4) + rectangle(60, 2.4, 0, (0, -10)) + rectangle(66, 2.4, 0, (0, -20)), 4)).translate(
-            (-32.6, 0, 50)
-        ),
-    )
-    return place(union(body, neck, cap, words), turn=(0, -5, 10))
+    words = text_section("BLEACH", 74).translate((0, 70))
+    for width, height in ((76, 50), (60, 40), (66, 30)):
+        words = words + rectangle(width, 2.6, 0, (0, height))
+    return place(union(body, neck, cap, embossed(body, words, 1.5)), turn=(0, -1, 30))
 
 
 def container_bottle() -> Solid:
@@ -74,10 +70,12 @@ def container_bottle() -> Solid:
     hole = place(tube(curve([(-90, 46, 205), (0, 46, 205), (90, 46, 205)], 2), 15.0, 2.1), (0, 0, -18))
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
-    panel = facing(plate(rectangle(118, 96, 12), 3)).translate((-52, 0, 78))
-    stripes = facing(plate(rectangle(90, 8, 3, (0, 24)) + rectangle(90, 8, 3) + rectangle(60, 8, 3, (-15, -24)), 3))
-    scale = [facing(plate(rectangle(12, 2.5), 3)).translate((-52, -72, z)) for z in range(40, 150, 18)]
-    return place(union(cut(body, hole, *thinner), cap, panel, stripes.translate((-53.4, 0, 78)), *scale), turn=(0, -5, -8))
+    panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
+    marks = text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70)) + rectangle(60, 7, 3, (-19, 48))
+    for step in range(7):
+        marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
+    drained = cut(union(body, panel, embossed(body, marks, 2.4)), hole, *thinner)
+    return place(union(drained, cap), turn=(0, -3, -6))
 
 
 def spray_bottle() -> Solid:
@@ -101,7 +99,7 @@ def spray_bottle() -> Solid:
     nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), rod((-76, 257, 0), (-80, 257, 0), 5)))
     grip = [ring(43.2, 0.9, z) for z in (16, 22, 28)]
     words = wrapped(text_section("SPRAY", 58), 42.6, 74, 1.3)
-    return place(union(body, collar, facing(plate(head, 26)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 8))
+    return place(union(body, collar, facing(plate(head, 26)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
 
 
 def vial() -> Solid:
@@ -112,26 +110,21 @@ def vial() -> Solid:
     label = wrapped(rectangle(62, 22), 12, 20, 0.25)
     words = wrapped(text_section("VIAL", 16), 12.2, 25, 0.35)
     lines = [wrapped(rectangle(15, 1.1), 12.2, z, 0.3) for z in (18.5, 15.5, 12.5)]
-    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, -14, 0))
+    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, -1, 0))
 
 
 def cork() -> Solid:
     """Tapered stopper, 34 mm wide, with lenticels and pits."""
     body = lathe([(11.5, 0), (12.6, 1.2), (16.2, 40.6), (15.2, 42)], segments=SEGMENTS)
     pits = []
-    for k in range(46):
-        angle, z = 2.39996 * k, 2.5 + 36.5 * ((k * 0.618034) % 1.0)
+    for k in range(90):
+        angle, z = 2.39996 * k, 2.5 + 36.5 * ((k * 0.4142136) % 1.0)
         radius = 12.7 + 0.09 * z
-        long = 1.0 + 1.6 * ((k * 0.381966) % 1.0)
+        long = 0.6 + 1.9 * ((k * 0.7320508) % 1.0)
         start = (radius * float(np.cos(angle)), radius * float(np.sin(angle)), z)
         side = angle + 0.09 * long
-        end = (radius * float(np.cos(side)), radius * float(np.sin(side)), z + 0.5)
-        pits.append(rod(start, end, 0.45, 0.8, rounded=True))
+        end = (radius * float(np.cos(side)), radius * float(np.sin(side)), z + 0.4)
+        pits.append(rod(start, end, 0.4, 0.75, rounded=True))
     holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
     split = block(10, 0.8, 14, 0, (-14, 4, 36))
-    return place(cut(body, *pits, *holes, split), turn=(0, -24, 0))
-
-
-def plain_disc_mark(radius: float, relief: float) -> Solid:
-    """Drawn round mark rising ``relief`` mm from z = 0."""
-    return plate(disc(radius), 2 * relief)
+    return place(cut(body, *pits, *holes, split), turn=(0, -2, 0))

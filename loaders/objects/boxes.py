@@ -22,7 +22,7 @@ from fpp_ml_bench.loaders.objects.sweeps import curve
 
 def _carton(width: float, height: float, depth: float, lines: list[tuple[str, float, float]], *art: Solid) -> Solid:
     """Drawn carton: glued flaps on top and bottom, text lines (words, width, height) on both large faces."""
-    front = [text_plate(words, size, 1.2).translate((0, at, depth / 2)) for words, size, at in lines]
+    front = [text_plate(words, size, 1.8).translate((0, at, depth / 2)) for words, size, at in lines]
     front += [solid.translate((0, 0, depth / 2)) for solid in art]
     frame = plate(rectangle(width - 10, height - 10) - rectangle(width - 14, height - 14), 1.2)
     face = union(*front, frame.translate((0, 0, depth / 2)))
@@ -38,15 +38,15 @@ def cracker_box() -> Solid:
     for hole in holes:
         pricked = pricked - disc(1.6, hole)
     crackers = [plate(pricked.rotate(14 * k), 4).translate((47.0 * k, -35 - 9 * (k % 2), 0)) for k in (-1, 0, 1)]
-    return place(facing(_carton(160, 213, 60, [("CRACKERS", 138, 62), ("CRISP", 70, 28)], *crackers)), turn=(0, 0, 14))
+    return place(facing(_carton(160, 213, 60, [("CRACKERS", 138, 62), ("CRISP", 70, 28)], *crackers)), turn=(0, 0, 3))
 
 
 def sugar_box() -> Solid:
     """Sugar carton, 89 x 176 x 40 mm, with a pouring flap drawn out at its side."""
-    flap = place(plate(polygon([(0, 0), (24, 0), (15, 17), (6, 17)]), 30), (44, 48, 0), (0, 0, -62))
+    flap = place(plate(polygon([(0, 0), (24, 0), (15, 17), (6, 17)]), 22), (44, 48, 0), (0, 0, -62))
     cubes = [block(17, 17, 5, 1, (x, y, 0)).rotate((0, 0, 4)) for x, y in ((-20, -56), (0, -56), (20, -56), (-10, -37))]
     body = _carton(89, 176, 40, [("SUGAR", 74, 38), ("PURE", 40, 6)], *cubes)
-    return place(facing(union(body, flap)), turn=(0, 0, 16))
+    return place(facing(union(body, flap)), turn=(0, 0, 2))
 
 
 def pudding_box() -> Solid:
@@ -55,7 +55,7 @@ def pudding_box() -> Solid:
     cream = plate(disc(7, (-7, 20)) + disc(8, (4, 22)) + disc(4, (0, 30)), 5)
     art = [solid.translate((30, -10, 0)) for solid in (glass, cream)]
     body = _carton(112, 90, 36, [("PUDDING", 92, 29), ("MILK", 38, -2)], *art)
-    return place(facing(body), turn=(0, -8, 14))
+    return place(facing(body), turn=(0, -1.5, 3))
 
 
 def gelatin_box() -> Solid:
@@ -65,7 +65,7 @@ def gelatin_box() -> Solid:
     dish = plate(rectangle(62, 4, 1.9, (0, -2)), 5)
     art = [solid.translate((0, -25, 0)) for solid in (mould, dish, *ribs)]
     body = _carton(88, 73, 29, [("GELATIN", 72, 18)], *art)
-    return place(facing(body), turn=(0, -8, -15))
+    return place(facing(body), turn=(0, -1.5, -3))
 
 
 def wood_block() -> Solid:
@@ -80,7 +80,7 @@ def wood_block() -> Solid:
     ends = [solid.translate((6, -4, s * 100)) for solid in grain for s in (-1, 1)]
     knot = rod((-39, -12, 30), (-46, -12, 30), 9)
     chipped = place(block(20, 20, 40), (-42, 42, 96), (0, 30, 45))
-    return place(cut(body, *cracks, *sides, *ends, knot, chipped), turn=(0, -12, 20))
+    return place(cut(body, *cracks, *sides, *ends, knot, chipped), turn=(0, -1, 3))
 
 
 def open_book() -> Solid:
@@ -92,9 +92,10 @@ def open_book() -> Solid:
     sheet = stroke([(float(x), float(y)) for x, y in loose], 1.0)
     cover = rectangle(155, 3.4, 1.2, (76, -1.6))
     right = union(pages.extrude(205), sheet.extrude(205), cover.extrude(215).translate((0, 0, -5))).rotate((0, 0, spread))
+    inked = pages.offset(0.9)
     text = [
-        place(block(width, 1.6, 3.4), (70 + width / 2 - 42, 17.0, z)).rotate((0, 0, spread))
-        for z, width in ((182, 60), *((164 - 11 * k, 84) for k in range(11)), (43, 50))
+        (inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))).extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread))
+        for z, width in ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
     ]
     spine = rod((0, -1.5, -5), (0, -1.5, 210), 4)
     left = union(
@@ -122,7 +123,7 @@ def magazine_stack() -> Solid:
     photo = place(block(110, 150, 2.0, 0), (22, 8, base), (0, 0, -4))
     curl = curve([(-40, 0), (20, 1), (70, 8), (104, 26), (112, 36)])
     cover = place(stroke([(float(x), float(y)) for x, y in curl], 1.4).extrude(280), (2, 144, base), (90, 0, -4))
-    return place(union(*magazines, title, photo, cover), turn=(0, -16, 24))
+    return place(union(*magazines, title, photo, cover), turn=(0, -9, 6))
 
 
 def wooden_boards() -> Solid:
@@ -130,7 +131,7 @@ def wooden_boards() -> Solid:
     pile = []
     for layer in range(4):
         for lane in (-1, 1):
-            shift, length = 6.0 * ((3 * layer + lane) % 4) - 8, 468 - 12 * ((2 * layer + lane) % 3)
+            shift, length = 6.0 * ((3 * layer + lane) % 4) - 8, 462 - 12 * ((2 * layer + lane) % 3)
             plank = block(length, 88, 24, 1.5, (shift, lane * 47.0, 12 + 25.0 * layer - 1.0 * layer))
             pile.append(plank.rotate((0, 0, 1.2 * (layer % 3 - 1))))
     leaning = []
@@ -141,8 +142,9 @@ def wooden_boards() -> Solid:
 
 
 def _knots(seed: int, height: float) -> list[Solid]:
-    """Two nail holes and a knot on each face of a plank."""
+    """Four nail holes through a plank and a shallow knot on each of its faces."""
     spots = [(-20, 30), (20, 30), (-20, height - 30), (20, height - 30)]
     holes = [rod((-20, y, z), (20, y, z), 3.0) for y, z in spots]
-    knot = rod((-30, 14 - 9 * (seed % 3), height * (0.4 + 0.1 * (seed % 4))), (-8.6, 8, height * 0.5), 11)
-    return [*holes, knot]
+    where = [(12 - 11 * (seed % 3), height * (0.38 + 0.09 * (seed % 4))), (-14 + 9 * (seed % 4), height * 0.74)]
+    knots = [rod((side * 9.2, y, z), (side * 20, y, z), 9) for (y, z), side in zip(where, (-1, 1), strict=True)]
+    return [*holes, *knots]

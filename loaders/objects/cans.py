@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from fpp_ml_bench.loaders.objects.lettering import text_plate, text_section, wrapped
+from fpp_ml_bench.loaders.objects.lettering import text_section, wrapped
 from fpp_ml_bench.loaders.objects.solids import (
     Point2,
     Solid,
     block,
     cut,
     disc,
-    facing,
+    embossed,
     lathe,
     place,
     plate,
@@ -59,7 +59,7 @@ def master_chef_can() -> Solid:
         wrapped(disc(17), 50.6, 36, 1.0),
     )
     grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in _around(60)]
-    return place(union(body, lid, label, name, *grips), turn=(0, -14, 0))
+    return union(body, lid, label, name, *grips)
 
 
 def tomato_soup_can() -> Solid:
@@ -71,7 +71,7 @@ def tomato_soup_can() -> Solid:
         wrapped(text_section("SOUP", 50), 33, 48, 0.9),
         wrapped(disc(8), 33, 29, 1.0),
     )
-    return place(union(body, label, name, _pull_tab().translate((-8, 0, 98))), turn=(0, -20, 0))
+    return union(body, label, name, _pull_tab().translate((-8, 0, 98)))
 
 
 def tuna_fish_can() -> Solid:
@@ -92,11 +92,11 @@ def potted_meat_can() -> Solid:
         (78, 95, 48, outline), (79, 97.5, 50.5, outline), (81, 97.5, 50.5, outline), (82, 95, 48, outline),
     ]  # fmt: skip
     lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
-    label = facing(plate(rectangle(84, 60), 2)).translate((-23.6, 0, 40))
-    name = facing(text_plate("MEAT", 68, 1.2)).translate((-24.6, 0, 48))
-    strip = facing(text_plate("POTTED", 56, 1.0)).translate((-24.6, 0, 26))
+    body = loft(rows)
+    label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
+    words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
     tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
-    return place(union(cut(loft(rows), lid), label, name, strip, tab), turn=(0, -22, 12))
+    return place(union(cut(body, lid), label, embossed(body, words, 1.8), tab), turn=(0, -10, 3))
 
 
 def container_tin() -> Solid:
@@ -109,4 +109,4 @@ def container_tin() -> Solid:
     mirrored = [(x, -y, z) for x, y, z in bail[-2::-1]]
     handle = tube(curve([(x * 1.45, y * 1.05, z) for x, y, z in bail + mirrored]), 1.8, up=(1, 0, 0.3))
     rivet = block(6, 10, 16, 2, (54, 0, 64))
-    return place(union(body, collar, lid, *ears, handle, rivet), turn=(0, -24, 0))
+    return place(union(body, collar, lid, *ears, handle, rivet), turn=(0, -2, 0))

@@ -10,6 +10,7 @@ from fpp_ml_bench.loaders.objects.solids import (
     cut,
     disc,
     facing,
+    laid,
     lathe,
     place,
     plate,
@@ -34,8 +35,7 @@ def hammer() -> Solid:
         [(0, 26, 34, 2.4), (4, 30, 39, 2.4), (18, 29, 37, 2.4), (60, 25, 30, 2.3), (100, 26, 33, 2.3), (140, 23, 28, 2.2),
          (200, 18, 23, 2.0), (250, 18, 23, 2.0), (292, 20, 26, 2.4), (312, 20, 26, 2.4)], smooth=6, sides=64,
     )  # fmt: skip
-    handle = handle.rotate((0, 0, 90)).rotate((-90, 0, 0)).rotate((0, 0, 0))
-    handle = place(handle, (0, 0, 0), (0, 0, 180)) if handle.bounding_box()[4] < 100 else handle
+    handle = laid(handle)
     face = place(lathe([(14, 0), (17, 3), (17, 15), (13, 21), (12, 40)], 0.5), (64, 292, 0), (0, -90, 0))
     cheek = block(46, 34, 30, 5, (4, 292, 0))
     spine = curve([(-10, 296), (-36, 300), (-62, 291), (-84, 268)])
@@ -50,40 +50,40 @@ def hammer() -> Solid:
     fork = place(plate(polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)]), 90), (-40, 285, 0), (90, 0, 180)).translate((0, 0, 0))
     claw = cut(skin(np.array(rings)), fork)
     grooves = [place(ring(19, 2.0).scale((0.95, 0.8, 1)), (0, y, 0), (-90, 0, 0)) for y in (34, 48, 62, 76, 90)]
-    return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(8, 0, 10))
+    return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(3, 0, 3))
 
 
 def scissors() -> Solid:
     """Household scissors, 205 mm long, a little open: two pointed blades, pivot screw, a round and a long bow."""
     blade = polygon([(-4, -20), (9, -20), (10, 10), (7, 70), (1.5, 108), (0, 108), (-6, 20)], 0.6)
-    shank = stroke(_outline(curve([(2, -16), (-2, -34), (-11, -48), (-16, -56)])), 12)
+    shank = stroke(_outline(curve([(2, -16), (2, -32), (7, -46), (12, -56)])), 12)
     halves = []
     for side, reach in ((1, 25.0), (-1, 36.0)):
         bow = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-        loop = np.stack([18.5 * np.cos(bow) - 19, reach * np.sin(bow) - 50 - reach, 0 * bow], axis=1)
+        loop = np.stack([18.5 * np.cos(bow) + 13, reach * np.sin(bow) - 50 - reach, 0 * bow], axis=1)
         half = union(
             plate(blade, 3.2), plate(shank, 8),
             tube(loop, 5.2, flatten=1.25, closed=True, sides=24),
         ).rotate((0, 0, 9))  # fmt: skip
         halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
     pivot = union(rod((0, 0, -6.5), (0, 0, 6.5), 6), cut(rod((0, 0, 5), (0, 0, 7.6), 5), block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))))
-    return place(facing(union(*halves, pivot)), turn=(10, 0, 0))
+    return place(facing(union(*halves, pivot)), turn=(3, 0, 2))
 
 
 def large_clamp() -> Solid:
     """Spring clamp, 200 mm long: two jaws with pads crossing at a coiled spring, handles with sleeves."""
-    jaw = polygon([(-18, 6), (-38, 50), (-40, 84), (-20, 104), (-8, 106), (-4, 96), (-20, 84), (-22, 56), (-2, 12), (12, 0), (2, -14)], 3)
-    lever = stroke(_outline(curve([(4, -4), (26, -34), (42, -66), (50, -100)])), 22)
-    sleeve = stroke(_outline(curve([(30, -44), (42, -68), (50, -100)])), 27)
-    half = union(plate(softened(jaw + lever, 2), 18), plate(softened(sleeve, 1), 24))
-    half = cut(half, plate(stroke([(16, -22), (38, -62)], 8), 40).translate((0, 0, 0)) ^ plate(rectangle(200, 36, 0, (0, -24)), 40))
-    pad = place(block(11, 26, 25, 3), (-5.5, 98, 0), (0, 0, -8))
-    ears = [plate(disc(17), 5).translate((0, 0, z)) for z in (-13, 13)]
-    pin = rod((0, 0, -19), (0, 0, 19), 6.5)
-    coil = [ring(11.5, 2.6, z) for z in (-10.4, -5.2, 0, 5.2, 10.4)]
-    legs = [tube(curve([(s * 10, -4, 0), (s * 24, -26, 0), (s * 34, -40, 0)]), 2.6) for s in (-1, 1)]
+    arm = stroke(_outline(curve([(18, -24), (0, 2), (-24, 30), (-34, 54), (-28, 76), (-14, 90)])), 22)
+    lever = stroke(_outline(curve([(0, 0), (24, -34), (40, -66), (48, -100)])), 26)
+    sleeve = stroke(_outline(curve([(31, -46), (40, -67), (48, -100)])), 34)
+    slot = plate(stroke([(20, -28), (29, -46)], 7), 60)
+    half = cut(union(plate(softened(arm + lever, 2), 20), plate(softened(sleeve, 1), 28)), slot)
+    pad = union(place(block(10, 38, 30, 3), (-6.5, 90, 0), (0, 0, 3)), rod((-12, 90, -17), (-12, 90, 17), 6))
+    ears = [plate(disc(19), 6).translate((0, 0, z)) for z in (-12, 12)]
+    pin = rod((0, 0, -24), (0, 0, 24), 7)
+    coil = [ring(12.5, 2.8, z) for z in (-19, -16, 16, 19)]
+    legs = [tube(curve([(s * 11, -4, 17), (s * 22, -26, 17), (s * 31, -46, 13)]), 2.8, up=(0, 0, 1)) for s in (-1, 1)]
     both = union(half, pad, half.mirror((1, 0, 0)), pad.mirror((1, 0, 0)), pin, *ears, *coil, *legs)
-    return place(facing(both), turn=(0, 10, 0))
+    return place(facing(both), turn=(0, 0, 2))
 
 
 def clamp() -> Solid:
@@ -98,7 +98,7 @@ def clamp() -> Solid:
     boss = rod((40, -66, 0), (40, -34, 0), 14)
     bar = union(rod((2, -112, 8), (78, -112, -8), 4.2), ball(6.4, (2, -112, 8)), ball(6.4, (78, -112, -8)))
     head = ball(10.5, (40, -112, 0))
-    return place(facing(union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)), turn=(0, 8, 0))
+    return place(facing(union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)), turn=(0, 3, 3))
 
 
 def boxcutter() -> Solid:
@@ -113,7 +113,7 @@ def boxcutter() -> Solid:
     backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
     ribs = [block(35, 2.6, 9, 1, (0, y, 0)) for y in range(-58, -20, 7)]
     grips = [place(rod((0, 0, -20), (0, 0, 20), 5), (17, y, 0)) for y in (-44, -30, -16)]
-    return place(facing(union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))), turn=(22, 0, 8))
+    return place(facing(union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))), turn=(2, 0, 2))
 
 
 def _handle(profile: list[Point2], flatten: float = 1.0) -> Solid:
@@ -129,10 +129,9 @@ def paint_brush() -> Solid:
     ferrule = loft([(-6, 24, 22, 2), (2, 25, 23, 2), (20, 32, 17, 2.4), (38, 36, 14, 2.8)], smooth=4, sides=64)
     crimps = [place(ring(12.6, 1.2), (0, y, 0), (90, 0, 0)) for y in (0.5, 5.5)]
     bristles = loft([(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)], smooth=5, sides=96)
-    upright = union(ferrule, bristles).rotate((0, 0, -90)).rotate((-90, 0, 0)).mirror((0, 1, 0)).rotate((0, 180, 0))
-    upright = upright if upright.bounding_box()[4] > 60 else upright.mirror((0, 1, 0))
-    hairs = [place(block(0.9, 46, 16, 0), (x, 68, 0), (0, 0, -0.12 * x)) for x in range(-15, 16, 5)]
-    return place(facing(union(handle, cut(upright, *(h - plate(rectangle(60, 60, 0, (0, 66)), 9) for h in hairs)), *crimps)), turn=(16, 0, 8))
+    furrows = [place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x in range(-15, 16, 5) for s in (-1, 1)]
+    tuft = cut(laid(union(ferrule, bristles)), *furrows)
+    return place(facing(union(handle, tuft, *crimps)), turn=(3, 0, 3))
 
 
 def paint_brush_large() -> Solid:
@@ -147,22 +146,21 @@ def paint_brush_large() -> Solid:
     handle = union(plate(polygon(outline), 14), plate(polygon(outline).offset(-5), 19))
     handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
     tuft = loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5)
-    tuft = tuft.rotate((0, 0, 90)).rotate((-90, 0, 0))
-    tuft = tuft if tuft.bounding_box()[4] > 60 else tuft.mirror((0, 1, 0))
+    tuft = laid(tuft)
     furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x in range(-45, 46, 6) for s in (-1, 1)]
-    return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(10, -6, 10))
+    return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(4, -2, 4))
 
 
 def pallet_knife() -> Solid:
     """Trowel-shaped palette knife, 215 mm: leaf blade on a cranked neck, turned handle with a brass collar."""
     leaf = polygon(np.concatenate([
-        curve([(0, 120), (10, 106), (22, 76), (24, 54), (14, 36), (0, 30)]),
-        curve([(0, 30), (-14, 36), (-24, 54), (-22, 76), (-10, 106), (0, 120)])[1:],
+        curve([(0, 120), (10, 106), (19, 76), (21, 54), (13, 36), (0, 30)]),
+        curve([(0, 30), (-13, 36), (-21, 54), (-19, 76), (-10, 106), (0, 120)])[1:],
     ]), 0.5)  # fmt: skip
     neck = tube(curve([(0, -6, 0), (0, 8, 1), (0, 20, 9), (0, 32, 16), (0, 46, 17)]), 3.6, flatten=0.8, up=(1, 0, 0))
     collar = place(lathe([(8, 0), (9, 3), (8, 9), (6, 11)], segments=48), (0, -11, 0), (-90, 0, 0))
     handle = _handle([(8.5, 8), (11.0, 26), (11.5, 50), (9.0, 76), (10.5, 94), (7.0, 104)])
-    return place(facing(union(plate(leaf, 2.6).translate((0, 0, 17)), neck, collar, handle)), turn=(16, 0, 10))
+    return place(facing(union(plate(leaf, 2.6).translate((0, 0, 17)), neck, collar, handle)), turn=(2, 0, 2))
 
 
 def pallet_knife_large() -> Solid:
@@ -178,4 +176,4 @@ def pallet_knife_large() -> Solid:
     ]))  # fmt: skip
     handle = union(plate(grip, 15), plate(grip.offset(-3.5), 20))
     rivets = [rod((0, y, -11), (0, y, 11), 3.6) for y in (-20, -56, -92)]
-    return place(facing(union(plate(blade, 3.0), bolster, handle, *rivets)), turn=(14, 8, 10))
+    return place(facing(union(plate(blade, 3.0), bolster, handle, *rivets)), turn=(2, 1, 2))

@@ -9,7 +9,7 @@ from fpp_ml_bench.loaders.objects.solids import (
     ball,
     block,
     cut,
-    disc,
+    embossed,
     facing,
     lathe,
     place,
@@ -33,7 +33,7 @@ def paint_container_bottle() -> Solid:
     lip = block(8, 9, 3, 1, (-12, 0, 112))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
     words = union(wrapped(text_section("PAINT", 34), 22.4, 54, 0.7), wrapped(stroke(_BRUSH_MARK, 9), 22.4, 28, 0.9))
-    return place(union(body, cap, lip, label, words), turn=(0, -10, 0))
+    return place(union(body, cap, lip, label, words), turn=(0, -1, 0))
 
 
 def paint_container_jar() -> Solid:
@@ -46,7 +46,7 @@ def paint_container_jar() -> Solid:
         runs.append(rod((x, y, top), (x, y, top - length), 2.4, 3.6, rounded=True))
     hem = tube([(-36.0 * np.cos(a), 36.0 * np.sin(a), 62.5) for a in np.linspace(-0.7, 0.8, 30)], 3.4)
     words = wrapped(text_section("PAINT", 44), 38, 14, 1.1)
-    return place(union(body, lid, hem, words, *runs), turn=(0, -18, 0))
+    return place(union(body, lid, hem, words, *runs), turn=(0, -2, 0))
 
 
 def paint_container_spraycan() -> Solid:
@@ -68,7 +68,7 @@ def paint_container_spraycan() -> Solid:
         wrapped(text_section("PAINT", 66), 32.4, 94, 0.9),
         wrapped(stroke(_BRUSH_MARK, 12).scale((1.2, 1.2)), 32.4, 54, 1.0),
     )
-    return place(union(body, button, nozzle, label, words), turn=(0, -6, 0))
+    return place(union(body, button, nozzle, label, words), turn=(0, -1, 0))
 
 
 def _tube(length: float, width: float, cap_radius: float, cap_height: float, crimp: float = 10.0) -> Solid:
@@ -90,26 +90,25 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
 
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 15 x 62 mm, leaning."""
-    words = place(facing(text_plate("RED", 10, 0.9)), (-4.2, 0, 36), (0, 8, 0))
-    return place(union(_tube(40, 17, 5.0, 9, 6), words), turn=(14, -8, 0))
+    body = _tube(40, 22, 6.5, 9, 6)
+    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 40)), 0.5)), turn=(2, -1, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube() -> Solid:
     """Oil-paint tube, 27 x 105 mm, rolled up a little at its end."""
     body = _tube(82, 30, 7.5, 13, 8)
     roll = rod((-3.2, -15.6, 102), (-3.2, 15.6, 102), 4.6)
-    words = place(facing(union(text_plate("OIL", 15, 0.9), plate(stroke(_BRUSH_MARK, 9).scale((0.42, 0.6)).translate((0, 14)), 2))), (-9.6, 0, 42), (0, 8, 0))
-    return place(union(body, roll, words), turn=(-16, 10, 0))
+    words = text_section("OIL", 19).translate((0, 62)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 44))
+    return place(union(body, roll, embossed(body, words, 0.7)), turn=(-2, 1, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube_large() -> Solid:
     """Large acrylic tube, 48 x 165 mm, squeezed at its waist and standing on a wide flip cap."""
     body = _tube(125, 52, 19, 26, 9)
-    dent = place(ball(26), (-33, 8, 112))
+    dent = place(ball(26), (-32, 8, 124))
     hinge = block(6, 12, 8, 1, (18, 0, 24))
-    words = place(facing(union(text_plate("ACRYL", 36, 1.2))), (-20.3, 0, 58), (0, 8, 0))
-    rest = place(facing(plate(rectangle(30, 3) + rectangle(24, 3, 0, (0, -7)), 2)), (-17.5, 0, 76), (0, 12, 0))
-    return place(union(cut(body, dent), hinge, words, rest), turn=(8, -6, 0))
+    words = text_section("ACRYL", 36).translate((0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
+    return place(union(cut(union(body, embossed(body, words, 1.0)), dent), hinge), turn=(2, -1, 0)).rotate((0, 0, 30))
 
 
 def paint_thinner() -> Solid:
@@ -127,9 +126,4 @@ def paint_thinner() -> Solid:
         *(plate(rectangle(74, 4, 0, (28, y)), 3) for y in (-36, -46, -56)),
     )  # fmt: skip
     seam = block(3, 8, 190, 1, (49, -30, 100))
-    return place(union(cut(body, top), spout, strap, facing(words).translate((-49.2, 0, 96)), seam), turn=(0, -10, 14))
-
-
-def drop(radius: float) -> Solid:
-    """Round drop of paint lying on z = 0."""
-    return plate(disc(radius), 1.0)
+    return place(union(cut(body, top), spout, strap, facing(words).translate((-49.2, 0, 96)), seam), turn=(0, -1, 3))

@@ -39,16 +39,16 @@ def power_drill() -> Solid:
     grip_outline = polygon(side, 4)
     grip = union(plate(grip_outline, 30), plate(grip_outline.offset(-4), 40))
     trigger = union(plate(polygon([(4, 50), (-8, 44), (-8, 32), (0, 20), (12, 16), (10, 50)], 2), 16))
-    shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 62, 0)
-    battery = block(104, 40, 66, 6, (30, -82, 0))
-    latch = union(block(14, 12, 70, 3, (-4, -78, 0)), block(108, 3, 68, 1, (30, -70, 0)))
+    shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 44, 0)
+    battery = block(104, 40, 48, 6, (30, -82, 0))
+    latch = union(block(14, 12, 52, 3, (-4, -78, 0)), block(108, 3, 50, 1, (30, -70, 0)))
     vents = [block(5, 26, 80, 2, (x, 84, 0)) for x in (22, 31, 40, 49)]
     cap = place(lathe([(27, 0), (27, 6), (20, 12)], 1.5), (60, 78, 0), (0, 90, 0))
     body = cut(union(housing, cap, grip), *(v - block(200, 200, 56, 0, (0, 84, 0)) for v in vents))
     badge = plate(rectangle(38, 11, 4, (-14, 82)), 60)
     switch = rod((8, 58, -24), (8, 58, 24), 5)
     parts = union(body, clutch, *knurls, cut(chuck, *flutes), bit, trigger, shoe, battery, latch, badge, switch)
-    return place(facing(parts), turn=(0, 0, 12))
+    return place(facing(parts), turn=(0, 0, 1))
 
 
 def _steps(count: int) -> list[tuple[float, float]]:
@@ -80,9 +80,4 @@ def spraygun() -> Solid:
     rows = [place(ring(43.3, 1.3), (-35, y, 0), (90, 0, 0)) for y in (197, 201, 205)]
     knobs = union(rod((30, 60, 0), (58, 60, 0), 9), rod((56, 60, 0), (72, 60, 0), 12), rod((40, 36, 0), (66, 32, 0), 8), rod((62, 33, 0), (76, 31, 0), 10))
     inlet = union(rod((43, -62, 0), (46, -80, 0), 11), rod((46, -78, 0), (47, -86, 0), 14), rod((47, -86, 0), (49, -104, 0), 7))
-    return place(facing(union(body, cap, grip, hook, trigger, pivot, stem, cup, knobs, inlet, *rows)), turn=(0, 0, 10))
-
-
-def spare_parts() -> Solid:
-    """Placeholder."""
-    return union(cut(ball(1), disc(0.2).extrude(3)), tube([(0, 0, 0), (0, 1, 0)], 0.1), plate(softened(disc(1), 0.1), 1))
+    return place(facing(union(body, cap, grip, hook, trigger, pivot, stem, cup, knobs, inlet, *rows)), turn=(0, 0, 1))

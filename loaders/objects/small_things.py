@@ -28,18 +28,18 @@ def marker() -> Solid:
     barrel = lathe([(7.6, 0), (8.6, 1), (8.6, 3), (9, 4), (9, 84), (8.4, 86), (8.4, 94), (5.6, 100), (5.2, 116), (3.4, 120)])
     tip = cut(rod((0, 0, 118), (0, 0, 131), 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
     label = wrapped(rectangle(52, 64), 9, 44, 0.3)
-    words = place(text_section("MARKER", 52).rotate(90).extrude(3), (0, 0, 0), (90, 0, -90)).translate((-7.2, 0, 44))
+    words = wrapped(text_section("MARKER", 54).rotate(90), 9.2, 44, 0.6)
     grooves = [ring(9, 0.45, z) for z in (7, 9, 11, 80)]
-    return place(union(cut(barrel, *grooves), tip, label, words), turn=(18, -8, 0))
+    return place(union(cut(barrel, *grooves), tip, label, words), turn=(4, -2, 0))
 
 
 def pen() -> Solid:
     """Retractable ballpoint, 12 x 145 mm: push button, clip, ribbed rubber grip and a fine point."""
-    barrel = lathe([(0.7, 0), (1.0, 3), (1.9, 4), (4.6, 17), (5.2, 20), (5.2, 50), (5.8, 51), (5.8, 54), (5.3, 55), (5.3, 126), (4.4, 130)], segments=64)
+    ribs = [(5.2 + 0.6 * proud, 21 + 2.6 * k + at) for k in range(11) for at, proud in ((0, 0), (0.5, 1), (1.3, 1), (1.8, 0))]
+    barrel = lathe([(0.7, 0), (1.0, 3), (1.9, 4), (4.6, 17), (5.2, 20), *ribs, (5.2, 50), (5.8, 51), (5.8, 54), (5.3, 55), (5.3, 126), (4.4, 130)], segments=64)
     button = lathe([(3, 128), (3, 140), (2.3, 142)], 0.4, SMALL_SEGMENTS)
     clip = union(block(2.2, 4.2, 52, 0.8, (-8.4, 0, 104)), block(5, 4.2, 5, 0.8, (-6.4, 0, 127.5)), ball(2.2, (-7.6, 0, 79)))
-    ribs = [ring(5.2, 0.55, 22 + 2.4 * k) for k in range(11)]
-    return place(union(barrel, button, clip, *ribs), turn=(14, -8, 0))
+    return place(union(barrel, button, clip), turn=(4, -2, 0))
 
 
 def chalk_stick() -> Solid:
@@ -48,20 +48,18 @@ def chalk_stick() -> Solid:
     worn = place(block(20, 20, 8), (-3, 0, 85), (0, -32, 0))
     broken = [place(block(18, 18, 8), (x, y, -3.2), turn) for x, y, turn in ((4, 2, (14, 22, 0)), (-5, 4, (-20, -16, 0)), (0, -5, (24, 3, 0)))]
     chips = [ball(2.2, (8.1 * c, 8.1 * s, z)) for c, s, z in ((-1, 0.2, 22), (0.6, 0.8, 40), (0.3, -0.95, 61), (-0.7, -0.7, 70))]
-    return place(cut(body, worn, *broken, *chips), turn=(20, -10, 0))
+    return place(cut(body, worn, *broken, *chips), turn=(5, -3, 0))
 
 
 def eyeglasses() -> Solid:
     """Spectacles, 140 mm wide, on open temples: rims with lenses, bridge, nose pads, hinges, hooked ear ends."""
-    angle = 2 * np.pi * np.arange(96) / 96
     rim = superellipse(56, 46, 2.6, 96)
-    del angle
     parts: list[Solid] = []
     for side in (-1, 1):
         loop = np.stack([rim[:, 0] + side * 35, rim[:, 1], 0 * rim[:, 0]], axis=1)
         parts.append(tube(loop, 2.3, flatten=1.2, closed=True, sides=20))
         parts.append(plate(polygon(rim).translate((side * 35, 0)), 1.6))
-        temple = curve([(side * 66, 9, -2), (side * 68, 9, -30), (side * 68, 8, -85), (side * 67, 0, -112), (side * 66, -20, -128)])
+        temple = curve([(side * 66, 9, -2), (side * 68, 9, -28), (side * 68, 8, -72), (side * 67, 1, -96), (side * 66, -18, -112)])
         parts.append(tube(temple, 2.0, flatten=1.9, up=(0, 1, 0.2), sides=20))
         parts.append(block(8, 9, 9, 2, (side * 65, 9, -2)))
         parts.append(place(Solid.sphere(4, 32).scale((0.5, 1.3, 0.9)), (side * 9.5, -7, -7), (0, side * 30, 0)))
@@ -79,7 +77,7 @@ def battery() -> Solid:
         wrapped(text_section("+", 9), 13, 41, 0.5), wrapped(text_section("-", 7), 13, 6, 0.5),
         wrapped(text_section("BATTERY", 32), 13, 22, 0.5), wrapped(rectangle(30, 1.2), 13, 15, 0.45), wrapped(rectangle(30, 1.2), 13, 29, 0.45),
     )  # fmt: skip
-    return place(union(body, nub, collar, words), turn=(0, -26, 0))
+    return place(union(body, nub, collar, words), turn=(0, -3, 0))
 
 
 def battery_case() -> Solid:
@@ -96,9 +94,4 @@ def battery_case() -> Solid:
         cells += [cell, stem, plus, *spring, block(1.4, 9, 11, 0, (side * 31, y, 2))]
     leads = [tube(curve([(30, y, -4), (37, y, -4), (41, y + 5, -3), (42, 20 + y, 0)]), 1.3, sides=20) for y in (6, 12)]
     clips = [block(8, 4, 5, 1, (x, s * 31, 8)) for x in (-16, 16) for s in (-1, 1)]
-    return place(facing(union(tray, *walls, *cells, *leads, *clips)), turn=(0, -10, 12))
-
-
-def unused() -> Solid:
-    """Placeholder."""
-    return plate(softened(rectangle(1, 1), 0.1), 1)
+    return place(facing(union(tray, *walls, *cells, *leads, *clips)), turn=(0, -1, 2))

@@ -17,7 +17,13 @@ Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]
 
 SEGMENTS = 120  # round a turned part: chord error 0.05 mm at a radius of 150 mm, a fifteenth of a pixel at 1.8 m
-SMALL_SEGMENTS = 48  # round parts of less than about 20 mm radius
+SMALL_SEGMENTS = 48  # round parts of less than 20 mm radius
+TINY_SEGMENTS = 24  # round parts of less than 4 mm radius
+
+
+def segments_for(radius: float) -> int:
+    """Segments round a circle of ``radius`` mm."""
+    return SEGMENTS if radius > 20 else SMALL_SEGMENTS if radius > 4 else TINY_SEGMENTS
 
 
 def union(*solids: Solid) -> Solid:
@@ -38,6 +44,18 @@ def place(solid: Solid, at: Point3 = (0, 0, 0), turn: Point3 = (0, 0, 0)) -> Sol
 def facing(solid: Solid) -> Solid:
     """A drawn solid (x right, y up, z to the viewer) stood up before the camera of the first view."""
     return solid.rotate((90, 0, -90))
+
+
+def laid(solid: Solid) -> Solid:
+    """An upright solid laid into the drawing frame, its front towards the viewer: the inverse of :func:`facing`."""
+    return solid.rotate((0, 0, 90)).rotate((-90, 0, 0))
+
+
+def embossed(body: Solid, section: Section, relief: float) -> Solid:
+    """A drawn section pressed out of the front of an upright body by about ``relief`` mm, following its surface."""
+    low_x, low_y, _, high_x, high_y, _ = body.bounding_box()
+    grown = body.scale((1 + 2 * relief / (high_x - low_x), 1 + 2 * relief / (high_y - low_y), 1))
+    return grown ^ facing(section.extrude(-2 * low_x))
 
 
 def polygon(points: Sequence[Point2] | np.ndarray, soften: float = 0.0) -> Section:
@@ -71,7 +89,7 @@ def rectangle(width: float, height: float, soften: float = 0.0, at: Point2 = (0,
 
 def disc(radius: float, at: Point2 = (0, 0)) -> Section:
     """Circle about ``at``."""
-    return CrossSection.circle(radius, SEGMENTS if radius > 20 else SMALL_SEGMENTS).translate(at)
+    return CrossSection.circle(radius, segments_for(radius)).translate(at)
 
 
 def plate(section: Section, thickness: float, bevel: float = 0.0) -> Solid:
@@ -108,13 +126,13 @@ def vessel(profile: Sequence[Point2] | np.ndarray, wall: float, soften: float = 
 
 def ring(radius: float, bead: float, z: float = 0.0) -> Solid:
     """Torus about z at height ``z``; ``bead`` is the radius of its tube."""
-    section = CrossSection.circle(bead, 24).translate((radius, z))
-    return Manifold.revolve(section, SEGMENTS)
+    section = CrossSection.circle(bead, 24 if bead > 3 else 12).translate((radius, z))
+    return Manifold.revolve(section, segments_for(radius))
 
 
 def ball(radius: float, at: Point3 = (0, 0, 0)) -> Solid:
     """Sphere about ``at``."""
-    return Manifold.sphere(radius, SMALL_SEGMENTS).translate(at)
+    return Manifold.sphere(radius, min(segments_for(radius), SMALL_SEGMENTS)).translate(at)
 
 
 def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = None, rounded: bool = False) -> Solid:
@@ -124,10 +142,9 @@ def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = No
     last = radius if end_radius is None else end_radius
     if rounded:
         return (ball(radius, start) + ball(last, end)).hull()
-    segments = SEGMENTS if max(radius, last) > 20 else SMALL_SEGMENTS
     polar = float(np.degrees(np.arctan2(np.hypot(axis[0], axis[1]), axis[2])))
     azimuth = float(np.degrees(np.arctan2(axis[1], axis[0])))
-    return place(Manifold.cylinder(length, radius, last, segments), start, (0, polar, azimuth))
+    return place(Manifold.cylinder(length, radius, last, segments_for(max(radius, last))), start, (0, polar, azimuth))
 
 
 def block(width: float, depth: float, height: float, soften: float = 0.0, at: Point3 = (0, 0, 0)) -> Solid:

@@ -9,8 +9,6 @@ from fpp_ml_bench.loaders.objects.solids import (
     cut,
     lathe,
     place,
-    plate,
-    polygon,
     rectangle,
     ring,
     rod,
@@ -18,7 +16,7 @@ from fpp_ml_bench.loaders.objects.solids import (
     union,
     vessel,
 )
-from fpp_ml_bench.loaders.objects.sweeps import curve, tube
+from fpp_ml_bench.loaders.objects.sweeps import curve, skin, tube
 
 
 def bowl() -> Solid:
@@ -50,9 +48,9 @@ def pitcher() -> Solid:
     ear = curve([(0, -56, 214), (0, -78, 222), (0, -104, 206), (0, -110, 160), (0, -98, 104), (0, -74, 66), (0, -50, 56)])
     handle = tube(ear, 8.0, flatten=1.4, up=(1, 0, 0))
     ridges = [ring(r, 1.3, z) for r, z in ((48.6, 10), (49.2, 17), (49.8, 24), (61.4, 222))]
-    marks = [wrapped(rectangle(14 if k % 2 else 26, 2.4), 53 + 0.05 * z, z, 1.2, 24) for k, z in enumerate(range(50, 200, 20))]
+    marks = [wrapped(rectangle(14 if k % 2 else 26, 2.4), 48.6 + 0.062 * z, z, 1.4, 24) for k, z in enumerate(range(50, 200, 20))]
     shell = cut(union(body, lip, handle, *ridges, *marks), throat, bore)
-    return place(shell, turn=(0, -14, 0))
+    return place(shell, turn=(0, -10, 0))
 
 
 def _spout(inset: float) -> Solid:
@@ -109,7 +107,7 @@ def duct_tape() -> Solid:
     lifted = np.stack([(64.0 + 30 * np.clip(bent - -0.5, 0, 1) ** 2) * np.cos(bent), (64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2) * np.sin(bent)], axis=1)
     end = stroke([(float(x), float(y)) for x, y in lifted], 1.4).extrude(50)
     roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
-    return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 26)).rotate((0, -8, 0))
+    return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 16)).rotate((0, -5, 0))
 
 
 def banana() -> Solid:
@@ -120,8 +118,6 @@ def banana() -> Solid:
     along = np.linspace(0, 1, len(bend))
     knots = curve([(0, 4.2), (0.03, 6.0), (0.09, 11.5), (0.22, 16.4), (0.45, 18.4), (0.66, 16.6), (0.8, 11.5), (0.88, 6.2), (0.95, 4.4), (1.0, 5.4)])
     girth = np.interp(along, knots[:, 0], knots[:, 1])
-    from fpp_ml_bench.loaders.objects.sweeps import skin
-
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.broadcast_to(np.array([1.0, 0.0, 0.0]), path.shape)
@@ -130,10 +126,5 @@ def banana() -> Solid:
     edges = 1 + 0.055 * np.cos(5 * angle + 0.6)
     reach = girth[:, None] * edges[None, :]
     rings = path[:, None, :] + (reach * np.cos(angle))[:, :, None] * across[:, None, :] + (reach * np.sin(angle))[:, :, None] * above[:, None, :]
-    tip = rod(tuple(path[0]), tuple(path[0] + 3 * (path[0] - path[2])), 3.4, 2.8)
-    return place(union(skin(rings), tip), turn=(32, 0, 0)).rotate((0, 14, 20))
-
-
-def unused_outline() -> Solid:
-    """Placeholder."""
-    return plate(polygon([(0, 0), (1, 0), (0, 1)]), 1)
+    tip = rod(tuple(path[0]), tuple(path[0] + 0.6 * (path[0] - path[2])), 3.4, 2.8)
+    return place(union(skin(rings), tip), turn=(32, 0, 0)).rotate((0, 4, 4))
