@@ -1,0 +1,116 @@
+"""Training samples as torch tensors: one fringe image in, one depth map out, in the representation of your choice."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.frames import CONFIGS
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.normalisation import NORMALISATIONS, Normalisation, normalise
+from fpp_ml_bench.pixel_sets import object_mask
+
+
+class FringeDepth(NamedTuple):
+    """One training sample, or a batch of them with a leading axis B.
+
+    ``fringe`` float32 (1, H, W) in [0, 1]; ``depth`` float32 (1, H, W) in the chosen representation, 0 = background;
+    ``depth_range_mm`` float32 (2,), D_min and D_max of the sample; ``row`` and ``frame`` int64, where it came from.
+    """
+
+    fringe: torch.Tensor
+    depth: torch.Tensor
+    depth_range_mm: torch.Tensor
+    row: torch.Tensor
+    frame: torch.Tensor
+
+
+class FringeDepthDataset(Dataset[FringeDepth]):
+    """Pairs of one frame and the depth map of its sample (paper Sections 3.3 and 5.4).
+
+    Parameters
+    ----------
+    folder : dataset folder.
+    split : ``train``, ``validation`` or ``test``.
+    config : which frames are samples of their own: ``single_shot`` (frame 0), ``horizontal``, ``vertical``,
+        ``sinusoidal`` or ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
+    normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] per sample, from its own D_min and D_max; a flat
+        sample is 0 throughout). See `fpp_ml_bench.normalisation`.
+    background_removed : set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
+
+    Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. `batches` is the
+    fast way on one process, with buffers that are reused.
+
+    Raises `DatasetError` for a folder, split or configuration that is not there.
+    """
+
+    def __init__(
+        self, folder: str | Path, split: str, config: str = "single_shot", normalisation: Normalisation = "individual",
+        background_removed: bool = False,
+    ) -> None:  # fmt: skip
+        self.source = DatasetFolder(folder)
+        if config not in CONFIGS or config not in self.source.configs:
+            raise DatasetError(f"{folder}: no configuration {config!r}; there are {', '.join(self.source.configs)}")
+        if normalisation not in NORMALISATIONS:
+            raise DatasetError(f"unknown normalisation {normalisation!r}; there are {', '.join(NORMALISATIONS)}")
+        self.samples = self.source.samples(split)
+        self.frames = self.source.sequence.config(config)
+        self.normalisation: Normalisation = normalisation
+        self.background_removed = background_removed
+
+    def __len__(self) -> int:
+        return len(self.samples) * len(self.frames)
+
+    def pair(self, index: int) -> tuple[int, int]:
+        """Row and frame of item ``index``: all frames of a row, then the next row."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"item {index} of {len(self)}")
+        row, place = divmod(index % len(self), len(self.frames))
+        return row, self.frames[place]
+
+    def __getitem__(self, index: int) -> FringeDepth:
+        return FringeDepth(*(tensor[0] for tensor in self.read([index])))
+
+    def read(self, indices: Sequence[int], out: FringeDepth | None = None) -> FringeDepth:
+        """Items ``indices`` as one batch: fringe and depth (B, 1, H, W). Written into ``out``, of the same B, if given."""
+        batch = self.empty(len(indices)) if out is None else out
+        fringes, depths = batch.fringe.numpy(), batch.depth.numpy()
+        for place, index in enumerate(indices):
+            row, frame = self.pair(index)
+            sample = self.samples[row]
+            depth_mm = self.source.depth_mm(sample)
+            measured = self.source.measured(sample)
+            low, high = measured["depth_min_mm"], measured["depth_max_mm"]
+            np.copyto(fringes[place, 0], self.source.frame(sample, frame))
+            if self.background_removed:
+                fringes[place, 0] *= object_mask(depth_mm)
+            normalise(depth_mm, self.normalisation, low, high, out=depths[place, 0])
+            batch.depth_range_mm[place, 0], batch.depth_range_mm[place, 1] = low, high
+            batch.row[place], batch.frame[place] = row, frame
+        batch.fringe.div_(GREY_LEVELS)
+        return batch
+
+    def empty(self, size: int) -> FringeDepth:
+        """Buffers for a batch of ``size`` items."""
+        image = (size, 1, *self.source.size)
+        return FringeDepth(
+            torch.empty(image), torch.empty(image), torch.empty(size, 2), torch.empty(size, dtype=torch.int64),
+            torch.empty(size, dtype=torch.int64),
+        )  # fmt: skip
+
+    def batches(self, size: int, order: Sequence[int] | None = None) -> Iterator[FringeDepth]:
+        """Batches of ``size`` items (the last may be smaller) in ``order``, default ascending.
+
+        The tensors are views of one buffer that the next batch overwrites: copy what must outlive the step (moving a
+        batch to a GPU does).
+        """
+        order = range(len(self)) if order is None else order
+        buffer = self.empty(size)
+        for start in range(0, len(order), size):
+            indices = order[start : start + size]
+            yield self.read(indices, FringeDepth(*(tensor[: len(indices)] for tensor in buffer)))
