@@ -44,7 +44,7 @@ def mustard_bottle() -> Solid:
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
     words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
-    return place(union(body, closure, panel, embossed(body, words, 2.2), *grips), turn=(0, -1, 30))
+    return place(union(body, closure, panel, embossed(body, words, 2.2), *grips), turn=(0, 0, 30))
 
 
 def bleach_cleanser() -> Solid:
@@ -58,7 +58,7 @@ def bleach_cleanser() -> Solid:
     words = text_section("BLEACH", 74).translate((0, 70))
     for width, height in ((76, 50), (60, 40), (66, 30)):
         words = words + rectangle(width, 2.6, 0, (0, height))
-    return place(union(body, neck, cap, embossed(body, words, 1.5)), turn=(0, -1, 30))
+    return place(union(body, neck, cap, embossed(body, words, 1.5)), turn=(0, 0, 30))
 
 
 def container_bottle() -> Solid:
@@ -82,8 +82,8 @@ def spray_bottle() -> Solid:
     """Trigger sprayer, 92 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
     body = lathe(
         np.concatenate([
-            [(34, 0), (40, 1)],
-            curve([(43, 5), (43, 60), (42, 100), (36, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
+            [(33, 0), (39, 1)],
+            curve([(41, 5), (41, 60), (40, 100), (35, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
             [(14.5, 205)],
         ])
     )  # fmt: skip
@@ -97,8 +97,8 @@ def spray_bottle() -> Solid:
             curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
         ])), 13, 0)  # fmt: skip
     nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), rod((-76, 257, 0), (-80, 257, 0), 5)))
-    grip = [ring(43.2, 0.9, z) for z in (16, 22, 28)]
-    words = wrapped(text_section("SPRAY", 58), 42.6, 74, 1.3)
+    grip = [ring(41.2, 0.9, z) for z in (16, 22, 28)]
+    words = wrapped(text_section("SPRAY", 58), 40.7, 74, 1.3)
     return place(union(body, collar, facing(plate(head, 26)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
 
 
@@ -110,7 +110,7 @@ def vial() -> Solid:
     label = wrapped(rectangle(62, 22), 12, 20, 0.25)
     words = wrapped(text_section("VIAL", 16), 12.2, 25, 0.35)
     lines = [wrapped(rectangle(15, 1.1), 12.2, z, 0.3) for z in (18.5, 15.5, 12.5)]
-    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, -1, 0))
+    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, 0, 0))
 
 
 def cork() -> Solid:

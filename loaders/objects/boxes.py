@@ -118,7 +118,7 @@ def magazine_stack() -> Solid:
         covers = [block(212, 280, 0.8, 0, (0, 0, z)) for z in (0.4, thick - 0.4)]
         spine = block(3, 280, thick, 0, (-104.5, 0, thick / 2))
         magazines.append(place(union(pages, spine, *covers), (dx, dy, base), (0, 0, turn)))
-        base += thick + 0.0
+        base += thick - 0.3  # pressed together: the stack is one body
     title = place(text_plate("MAGAZINE", 170, 1.2), (-62, 4, base), (0, 0, -94))
     photo = place(block(110, 150, 2.0, 0), (22, 8, base), (0, 0, -4))
     curl = curve([(-40, 0), (20, 1), (70, 8), (104, 26), (112, 36)])

@@ -103,10 +103,11 @@ def container_tin() -> Solid:
     """Lever-lid tin with a wire handle, 110 x 130 mm."""
     body = _rimmed(54, 128, ribs=(30, 34, 98, 102))
     collar = cut(lathe([(54, 124), (54, 131), (44, 131)]), rod((0, 0, 126), (0, 0, 133), 44))
-    lid = cut(lathe([(43.5, 120), (43.5, 130), (45, 130), (45, 132.5), (40, 132.5)]), rod((0, 0, 129), (0, 0, 134), 37))
-    ears = [rod((0, s * 52, 112), (0, s * 59, 112), 8, 5) for s in (-1, 1)]
+    lid = cut(lathe([(44.5, 120), (44.5, 130), (45.5, 130), (45.5, 132.5), (40, 132.5)]), rod((0, 0, 129), (0, 0, 134), 37))
+    plug = rod((0, 0, 118), (0, 0, 129.1), 44.2)
+    ears = [rod((0, s * 52, 112), (0, s * 64, 112), 8, 5) for s in (-1, 1)]
     bail = [(0.0, -58.0, 112.0), (-12.0, -60.0, 95.0), (-34.0, -44.0, 62.0), (-42.0, -18.0, 46.0), (-44.0, 0.0, 43.0)]
     mirrored = [(x, -y, z) for x, y, z in bail[-2::-1]]
     handle = tube(curve([(x * 1.45, y * 1.05, z) for x, y, z in bail + mirrored]), 1.8, up=(1, 0, 0.3))
     rivet = block(6, 10, 16, 2, (54, 0, 64))
-    return place(union(body, collar, lid, *ears, handle, rivet), turn=(0, -2, 0))
+    return place(union(body, collar, plug, lid, *ears, handle, rivet), turn=(0, -12, 0))

@@ -33,7 +33,7 @@ def paint_container_bottle() -> Solid:
     lip = block(8, 9, 3, 1, (-12, 0, 112))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
     words = union(wrapped(text_section("PAINT", 34), 22.4, 54, 0.7), wrapped(stroke(_BRUSH_MARK, 9), 22.4, 28, 0.9))
-    return place(union(body, cap, lip, label, words), turn=(0, -1, 0))
+    return place(union(body, cap, lip, label, words), turn=(0, 0, 0))
 
 
 def paint_container_jar() -> Solid:
@@ -46,7 +46,7 @@ def paint_container_jar() -> Solid:
         runs.append(rod((x, y, top), (x, y, top - length), 2.4, 3.6, rounded=True))
     hem = tube([(-36.0 * np.cos(a), 36.0 * np.sin(a), 62.5) for a in np.linspace(-0.7, 0.8, 30)], 3.4)
     words = wrapped(text_section("PAINT", 44), 38, 14, 1.1)
-    return place(union(body, lid, hem, words, *runs), turn=(0, -2, 0))
+    return place(union(body, lid, hem, words, *runs), turn=(0, -1, 0))
 
 
 def paint_container_spraycan() -> Solid:
@@ -68,7 +68,7 @@ def paint_container_spraycan() -> Solid:
         wrapped(text_section("PAINT", 66), 32.4, 94, 0.9),
         wrapped(stroke(_BRUSH_MARK, 12).scale((1.2, 1.2)), 32.4, 54, 1.0),
     )
-    return place(union(body, button, nozzle, label, words), turn=(0, -1, 0))
+    return place(union(body, button, nozzle, label, words), turn=(0, 0, 0))
 
 
 def _tube(length: float, width: float, cap_radius: float, cap_height: float, crimp: float = 10.0) -> Solid:
@@ -91,7 +91,7 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 15 x 62 mm, leaning."""
     body = _tube(40, 22, 6.5, 9, 6)
-    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 40)), 0.5)), turn=(2, -1, 0)).rotate((0, 0, 30))
+    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 40)), 0.5)), turn=(1, 0, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube() -> Solid:
@@ -99,7 +99,7 @@ def paint_container_tube() -> Solid:
     body = _tube(82, 30, 7.5, 13, 8)
     roll = rod((-3.2, -15.6, 102), (-3.2, 15.6, 102), 4.6)
     words = text_section("OIL", 19).translate((0, 62)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 44))
-    return place(union(body, roll, embossed(body, words, 0.7)), turn=(-2, 1, 0)).rotate((0, 0, 30))
+    return place(union(body, roll, embossed(body, words, 0.7)), turn=(-1, 0, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube_large() -> Solid:
@@ -108,7 +108,7 @@ def paint_container_tube_large() -> Solid:
     dent = place(ball(26), (-32, 8, 124))
     hinge = block(6, 12, 8, 1, (18, 0, 24))
     words = text_section("ACRYL", 36).translate((0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
-    return place(union(cut(union(body, embossed(body, words, 1.0)), dent), hinge), turn=(2, -1, 0)).rotate((0, 0, 30))
+    return place(union(cut(union(body, embossed(body, words, 1.0)), dent), hinge), turn=(1, 0, 0)).rotate((0, 0, 30))
 
 
 def paint_thinner() -> Solid:

@@ -40,7 +40,7 @@ def power_drill() -> Solid:
     grip = union(plate(grip_outline, 30), plate(grip_outline.offset(-4), 40))
     trigger = union(plate(polygon([(4, 50), (-8, 44), (-8, 32), (0, 20), (12, 16), (10, 50)], 2), 16))
     shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 44, 0)
-    battery = block(104, 40, 48, 6, (30, -82, 0))
+    battery = block(104, 42, 46, 6, (30, -81, 0))
     latch = union(block(14, 12, 52, 3, (-4, -78, 0)), block(108, 3, 50, 1, (30, -70, 0)))
     vents = [block(5, 26, 80, 2, (x, 84, 0)) for x in (22, 31, 40, 49)]
     cap = place(lathe([(27, 0), (27, 6), (20, 12)], 1.5), (60, 78, 0), (0, 90, 0))
@@ -61,7 +61,7 @@ def spraygun() -> Solid:
     body = place(lathe([(15, 0), (17, 4), (17, 60), (15, 84), (17, 88), (17, 96)], 1), (34, 60, 0), _TO_LEFT)
     cap = union(
         place(ring(18, 2.4).scale((1, 1, 2.6)), (-66, 60, 0), _TO_LEFT),
-        place(lathe([(18, 0), (18, 8), (8, 13), (5, 18)]), (-62, 60, 0), _TO_LEFT),
+        place(lathe([(18, 0), (18, 8), (8, 13), (5, 18)]), (-60, 60, 0), _TO_LEFT),
         *(place(block(16, 9, 11, 2), (-76, 60 + s * 15, 0), (0, 0, s * 24)) for s in (-1, 1)),
     )  # fmt: skip
     grip_outline = polygon(np.concatenate([
