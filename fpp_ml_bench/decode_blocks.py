@@ -26,13 +26,15 @@ from fpp_ml_bench.triangulation import depth_from_both, depth_from_coordinate
 
 MIN_MODULATION = 5.0
 """Grey levels. At read noise of one level and only 3 steps this leaves a phase noise of 0.16 rad: a tenth of the pi/2
-that the fringe order tolerates, and some 7 mm of depth at 1.8 m. Darker than this is shadow, glare or no projector light."""
+that the fringe order tolerates, and some 7 mm of depth at 1.8 m. Darker than this is shadow, glare or no projector
+light."""
 CLIPPED_STEPS_DIVISOR = 9
-"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). With so many steps a clipped crest distorts
-the phase by under 5 mrad, since N steps cancel harmonics up to N - 2; with few steps it would bias it by tens of mrad."""
+"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). With so many steps a clipped crest
+distorts the phase by under 5 mrad, since N steps cancel harmonics up to N - 2; with few steps it would bias it by tens
+of mrad."""
 MAX_DISAGREEMENT_PX = 1.5
-"""Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps gives a
-sigma of 0.5 px; a fringe order wrong by one puts an 18-px fringe more than 10 px off."""
+"""Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps
+gives a sigma of 0.5 px; a fringe order wrong by one puts an 18-px fringe more than 10 px off."""
 
 
 class Reason(IntEnum):
@@ -120,14 +122,14 @@ def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limit
         from fpp_ml_bench.decode_kernels import decode_block
 
         count = grey.shape[1]
-        found = Coordinates(*(np.empty(count) for _ in range(3)), reason=np.empty(count, dtype=np.uint8))
+        found = Coordinates(np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
         thresholds = (
             float(limits.min_modulation),
             float(plan.max_clipped_steps),
             float(limits.ambiguous_fraction),
             INCONSISTENT_RAD,
         )
-        codes = np.array(_STAGE_REASONS, dtype=np.uint8)
+        codes = tuple(float(code) for code in _STAGE_REASONS)
         decode_block(
             grey, plan.weights, len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px), thresholds,
             codes, found.coordinate_px, found.modulation, found.phase, found.reason,

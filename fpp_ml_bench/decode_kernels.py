@@ -56,7 +56,7 @@ def decode_block(  # type: ignore[no-untyped-def]
     """
     steps, total = weights.shape[1], frames.shape[1]
     mean, cosine, sine = np.empty(TILE), np.empty(TILE), np.empty(TILE)
-    clipped = np.empty(TILE, np.int32)
+    clipped, centre, faulty = np.empty(TILE, np.int32), np.empty(TILE), np.empty(TILE)
     dark, bright, least = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
     cell, doubt, previous = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
     cells = len(centres)
@@ -76,36 +76,41 @@ def decode_block(  # type: ignore[no-untyped-def]
             for i in range(n):
                 clipped[i] += row[i] == 255
         for i in range(n):
+            phase[start + i] = _minus_atan2(sine[i], cosine[i])
+        for i in range(n):
             b = math.sqrt(cosine[i] * cosine[i] + sine[i] * sine[i])
             modulation[start + i] = b
-            phase[start + i] = _minus_atan2(sine[i], cosine[i])
             margin = limits[2] * b
             # Grey levels are whole numbers, so the float comparisons become exact integer ones: grey > mean is
-            # grey > floor(mean), and |grey - mean| < margin is dark < grey < bright.
+            # grey > floor(mean), and mean - margin < grey < mean + margin is dark < grey < bright.
             least[i] = np.int16(math.floor(mean[i]))
             dark[i] = np.int16(max(math.floor(mean[i] - margin), -1.0))
             bright[i] = np.int16(min(math.ceil(mean[i] + margin), 256.0))
         for bit in range(bits):
             row = frames[steps + bit, start : start + n]
             for i in range(n):
-                grey = np.int16(row[i])
-                previous[i] ^= grey > least[i]
+                level = np.int16(row[i])
+                previous[i] ^= level > least[i]
                 cell[i] = np.int16(cell[i] * 2 + previous[i])
-                doubt[i] = np.int16(doubt[i] * 2 + ((grey > dark[i]) & (grey < bright[i])))
+                doubt[i] = np.int16(doubt[i] * 2 + ((level > dark[i]) & (level < bright[i])))
         for i in range(n):
-            number = np.int32(cell[i])
-            even = number + (number & 1)
+            even = np.int16(cell[i] + (cell[i] & 1))
             trusted = (doubt[i] <= 1) | (doubt[i] == (even & -even))
-            centre = centres[min(number, cells - 1)]
+            faulty[i] = 0.0 if trusted & (cell[i] < cells) else 1.0
+        for i in range(n):
+            centre[i] = centres[min(np.int64(cell[i]), cells - 1)]
+        for i in range(n):
             phi = phase[start + i]
-            absolute = phi + _TAU * math.floor((centre - phi) / _TAU + 0.5)
-            trusted = trusted & (number < cells) & (abs(absolute - centre) <= limits[3])
-            w = absolute * (pitch / _TAU)
-            coordinate[start + i] = w
-            code = codes[3] if (w < -0.5) | (w > length - 0.5) else np.uint8(0)
-            code = code if trusted else codes[2]
+            absolute = phi + _TAU * math.floor((centre[i] - phi) / _TAU + 0.5)
+            coordinate[start + i] = absolute * (pitch / _TAU)
+            faulty[i] += 1.0 if abs(absolute - centre[i]) > limits[3] else 0.0
+        for i in range(n):
+            w = coordinate[start + i]
+            code = codes[3] if (w < -0.5) | (w > length - 0.5) else 0.0
+            code = codes[2] if faulty[i] > 0.0 else code
             code = codes[1] if clipped[i] > limits[1] else code
-            reason[start + i] = code if modulation[start + i] >= limits[0] else codes[0]
+            code = code if modulation[start + i] >= limits[0] else codes[0]
+            reason[start + i] = np.uint8(np.int32(code))
 
 
 @njit
@@ -132,25 +137,33 @@ def depth_both(  # type: ignore[no-untyped-def]
     """
     (fx, fy), (cx, cy) = focal, centre
     tx, ty, tz = translation[0], translation[1], translation[2]
-    for i in range(len(x)):
-        a0 = rotation[0, 0] * x[i] + rotation[0, 1] * y[i] + rotation[0, 2]
-        a1 = rotation[1, 0] * x[i] + rotation[1, 1] * y[i] + rotation[1, 2]
-        forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
-        px, py = (u[i] - cx) / fx, (v[i] - cy) / fy
-        wu, wv = weight_u[i] * weight_u[i], weight_v[i] * weight_v[i]
-        cu, du = fx * (a0 - px * forward), fx * (px * tz - tx)
-        cv, dv = fy * (a1 - py * forward), fy * (py * tz - ty)
-        w = (wu * cu * du + wv * cv * dv) / (wu * du * du + wv * dv * dv)
+    cu, du, cv, dv = np.empty(TILE), np.empty(TILE), np.empty(TILE), np.empty(TILE)
+    forward, inverse = np.empty(TILE), np.empty(TILE)
+    for start in range(0, len(x), TILE):
+        n = min(TILE, len(x) - start)
+        for i in range(n):
+            j = start + i
+            a0 = rotation[0, 0] * x[j] + rotation[0, 1] * y[j] + rotation[0, 2]
+            a1 = rotation[1, 0] * x[j] + rotation[1, 1] * y[j] + rotation[1, 2]
+            forward[i] = rotation[2, 0] * x[j] + rotation[2, 1] * y[j] + rotation[2, 2]
+            px, py = (u[j] - cx) / fx, (v[j] - cy) / fy
+            wu, wv = weight_u[j] * weight_u[j], weight_v[j] * weight_v[j]
+            cu[i], du[i] = fx * (a0 - px * forward[i]), fx * (px * tz - tx)
+            cv[i], dv[i] = fy * (a1 - py * forward[i]), fy * (py * tz - ty)
+            inverse[i] = (wu * cu[i] * du[i] + wv * cv[i] * dv[i]) / (wu * du[i] * du[i] + wv * dv[i] * dv[i])
         if tz != 0.0:
             for _ in range(GAUSS_NEWTON_STEPS):
-                q = forward + tz * w
-                ru, rv = (cu - du * w) / q, (cv - dv * w) / q
-                gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
-                w = w + (wu * ru * gu + wv * rv * gv) / (wu * gu * gu + wv * gv * gv)
-        q = forward + tz * w
-        ru, rv = (cu - du * w) / q, (cv - dv * w) / q
-        gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
-        disagreement[i] = abs(ru * gv - rv * gu) / math.sqrt(gu * gu + gv * gv)
-        z = 1.0 / w
-        good = (z > 0.0) & (z < np.inf) & (forward * z + tz > 0.0)
-        depth_mm[i] = z * 1000.0 if good else np.nan
+                for i in range(n):
+                    wu, wv = weight_u[start + i] * weight_u[start + i], weight_v[start + i] * weight_v[start + i]
+                    q = forward[i] + tz * inverse[i]
+                    ru, rv = (cu[i] - du[i] * inverse[i]) / q, (cv[i] - dv[i] * inverse[i]) / q
+                    gu, gv = (du[i] + ru * tz) / q, (dv[i] + rv * tz) / q
+                    inverse[i] += (wu * ru * gu + wv * rv * gv) / (wu * gu * gu + wv * gv * gv)
+        for i in range(n):
+            q = forward[i] + tz * inverse[i]
+            ru, rv = (cu[i] - du[i] * inverse[i]) / q, (cv[i] - dv[i] * inverse[i]) / q
+            gu, gv = (du[i] + ru * tz) / q, (dv[i] + rv * tz) / q
+            disagreement[start + i] = abs(ru * gv - rv * gu) / math.sqrt(gu * gu + gv * gv)
+            z = 1.0 / inverse[i]
+            good = (z > 0.0) & (z < np.inf) & (forward[i] * z + tz > 0.0)
+            depth_mm[start + i] = z * 1000.0 if good else np.nan

@@ -36,8 +36,9 @@ class Measured:
 
 @dataclass(frozen=True)
 class Decoded:
-    """``depth_mm`` float32 (H, W), 0 = none; ``reason`` uint8 (H, W), a `Reason` code each; ``counts`` pixels per reason
-    (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, if asked for."""
+    """``depth_mm`` float32 (H, W), 0 = none; ``reason`` uint8 (H, W), a `Reason` code each; ``counts`` pixels per
+    reason (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, if
+    asked for."""
 
     depth_mm: NDArray[np.float32]
     reason: NDArray[np.uint8]
@@ -54,10 +55,9 @@ def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ..
             f"expected the {len(rig.sequence)} frames of the rig's sequence, got {len(frames)}; "
             "put None in the place of a frame that was not captured"
         )
-    flat = {}
+    flat, described = {}, rig.sequence.frames
     for index in used:
-        frame = frames[index]
-        title = f"frame {rig.sequence.frames[index].title}"
+        frame, title = frames[index], f"frame {described[index].title}"
         if frame is None:
             raise DecodeError(f"{title}: is needed and missing")
         image = np.asarray(frame)
@@ -101,23 +101,23 @@ def decode_stack(
 ) -> Decoded:
     """Depth in mm from a captured sequence.
 
-    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views (nothing is stacked or kept) or
-    an array (F, H, W); a frame that is not needed may be None. Black and white are never needed: the threshold of the Gray
-    code is the sinusoids' own mean.
+    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views (nothing is stacked or
+    kept) or an array (F, H, W); a frame that is not needed may be None. Black and white are never needed: the
+    threshold of the Gray code is the sinusoids' own mean.
 
     ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
-    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels whose two answers disagree by more
-    than ``limits.max_disagreement_px`` across the epipolar line.
+    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels whose two answers disagree by
+    more than ``limits.max_disagreement_px`` across the epipolar line.
 
     ``steps``: how many of the N sinusoids a direction to use, 3 to N (default: all), spread as evenly as they go; where
     they are not quite even (N not a multiple), the phase is the least-squares one.
 
-    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and cost nothing. ``threads``: the result is
-    the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return coordinates,
+    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and cost nothing. ``threads``: the result
+    is the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return coordinates,
     modulation and wrapped phase.
 
-    Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane leaves the
-    depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit.
+    Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane
+    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit.
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
@@ -171,8 +171,8 @@ class _Image:
         self.details: dict[Direction, Coordinates] = {}
         if details:
             for plan in plans:
-                maps = (np.full(size, np.nan) for _ in range(3))
-                self.details[plan.direction] = Coordinates(*maps, reason=np.zeros(size, dtype=np.uint8))
+                u, b, phi = (np.full(size, np.nan) for _ in range(3))
+                self.details[plan.direction] = Coordinates(u, b, phi, reason=np.zeros(size, dtype=np.uint8))
 
     def decode_from(self, start: int) -> None:
         stop = min(start + BLOCK_PX, self.pixels)

@@ -1,11 +1,11 @@
 """Gray code in half periods, and the fringe order from it.
 
 A cell is half a fringe period, so code and wrapped phase overlap: the phase alone fixes the position up to whole
-periods, and the cell only has to say which one. The order is the whole number k that brings ``phi + 2 pi k`` nearest to
-the cell's centre. A bit misread at a cell edge names the neighbouring cell, whose centre is half a period off; but at an
-edge the true phase is a quarter of a period from BOTH centres, so k stays right, with a quarter of a period to spare on
-either side. The classical code of one cell a period has its edges where the phase wraps, and slips there by a whole
-period; a median filter hides such slips and moves depth edges with them.
+periods, and the cell only has to say which one. The order is the whole number k that brings ``phi + 2 pi k`` nearest
+to the cell's centre. A bit misread at a cell edge names the neighbouring cell, whose centre is half a period off; but
+at an edge the true phase is a quarter of a period from BOTH centres, so k stays right, with a quarter of a period to
+spare on either side. The classical code of one cell a period has its edges where the phase wraps, and slips there by a
+whole period; a median filter hides such slips and moves depth edges with them.
 """
 
 import math
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 AMBIGUOUS_FRACTION = 0.25
-"""A bit nearer to the threshold than this part of the modulation is ambiguous. A code bit swings by the full modulation,
-so three quarters of it must be lost to noise or blur before a clear bit can turn over."""
+"""A bit nearer to the threshold than this part of the modulation is ambiguous. A code bit swings by the full
+modulation, so noise must add up to one and a quarter of it before a clear bit can turn over unnoticed."""
 INCONSISTENT_RAD = 0.75 * math.pi
 """Largest accepted distance from absolute phase to cell centre: pi/2 is the cell itself, pi/4 more a misread edge."""
 
@@ -52,8 +52,8 @@ def bits_needed(length_px: int, pitch_px: float) -> int:
 def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
     """Absolute phase at the centre of each cell, float64 (cells,).
 
-    The centre of the pixels a cell really holds: for 9 px a cell, pixels 9j to 9j + 8 and thus 9j + 4, half a pixel before
-    (j + 1/2) P/2. Left out, that half pixel would eat into the quarter period of tolerance.
+    The centre of the pixels a cell really holds: for 9 px a cell, pixels 9j to 9j + 8 and thus 9j + 4, half a pixel
+    before (j + 1/2) P/2. Left out, that half pixel would eat into the quarter period of tolerance.
     """
     edges = np.ceil(np.arange(cell_count(length_px, pitch_px) + 1) * (pitch_px / 2))
     return (edges[:-1] + edges[1:] - 1) / 2 * (2 * np.pi / pitch_px)
@@ -67,8 +67,9 @@ def decode_cells(
     ``bits`` (n, H, W) grey levels, most significant bit first; ``threshold`` and ``modulation`` (H, W) grey levels: the
     mean A and amplitude B of the same direction's sinusoids. Returns int32 (H, W) cells and bool (H, W).
 
-    A bit within ``ambiguous_fraction`` B of the threshold is ambiguous. Between neighbouring cells exactly one bit turns
-    over, so a cell is trusted when no bit is ambiguous, or when just one is and turning it over names a neighbour.
+    A bit within ``ambiguous_fraction`` B of the threshold is ambiguous. Between neighbouring cells exactly one bit
+    turns over, so a cell is trusted when no bit is ambiguous, or when just one is and turning it over names a
+    neighbour.
     """
     mean, amplitude = np.asarray(threshold, dtype=np.float64), np.asarray(modulation, dtype=np.float64)
     margin = ambiguous_fraction * amplitude
@@ -91,8 +92,8 @@ def absolute_phase(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Absolute phase ``phi + 2 pi k`` with k nearest to the cell's centre, and whether the two agree.
 
-    ``phase`` rad (H, W), ``cells`` int (H, W), ``centres_rad`` from `cell_centres_rad`. Returns float64 rad (H, W) and bool
-    (H, W): the cell exists on the pattern and its centre is within `INCONSISTENT_RAD`.
+    ``phase`` rad (H, W), ``cells`` int (H, W), ``centres_rad`` from `cell_centres_rad`. Returns float64 rad (H, W) and
+    bool (H, W): the cell exists on the pattern and its centre is within `INCONSISTENT_RAD`.
     """
     centre = centres_rad[np.minimum(cells, len(centres_rad) - 1)]
     absolute = phase + 2 * np.pi * np.floor((centre - phase) / (2 * np.pi) + 0.5)

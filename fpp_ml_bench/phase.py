@@ -1,9 +1,9 @@
 """Wrapped phase, modulation and mean from N phase-shifted frames (paper Eqs. 1 and 2).
 
-The model is ``I_n = A + B cos(phi + delta_n)`` with ``delta_n = 2 pi n / N``. Written as ``A + C cos delta + S sin delta``
-with ``C = B cos phi`` and ``S = -B sin phi`` it is linear, and least squares over any three or more different shifts is
-one weighted sum of the frames for each of A, C and S. For equal steps the weights are 1/N, (2/N) cos delta_n and
-(2/N) sin delta_n, and ``phi = -atan2(S, C)`` is the paper's Eq. 2.
+The model is ``I_n = A + B cos(phi + delta_n)`` with ``delta_n = 2 pi n / N``. Written as ``A + C cos delta_n + S sin
+delta_n`` with ``C = B cos phi`` and ``S = -B sin phi`` it is linear, and least squares over any three or more
+different shifts is one weighted sum of the frames for each of A, C and S. For equal steps the weights are 1/N, (2/N)
+cos delta_n and (2/N) sin delta_n, and ``phi = -atan2(S, C)`` is the paper's Eq. 2.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ class Phase(NamedTuple):
 
 
 def choose_steps(steps: int, wanted: int) -> tuple[int, ...]:
-    """``wanted`` of ``steps`` frames, spread as evenly over the circle as whole steps allow: floor(i steps / wanted + 1/2).
+    """``wanted`` of ``steps`` frames, spread over the circle as evenly as they go: floor(i steps / wanted + 1/2).
 
     Exactly equal where ``wanted`` divides ``steps``. Raises `DecodeError` for fewer than 3 or more than ``steps``.
     """
@@ -72,9 +72,9 @@ def wrapped_phase(
 ) -> Phase:
     """Wrapped phase, modulation and mean of N >= 3 frames (N, H, W), or N images (H, W), in grey levels.
 
-    ``shifts_rad`` (N,) defaults to equal steps, 2 pi n / N. Sums are float64 whatever ``dtype`` (float32 or float64) the
-    results have. A phase of exactly +pi comes out as -pi. Where nothing is modulated the phase is 0 and means nothing:
-    look at the modulation. Raises `DecodeError` for too few frames, unequal shapes, or dtypes that hold no grey levels.
+    ``shifts_rad`` (N,) defaults to equal steps, 2 pi n / N. Sums are float64 whatever ``dtype`` (float32 or float64)
+    the results have. A phase of exactly +pi comes out as -pi. Where nothing is modulated the phase means nothing: look
+    at the modulation. Raises `DecodeError` for too few frames, unequal shapes, or dtypes that hold no grey levels.
     """
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise DecodeError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
@@ -86,15 +86,10 @@ def wrapped_phase(
         raise DecodeError(f"shifts_rad: expected one for each of the {len(images)} frames, got {weights.shape[1]}")
     mean, cosine, sine = weighted_sums(images, weights)
     phase = minus_atan2(sine, cosine).astype(dtype)
-    phase[phase >= dtype_pi(dtype)] = -np.pi
+    phase[phase >= np.asarray(np.pi, dtype=dtype)] = -np.pi  # float32 rounds the last values below pi up to it
     return Phase(
         phase, np.sqrt(cosine * cosine + sine * sine).astype(dtype, copy=False), mean.astype(dtype, copy=False)
     )
-
-
-def dtype_pi(dtype: DTypeLike) -> np.floating:
-    """The first value of ``dtype`` that is no longer below pi (float64's own pi is already rounded down)."""
-    return np.dtype(dtype).type(np.pi)
 
 
 def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> list[NDArray[np.float64]]:

@@ -1,7 +1,7 @@
 """Depth from projector coordinates: closed form from one of them, least squares from both, for any rig.
 
-A camera pixel's ray is ``Z (x, y, 1)``; with ``a = R (x, y, 1)`` it runs through ``Z a + t`` in the projector's frame and is
-seen there at ``(Z a_0 + t_0) / (Z a_2 + t_2)``. One ideal projector coordinate x_p therefore gives
+A camera pixel's ray is ``Z (x, y, 1)``; with ``a = R (x, y, 1)`` it runs through ``Z a + t`` in the projector's frame
+and is seen there at ``(Z a_0 + t_0) / (Z a_2 + t_2)``. One ideal projector coordinate x_p therefore gives
 
     Z = (x_p t_2 - t_0) / (a_0 - x_p a_2)            (and likewise y_p with a_1, t_1),
 
@@ -106,15 +106,17 @@ def depth_from_both(
     """Depth in mm from both projector coordinates by weighted least squares in projector px, float64; NaN where none.
 
     ``weight_u`` and ``weight_v`` are 1 / sigma^2 of the coordinates, up to a common factor; with sigma proportional to
-    pitch over modulation that is (B / P)^2. Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear
-    functions: algebraic start, then `GAUSS_NEWTON_STEPS` where the projector is not beside the camera. What is left over
-    lies across the epipolar line: ``disagreement_px`` is the measured point's distance from it, whatever the weights.
+    pitch over modulation that is (B / P)^2. Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of
+    linear functions: algebraic start, then `GAUSS_NEWTON_STEPS` where the projector is not beside the camera. What is
+    left over lies across the epipolar line: ``disagreement_px`` is the measured point's distance from it, whatever the
+    weights. With a distorted projector the residual is counted in its undistorted px.
     """
     device = rig.projector
     u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)
     tx, ty, tz = rig.t
     with np.errstate(all="ignore"):
         px, py = device.normalised(u, v)
+        weight_u, weight_v = np.asarray(weight_u, dtype=np.float64), np.asarray(weight_v, dtype=np.float64)
         forward = rotated_ray(rays, rig, 2)
         # f (c - d w) / (forward + t_2 w) is the residual in px; c and d are fixed by the measurement.
         cu, du = device.fx * (rotated_ray(rays, rig, 0) - px * forward), device.fx * (px * tz - tx)
@@ -145,9 +147,9 @@ def depth_noise_mm(
     """Standard deviation of the depth in mm that intensity noise causes, float64.
 
     ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical
-    axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / |du/dZ|; for the paper's
-    rig the last is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add. Projector
-    distortion is left out: it changes the slope by its own few percent.
+    axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / |du/dZ|; for the
+    paper's rig the last is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add.
+    Projector distortion is left out: it changes the slope by its own few percent.
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
