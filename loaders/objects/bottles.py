@@ -39,7 +39,9 @@ def mustard_bottle() -> Solid:
          (132, 84, 53, 2.4), (146, 62, 46, 2.2), (153, 46, 42, 2.0), (155, 42, 41, 2.0)], smooth=8,
     )  # fmt: skip
     closure = lathe(
-        np.concatenate([[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]),
+        np.concatenate(
+            [[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]
+        ),
     )
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
@@ -71,7 +73,9 @@ def container_bottle() -> Solid:
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
     panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
-    marks = text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70)) + rectangle(60, 7, 3, (-19, 48))
+    marks = (
+        text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70)) + rectangle(60, 7, 3, (-19, 48))
+    )
     for step in range(7):
         marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
     drained = cut(union(body, panel, embossed(body, marks, 2.4)), hole, *thinner)
@@ -82,24 +86,42 @@ def spray_bottle() -> Solid:
     """Trigger sprayer, 92 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
     body = lathe(
         np.concatenate([
-            [(33, 0), (39, 1)],
-            curve([(41, 5), (41, 60), (40, 100), (35, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
+            [(31, 0), (37, 1)],
+            curve([(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
             [(14.5, 205)],
         ])
     )  # fmt: skip
     collar = ribbed_cap(19, 20, 30).translate((0, 0, 196))
     head = polygon(
-        [(-18, 214), (18, 214), (20, 226), (34, 236), (36, 262), (20, 275), (-34, 275), (-62, 266), (-64, 248), (-20, 244)], 3
+        [
+            (-18, 214),
+            (18, 214),
+            (20, 226),
+            (34, 236),
+            (36, 262),
+            (20, 275),
+            (-34, 275),
+            (-62, 266),
+            (-64, 248),
+            (-20, 244),
+        ],
+        3,
     )
     trigger = plate(
         polygon(np.concatenate([
             curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
             curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
         ])), 13, 0)  # fmt: skip
-    nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), rod((-76, 257, 0), (-80, 257, 0), 5)))
-    grip = [ring(41.2, 0.9, z) for z in (16, 22, 28)]
-    words = wrapped(text_section("SPRAY", 58), 40.7, 74, 1.3)
-    return place(union(body, collar, facing(plate(head, 26)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
+    nozzle = facing(
+        union(
+            rod((-60, 257, 0), (-72, 257, 0), 11),
+            block(8, 24, 24, 1, (-74, 257, 0)),
+            rod((-76, 257, 0), (-80, 257, 0), 5),
+        )
+    )
+    grip = [ring(39.2, 0.9, z) for z in (16, 22, 28)]
+    words = wrapped(text_section("SPRAY", 56), 38.8, 74, 1.3)
+    return place(union(body, collar, facing(plate(head, 19)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
 
 
 def vial() -> Solid:

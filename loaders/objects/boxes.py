@@ -51,7 +51,12 @@ def sugar_box() -> Solid:
 
 def pudding_box() -> Solid:
     """Pudding carton, 112 x 90 x 36 mm, with a filled glass in relief."""
-    glass = plate(polygon([(-16, 20), (16, 20), (11, -4), (3, -8), (3, -16), (11, -20), (-11, -20), (-3, -16), (-3, -8), (-11, -4)]), 4)
+    glass = plate(
+        polygon(
+            [(-16, 20), (16, 20), (11, -4), (3, -8), (3, -16), (11, -20), (-11, -20), (-3, -16), (-3, -8), (-11, -4)]
+        ),
+        4,
+    )
     cream = plate(disc(7, (-7, 20)) + disc(8, (4, 22)) + disc(4, (0, 30)), 5)
     art = [solid.translate((30, -10, 0)) for solid in (glass, cream)]
     body = _carton(112, 90, 36, [("PUDDING", 92, 29), ("MILK", 38, -2)], *art)
@@ -75,7 +80,9 @@ def wood_block() -> Solid:
         place(block(10, 1.8, length, 0), (x, y, z), (0, tilt, 0))
         for x, y, z, length, tilt in ((-42, 15, 50, 120, 2), (-42, -21, -48, 105, -2), (42, 6, -20, 150, 2))
     ]
-    sides = [place(block(1.6, 10, length, 0), (x, y, z)) for x, y, z, length in ((10, 42, 40, 130), (-14, -42, -25, 140))]
+    sides = [
+        place(block(1.6, 10, length, 0), (x, y, z)) for x, y, z, length in ((10, 42, 40, 130), (-14, -42, -25, 140))
+    ]
     grain = [plate(disc(r) - disc(r - 1.6), 3) for r in (9, 17, 25, 33, 40)]
     ends = [solid.translate((6, -4, s * 100)) for solid in grain for s in (-1, 1)]
     knot = rod((-39, -12, 30), (-46, -12, 30), 9)
@@ -91,16 +98,16 @@ def open_book() -> Solid:
     loose = curve([(4, 4), (15, 19), (39, 27), (80, 27), (118, 31), (142, 38)])
     sheet = stroke([(float(x), float(y)) for x, y in loose], 1.0)
     cover = rectangle(155, 3.4, 1.2, (76, -1.6))
-    right = union(pages.extrude(205), sheet.extrude(205), cover.extrude(215).translate((0, 0, -5))).rotate((0, 0, spread))
+    right = union(pages.extrude(205), sheet.extrude(205), cover.extrude(215).translate((0, 0, -5))).rotate(
+        (0, 0, spread)
+    )
     inked = pages.offset(0.9)
     text = [
         (inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))).extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread))
         for z, width in ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
     ]
     spine = rod((0, -1.5, -5), (0, -1.5, 210), 4)
-    left = union(
-        pages.extrude(205), cover.extrude(215).translate((0, 0, -5))
-    ).rotate((0, 0, spread)).mirror((1, 0, 0))
+    left = union(pages.extrude(205), cover.extrude(215).translate((0, 0, -5))).rotate((0, 0, spread)).mirror((1, 0, 0))
     printed = [line.mirror((1, 0, 0)) for line in text]
     ribbon = stroke([(0, 14), (9, 22), (13, 26)], 1.6).extrude(150).translate((0, 0, -22))
     book = union(right, left, spine, ribbon, *printed)

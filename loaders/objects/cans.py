@@ -6,7 +6,6 @@ from fpp_ml_bench.loaders.objects.lettering import text_section, wrapped
 from fpp_ml_bench.loaders.objects.solids import (
     Point2,
     Solid,
-    block,
     cut,
     disc,
     embossed,
@@ -19,7 +18,7 @@ from fpp_ml_bench.loaders.objects.solids import (
     softened,
     union,
 )
-from fpp_ml_bench.loaders.objects.sweeps import curve, loft, tube
+from fpp_ml_bench.loaders.objects.sweeps import curve, loft
 
 
 def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid:
@@ -96,18 +95,16 @@ def potted_meat_can() -> Solid:
     label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
     words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
     tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
-    return place(union(cut(body, lid), label, embossed(body, words, 1.8), tab), turn=(0, -10, 3))
+    return place(union(cut(body, lid), label, embossed(body, words, 1.8), tab), turn=(0, 0, 2))
 
 
 def container_tin() -> Solid:
-    """Lever-lid tin with a wire handle, 110 x 130 mm."""
-    body = _rimmed(54, 128, ribs=(30, 34, 98, 102))
-    collar = cut(lathe([(54, 124), (54, 131), (44, 131)]), rod((0, 0, 126), (0, 0, 133), 44))
-    lid = cut(lathe([(44.5, 120), (44.5, 130), (45.5, 130), (45.5, 132.5), (40, 132.5)]), rod((0, 0, 129), (0, 0, 134), 37))
-    plug = rod((0, 0, 118), (0, 0, 129.1), 44.2)
-    ears = [rod((0, s * 52, 112), (0, s * 64, 112), 8, 5) for s in (-1, 1)]
-    bail = [(0.0, -58.0, 112.0), (-12.0, -60.0, 95.0), (-34.0, -44.0, 62.0), (-42.0, -18.0, 46.0), (-44.0, 0.0, 43.0)]
-    mirrored = [(x, -y, z) for x, y, z in bail[-2::-1]]
-    handle = tube(curve([(x * 1.45, y * 1.05, z) for x, y, z in bail + mirrored]), 1.8, up=(1, 0, 0.3))
-    rivet = block(6, 10, 16, 2, (54, 0, 64))
-    return place(union(body, collar, plug, lid, *ears, handle, rivet), turn=(0, -12, 0))
+    """Kitchen canister, 110 x 158 mm: rolled seams, an overlapping domed lid with a knob, a label plate."""
+    body = lathe([(53, 0), (54.4, 0.8), (54.4, 2.6), (53, 3.6), (53, 112)])
+    dome = curve([(54.6, 122), (52, 127), (40, 132), (22, 135), (7, 136)])
+    lid = lathe(np.concatenate([[(54.0, 104.0), (55.4, 104.6), (55.4, 106.4), (54.6, 107.4)], dome, [(5.0, 140.0)]]))
+    knob = lathe(curve([(5, 138), (7, 143), (11, 147), (12.5, 152), (9, 157), (1, 158.6)]))
+    beads = [ring(53, 1.2, z) for z in (14, 96)]
+    plaque = wrapped(rectangle(74, 44, 8), 53, 56, 1.0)
+    name = wrapped(text_section("TEA", 52), 54, 56, 1.3)
+    return union(body, lid, knob, plaque, name, *beads)

@@ -46,8 +46,14 @@ def hammer() -> Solid:
         tangent = spine[min(k + 1, len(spine) - 1)] - spine[max(k - 1, 0)]
         normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
         section = superellipse(2 * thick[k], 2 * claw_wide[k], 4, 48)
-        rings.append(np.stack([point[0] + normal[0] * section[:, 0], point[1] + normal[1] * section[:, 0], section[:, 1]], axis=1))
-    fork = place(plate(polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)]), 90), (-40, 285, 0), (90, 0, 180)).translate((0, 0, 0))
+        rings.append(
+            np.stack(
+                [point[0] + normal[0] * section[:, 0], point[1] + normal[1] * section[:, 0], section[:, 1]], axis=1
+            )
+        )
+    fork = place(plate(polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)]), 90), (-40, 285, 0), (90, 0, 180)).translate(
+        (0, 0, 0)
+    )
     claw = cut(skin(np.array(rings)), fork)
     grooves = [place(ring(19, 2.0).scale((0.95, 0.8, 1)), (0, y, 0), (-90, 0, 0)) for y in (34, 48, 62, 76, 90)]
     return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(3, 0, 3))
@@ -66,7 +72,10 @@ def scissors() -> Solid:
             tube(loop, 5.2, flatten=1.25, closed=True, sides=24),
         ).rotate((0, 0, 9))  # fmt: skip
         halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
-    pivot = union(rod((0, 0, -6.5), (0, 0, 6.5), 6), cut(rod((0, 0, 5), (0, 0, 7.6), 5), block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))))
+    pivot = union(
+        rod((0, 0, -6.5), (0, 0, 6.5), 6),
+        cut(rod((0, 0, 5), (0, 0, 7.6), 5), block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))),
+    )
     return place(facing(union(*halves, pivot)), turn=(3, 0, 2))
 
 
@@ -79,9 +88,9 @@ def large_clamp() -> Solid:
     half = cut(union(plate(softened(arm + lever, 2), 20), plate(softened(sleeve, 1), 28)), slot)
     pad = union(place(block(10, 38, 30, 3), (-6.5, 90, 0), (0, 0, 3)), rod((-12, 90, -17), (-12, 90, 17), 6))
     ears = [plate(disc(19), 6).translate((0, 0, z)) for z in (-12, 12)]
-    pin = rod((0, 0, -24), (0, 0, 24), 7)
-    coil = [ring(12.5, 2.8, z) for z in (-19, -16, 16, 19)]
-    legs = [tube(curve([(s * 11, -4, 17), (s * 22, -26, 17), (s * 31, -46, 13)]), 2.8, up=(0, 0, 1)) for s in (-1, 1)]
+    pin = rod((0, 0, -20), (0, 0, 20), 7)
+    coil = [ring(12.5, 2.8, z) for z in (-16.4, -13.4, 13.4, 16.4)]
+    legs = [tube(curve([(s * 11, -4, 14), (s * 22, -26, 14), (s * 31, -46, 12)]), 2.8, up=(0, 0, 1)) for s in (-1, 1)]
     both = union(half, pad, half.mirror((1, 0, 0)), pad.mirror((1, 0, 0)), pin, *ears, *coil, *legs)
     return place(facing(both), turn=(0, 0, 2))
 
@@ -98,16 +107,23 @@ def clamp() -> Solid:
     boss = rod((40, -66, 0), (40, -34, 0), 14)
     bar = union(rod((2, -112, 8), (78, -112, -8), 4.2), ball(6.4, (2, -112, 8)), ball(6.4, (78, -112, -8)))
     head = ball(10.5, (40, -112, 0))
-    return place(facing(union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)), turn=(0, 3, 3))
+    return place(
+        facing(union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)), turn=(0, 3, 3)
+    )
 
 
 def boxcutter() -> Solid:
     """Snap-off knife, 190 mm with its blade out: score lines, slider in its slot, ribbed grip, end clip."""
-    handle = softened(polygon([(-15, -86), (15, -86), (16, -60), (13, -10), (14, 40), (10, 62), (-10, 62), (-14, 40)]), 3)
+    handle = softened(
+        polygon([(-15, -86), (15, -86), (16, -60), (13, -10), (14, 40), (10, 62), (-10, 62), (-14, 40)]), 3
+    )
     slot = rectangle(8, 104, 3.5, (2, -4))
     body = union(plate(handle, 13, 2.5), plate(rectangle(22, 26, 3, (0, -74)), 15, 2))
     body = cut(body, plate(slot, 8).translate((0, 0, 8)))
-    slider = union(plate(rectangle(13, 26, 3, (2, 22)), 6, 1).translate((0, 0, 7)), *(block(13, 1.6, 2.4, 0, (2, y, 10)) for y in (15, 19, 23, 27, 31)))
+    slider = union(
+        plate(rectangle(13, 26, 3, (2, 22)), 6, 1).translate((0, 0, 7)),
+        *(block(13, 1.6, 2.4, 0, (2, y, 10)) for y in (15, 19, 23, 27, 31)),
+    )
     blade = plate(polygon([(-9, 40), (9, 40), (9, 104), (-9, 122)]), 2.0)
     scores = [place(block(26, 1.2, 3, 0), (0, y, 1.6), (0, 0, -35)) for y in (66, 77, 88, 99)]
     backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
@@ -128,8 +144,12 @@ def paint_brush() -> Solid:
     handle = _handle([(11.5, 0), (14.0, 22), (13.0, 44), (8.0, 90), (6.4, 130), (5.2, 155), (4.0, 162)])
     ferrule = loft([(-6, 24, 22, 2), (2, 25, 23, 2), (20, 32, 17, 2.4), (38, 36, 14, 2.8)], smooth=4, sides=64)
     crimps = [place(ring(12.6, 1.2), (0, y, 0), (90, 0, 0)) for y in (0.5, 5.5)]
-    bristles = loft([(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)], smooth=5, sides=96)
-    furrows = [place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x in range(-15, 16, 5) for s in (-1, 1)]
+    bristles = loft(
+        [(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)], smooth=5, sides=96
+    )
+    furrows = [
+        place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x in range(-15, 16, 5) for s in (-1, 1)
+    ]
     tuft = cut(laid(union(ferrule, bristles)), *furrows)
     return place(facing(union(handle, tuft, *crimps)), turn=(3, 0, 3))
 
@@ -147,7 +167,9 @@ def paint_brush_large() -> Solid:
     handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
     tuft = loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5)
     tuft = laid(tuft)
-    furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x in range(-45, 46, 6) for s in (-1, 1)]
+    furrows = [
+        place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x in range(-45, 46, 6) for s in (-1, 1)
+    ]
     return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(4, -2, 4))
 
 

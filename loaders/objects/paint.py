@@ -28,21 +28,29 @@ _BRUSH_MARK = [(-20, -6), (-10, 4), (-2, -4), (8, 5), (20, -2)]
 
 def paint_container_bottle() -> Solid:
     """Craft-paint bottle, 44 x 118 mm, with a flip-top cap and a daub of paint on its label."""
-    body = lathe(np.concatenate([[(19.0, 0.0), (21.5, 2.0), (22.0, 6.0), (22.0, 72.0)], curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])]))
-    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), lathe([(12.4, 103), (12.6, 112), (11, 115)]), rod((0, 0, 114), (0, 0, 119), 4, 3))
-    lip = block(8, 9, 3, 1, (-12, 0, 112))
+    body = lathe(
+        np.concatenate(
+            [[(19.0, 0.0), (21.5, 2.0), (22.0, 6.0), (22.0, 72.0)], curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])]
+        )
+    )
+    cap = union(
+        ribbed_cap(13, 13, 28).translate((0, 0, 91)),
+        lathe([(12.4, 103), (12.6, 112), (11, 115)]),
+        rod((0, 0, 114), (0, 0, 119), 4, 3),
+    )
+    notch = block(5, 11, 4, 1, (-13.6, 0, 104))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
-    words = union(wrapped(text_section("PAINT", 34), 22.4, 54, 0.7), wrapped(stroke(_BRUSH_MARK, 9), 22.4, 28, 0.9))
-    return place(union(body, cap, lip, label, words), turn=(0, 0, 0))
+    words = union(wrapped(text_section("PAINT", 34), 22.4, 54, 0.7), wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9))
+    return union(body, cut(cap, notch), label, words)
 
 
 def paint_container_jar() -> Solid:
     """Wide paint jar, 76 x 84 mm, its ribbed lid askew and paint running down from under it."""
     body = lathe([(32, 0), (37, 3), (38, 8), (38, 52), (36, 58), (33, 62), (33, 68)], 1.2)
-    lid = place(union(ribbed_cap(37.5, 17, 60), ring(34, 1.6, 17), ring(22, 1.0, 17)), (0, 0, 65), (0, 5, 0))
+    lid = place(union(ribbed_cap(37.5, 17, 60), ring(34, 1.6, 17), ring(22, 1.0, 17)), (0, 0, 65), (0, 2, 0))
     runs = []
     for y, top, length in ((-14, 62, 30), (-6, 62, 44), (3, 62, 22), (11, 62, 12), (20, 62, 34)):
-        x = -float(np.sqrt(37.6**2 - y**2))
+        x = -float(np.sqrt(36.4**2 - y**2))
         runs.append(rod((x, y, top), (x, y, top - length), 2.4, 3.6, rounded=True))
     hem = tube([(-36.0 * np.cos(a), 36.0 * np.sin(a), 62.5) for a in np.linspace(-0.7, 0.8, 30)], 3.4)
     words = wrapped(text_section("PAINT", 44), 38, 14, 1.1)
@@ -82,16 +90,28 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
     ]  # fmt: skip
     body = loft(levels, smooth=8)
     fold = block(0.08 * width + 2.6, width + 1.5, crimp, 0.8, (0, 0, end - crimp / 2))
-    pleats = [block(0.08 * width + 3.8, width + 1.6, 1.1, 0, (0, 0, end - crimp + 1.5 + 2.4 * k)) for k in range(int(crimp / 2.6))]
-    neck = lathe([(0.40 * width, shoulder), (0.40 * width, shoulder + 0.5), (0.36 * width, shoulder - 2), (cap_radius * 0.6, cap_height - 4)][::-1])
+    pleats = [
+        block(0.08 * width + 3.8, width + 1.6, 1.1, 0, (0, 0, end - crimp + 1.5 + 2.4 * k))
+        for k in range(int(crimp / 2.6))
+    ]
+    neck = lathe(
+        [
+            (0.40 * width, shoulder),
+            (0.40 * width, shoulder + 0.5),
+            (0.36 * width, shoulder - 2),
+            (cap_radius * 0.6, cap_height - 4),
+        ][::-1]
+    )
     rim = ring(0.4 * width - 0.6, 1.3, shoulder)
     return union(body, fold, neck, rim, *pleats, ribbed_cap(cap_radius, cap_height, 24))
 
 
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 15 x 62 mm, leaning."""
-    body = _tube(40, 22, 6.5, 9, 6)
-    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 40)), 0.5)), turn=(1, 0, 0)).rotate((0, 0, 30))
+    body = _tube(46, 22, 7.0, 10, 6)
+    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 44)), 0.5)), turn=(1, 0, 0)).rotate(
+        (0, 0, 30)
+    )
 
 
 def paint_container_tube() -> Solid:
@@ -118,7 +138,12 @@ def paint_thinner() -> Solid:
     )  # fmt: skip
     top = loft([(196, 157, 92, 9), (203, 157, 92, 9)])
     spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 208)))
-    strap = tube(curve([(0, 16, 196), (0, 12, 224), (0, -14, 238), (0, -48, 234), (0, -64, 214), (0, -66, 196)]), 9, flatten=0.28, up=(0, 0.3, 1))
+    strap = tube(
+        curve([(0, 16, 196), (0, 12, 224), (0, -14, 238), (0, -48, 234), (0, -64, 214), (0, -66, 196)]),
+        9,
+        flatten=0.28,
+        up=(0, 0.3, 1),
+    )
     words = union(
         text_plate("PAINT", 112, 1.6).translate((0, 46, 0)), text_plate("THINNER", 140, 1.6).translate((0, 14, 0)),
         plate(stroke([(-58, -34), (-20, -34), (-20, -58), (-58, -58), (-58, -34)], 4), 3),

@@ -70,9 +70,10 @@ def softened(section: Section, radius: float) -> Section:
     """The section with convex and concave corners rounded to ``radius`` mm (opened, then closed)."""
     if radius <= 0:
         return section
-    opened = section.offset(-radius, JoinType.Round, 2.0, SMALL_SEGMENTS)
-    closed = opened.offset(2 * radius, JoinType.Round, 2.0, SMALL_SEGMENTS)
-    return closed.offset(-radius, JoinType.Round, 2.0, SMALL_SEGMENTS).simplify(0.01)
+    arcs = segments_for(radius)
+    opened = section.offset(-radius, JoinType.Round, 2.0, arcs)
+    closed = opened.offset(2 * radius, JoinType.Round, 2.0, arcs)
+    return closed.offset(-radius, JoinType.Round, 2.0, arcs).simplify(0.01)
 
 
 def stroke(points: Sequence[Point2], width: float) -> Section:

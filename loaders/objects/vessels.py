@@ -45,10 +45,15 @@ def pitcher() -> Solid:
     body = vessel(profile, wall, 1.0)
     lip, throat = _spout(0.0), _spout(wall)
     bore = lathe([(44, 6), (48.4, 60), (53.4, 130), (56.4, 190), (58.5, 250)])
-    ear = curve([(0, -56, 214), (0, -78, 222), (0, -104, 206), (0, -110, 160), (0, -98, 104), (0, -74, 66), (0, -50, 56)])
+    ear = curve(
+        [(0, -56, 214), (0, -78, 222), (0, -104, 206), (0, -110, 160), (0, -98, 104), (0, -74, 66), (0, -50, 56)]
+    )
     handle = tube(ear, 8.0, flatten=1.4, up=(1, 0, 0))
     ridges = [ring(r, 1.3, z) for r, z in ((48.6, 10), (49.2, 17), (49.8, 24), (61.4, 222))]
-    marks = [wrapped(rectangle(14 if k % 2 else 26, 2.4), 48.6 + 0.062 * z, z, 1.4, 24) for k, z in enumerate(range(50, 200, 20))]
+    marks = [
+        wrapped(rectangle(14 if k % 2 else 26, 2.4), 48.6 + 0.062 * z, z, 1.4, 24)
+        for k, z in enumerate(range(50, 200, 20))
+    ]
     shell = cut(union(body, lip, handle, *ridges, *marks), throat, bore)
     return place(shell, turn=(0, -10, 0))
 
@@ -56,7 +61,14 @@ def pitcher() -> Solid:
 def _spout(inset: float) -> Solid:
     """Beak of the pitcher towards +y; drawn ``inset`` mm smaller on every side it is its channel."""
     rim = 238.0 + (12 if inset else 0)
-    outline = [(0, 90 - 2 * inset, rim), (-30 + inset, 44, rim), (30 - inset, 44, rim), (0, 55 - inset, 176 + 2 * inset), (-18, 30, rim), (18, 30, rim)]
+    outline = [
+        (0, 90 - 2 * inset, rim),
+        (-30 + inset, 44, rim),
+        (30 - inset, 44, rim),
+        (0, 55 - inset, 176 + 2 * inset),
+        (-18, 30, rim),
+        (18, 30, rim),
+    ]
     return Solid.batch_hull([ball(2.5, point) for point in outline]).trim_by_plane((0, 0, -1), -rim)
 
 
@@ -94,7 +106,9 @@ def _candle(radius: float, height: float) -> Solid:
         x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
         runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
     wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
-    flame = lathe(curve([(0.6, height + 4), (4.5, height + 8), (6.6, height + 15), (4.6, height + 25), (0.6, height + 38)]))
+    flame = lathe(
+        curve([(0.6, height + 4), (4.5, height + 8), (6.6, height + 15), (4.6, height + 25), (0.6, height + 38)])
+    )
     return union(body, *runs, wick, flame)
 
 
@@ -102,9 +116,19 @@ def duct_tape() -> Solid:
     """Roll of tape, 128 x 50 mm, on a cardboard core, its end lifted; stood on edge with the hole to the viewer."""
     turns = lathe([(64, 0), (64, 50)], 0.6)
     core = cut(rod((0, 0, -0.6), (0, 0, 50.6), 41), rod((0, 0, -2), (0, 0, 53), 38))
-    windings = [cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r)) for r in range(45, 63, 4) for z in (-0.7, 49.1)]
+    windings = [
+        cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r))
+        for r in range(45, 63, 4)
+        for z in (-0.7, 49.1)
+    ]
     bent = np.linspace(-1.4, 0.15, 24)
-    lifted = np.stack([(64.0 + 30 * np.clip(bent - -0.5, 0, 1) ** 2) * np.cos(bent), (64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2) * np.sin(bent)], axis=1)
+    lifted = np.stack(
+        [
+            (64.0 + 30 * np.clip(bent - -0.5, 0, 1) ** 2) * np.cos(bent),
+            (64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2) * np.sin(bent),
+        ],
+        axis=1,
+    )
     end = stroke([(float(x), float(y)) for x, y in lifted], 1.4).extrude(50)
     roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
     return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 16)).rotate((0, -5, 0))
@@ -116,7 +140,20 @@ def banana() -> Solid:
     radius = 112.0
     path = np.stack([np.zeros_like(bend), radius * np.sin(bend), -radius * np.cos(bend)], axis=1)
     along = np.linspace(0, 1, len(bend))
-    knots = curve([(0, 4.2), (0.03, 6.0), (0.09, 11.5), (0.22, 16.4), (0.45, 18.4), (0.66, 16.6), (0.8, 11.5), (0.88, 6.2), (0.95, 4.4), (1.0, 5.4)])
+    knots = curve(
+        [
+            (0, 4.2),
+            (0.03, 6.0),
+            (0.09, 11.5),
+            (0.22, 16.4),
+            (0.45, 18.4),
+            (0.66, 16.6),
+            (0.8, 11.5),
+            (0.88, 6.2),
+            (0.95, 4.4),
+            (1.0, 5.4),
+        ]
+    )
     girth = np.interp(along, knots[:, 0], knots[:, 1])
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -125,6 +162,10 @@ def banana() -> Solid:
     angle = 2 * np.pi * np.arange(80) / 80
     edges = 1 + 0.055 * np.cos(5 * angle + 0.6)
     reach = girth[:, None] * edges[None, :]
-    rings = path[:, None, :] + (reach * np.cos(angle))[:, :, None] * across[:, None, :] + (reach * np.sin(angle))[:, :, None] * above[:, None, :]
+    rings = (
+        path[:, None, :]
+        + (reach * np.cos(angle))[:, :, None] * across[:, None, :]
+        + (reach * np.sin(angle))[:, :, None] * above[:, None, :]
+    )
     tip = rod(tuple(path[0]), tuple(path[0] + 0.6 * (path[0] - path[2])), 3.4, 2.8)
     return place(union(skin(rings), tip), turn=(32, 0, 0)).rotate((0, 4, 4))
