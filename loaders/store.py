@@ -34,16 +34,32 @@ class DatasetFolder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.manifest: Manifest = read_manifest(self.path)
-        self._batches: dict[str, list[pa.RecordBatch]] = {}
-        self._images: dict[tuple[str, str], list[NDArray]] = {}
+        self._hold(Path(path), read_manifest(Path(path)))
         for shard in self.manifest.shards:
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
             if size != shard.bytes:
                 came = "it is missing" if size is None else f"it has {size}"
                 raise DatasetError(f"{file}: expected {shard.bytes} bytes, {came}; build or copy the dataset again")
+
+    def _hold(self, path: Path, manifest: Manifest) -> None:
+        self.path = path
+        self.manifest = manifest
+        self._batches: dict[str, list[pa.RecordBatch]] = {}
+        self._images: dict[tuple[str, str], list[NDArray]] = {}
+
+    @classmethod
+    def unchecked(cls, path: Path, manifest: Manifest) -> "DatasetFolder":
+        """The folder opened although some of its files may be missing; for `fpp_ml_bench.loaders.verify`."""
+        opened = cls.__new__(cls)
+        opened._hold(path, manifest)
+        return opened
+
+    def forget(self, shard: ShardFile) -> None:
+        """Let go of the maps of one file."""
+        self._batches.pop(shard.path, None)
+        for key in [key for key in self._images if key[0] == shard.path]:
+            del self._images[key]
 
     def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
         return DatasetFolder, (self.path,)

@@ -1,0 +1,99 @@
+"""``fpp-bench info``: what a dataset holds."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.loaders.statistics import SplitStatistics
+
+SUMMARY = "What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."
+EXAMPLES = ("fpp-bench info data/mini", "fpp-bench info data/mini --json | jq .splits")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    parser.add_argument("--json", action="store_true", help="machine-readable, on standard output")
+
+
+def run(args: argparse.Namespace) -> int:
+    import json
+    from dataclasses import asdict
+
+    from fpp_ml_bench.loaders.statistics import split_statistics
+    from fpp_ml_bench.loaders.store import DatasetFolder
+
+    opened = DatasetFolder(args.dataset)
+    statistics = split_statistics(opened.manifest)
+    if args.json:
+        content = {
+            "path": str(opened.path),
+            "fingerprint": opened.fingerprint,
+            "origin": opened.manifest.origin,
+            "size": list(opened.size),
+            "configs": list(opened.configs),
+            "bytes": sum(file.bytes for file in (*opened.manifest.shards, *opened.manifest.others)),
+            "settings": opened.manifest.settings,
+            "rig": opened.manifest.rig,
+            "splits": [asdict(split) for split in statistics],
+        }
+        print(json.dumps(content, indent=1, allow_nan=False))
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+
+    from fpp_ml_bench.commands.console import gigabytes
+
+    manifest, rig = opened.manifest, opened.rig
+    groups: dict[str, int] = {}
+    for shard in manifest.shards:
+        groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
+    console = Console(width=max(110, Console().width))
+    console.print(f"[bold]{opened.path}[/bold]  {manifest.origin}, by {manifest.generator.get('name')} "
+                  f"{manifest.generator.get('version')}", highlight=False)  # fmt: skip
+    console.print(f"fingerprint     {opened.fingerprint}", highlight=False)
+    console.print(f"images          {opened.size[0]} x {opened.size[1]} px, {len(opened.sequence)} frames a sequence, stored: "
+                  f"{manifest.stored}", highlight=False)  # fmt: skip
+    console.print(f"configurations  {', '.join(opened.configs)}", highlight=False)
+    console.print(
+        "on disk         " + ", ".join(f"{name} {gigabytes(size)}" for name, size in groups.items()), highlight=False
+    )
+    near, far = rig.working_range_mm
+    console.print(
+        f"rig             baseline {1000 * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm = "
+        f"{rig.periods_in_range('horizontal'):.2f} horizontal / {rig.periods_in_range('vertical'):.2f} vertical fringe periods "
+        f"of {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px, "
+        f"{rig.image_px_per_period('vertical'):.1f} image px a period",
+        highlight=False,
+    )
+    settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
+    console.print("settings        " + ", ".join(f"{key} {value}" for key, value in settings.items()), highlight=False)
+    table = Table(title="lengths in mm, means over samples", title_justify="left")
+    table.add_column("")
+    for split in statistics:
+        table.add_column(split.split, justify="right")
+    for title, cells in _rows(statistics):
+        table.add_row(title, *cells)
+    console.print(table)
+    return 0
+
+
+def _rows(statistics: "list[SplitStatistics]") -> list[tuple[str, list[str]]]:
+    """Lines of the table: a title and one cell a split."""
+    from fpp_ml_bench.commands.console import millimetres
+
+    def share(value: float | None) -> str:
+        return "-" if value is None else f"{100 * value:.2f}%"
+
+    return [
+        ("objects, samples", [f"{s.objects}, {s.samples}" for s in statistics]),
+        ("cover, mean", [share(s.cover_mean) for s in statistics]),
+        ("cover, least - most", [f"{share(s.cover_min)} - {share(s.cover_max)}" for s in statistics]),
+        ("depth range, median", [f"{s.depth_range_median_mm:.0f}" for s in statistics]),
+        ("depth range, largest", [f"{s.depth_range_max_mm:.0f}" for s in statistics]),
+        ("ground-truth error (decoded - exact), MAE", [millimetres(s.gt_mae_mm) for s in statistics]),
+        ("  RMSE", [millimetres(s.gt_rmse_mm) for s in statistics]),
+        ("  MAE 3 px or more from a depth edge", [millimetres(s.gt_interior_mae_mm) for s in statistics]),
+        ("  largest", [millimetres(s.gt_max_mm) for s in statistics]),
+        ("object pixels without ground truth", [share(s.undecoded_share) for s in statistics]),
+    ]

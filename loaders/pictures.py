@@ -1,0 +1,146 @@
+"""Pictures of a dataset: one sample with everything known about it, and the contact sheet of all objects and views."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M, VIEWS, sample_name
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.schema import stored_frames
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.pixel_sets import object_mask
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from fpp_ml_bench.loaders.scene import SolidMesh
+
+_TILE_PX = 120
+_DPI = 110
+
+
+def sample_picture(opened: DatasetFolder, sample: str, path: Path) -> None:
+    """Write one sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh."""
+    from matplotlib.figure import Figure
+
+    sequence = opened.sequence
+    stored = set(stored_frames(sequence, opened.manifest.stored))
+    wished = [0, *sequence.sinusoids("vertical")[:1], sequence.gray("horizontal")[-3], sequence.gray("vertical")[-3],
+              sequence.white]  # fmt: skip
+    panels: list[tuple[str, Callable[[Axes], None]]] = []
+    for index in (i for i in wished if i in stored):
+        panels.append((sequence.frames[index].title, _grey(opened.frame(sample, index))))
+    depth_mm = opened.depth_mm(sample)
+    inside = object_mask(depth_mm)
+    low, high = float(depth_mm[inside].min()), float(depth_mm.max())
+    panels.append((f"depth, {low:.0f}-{high:.0f} mm", _colours(_hidden(depth_mm, inside), "viridis", low, high, "mm")))
+    if opened.has_exact:
+        exact_mm = opened.depth_mm(sample, "depth_exact")
+        error_mm = depth_mm - exact_mm
+        limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
+        panels.append(("exact depth", _colours(_hidden(exact_mm, object_mask(exact_mm)), "viridis", low, high, "mm")))
+        panels.append(
+            (f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm",
+             _colours(_hidden(error_mm, inside), "coolwarm", -limit, limit, "mm"))
+        )  # fmt: skip
+    cover = 100 * inside.mean()
+    panels.append((f"object mask, {cover:.1f}% of the image", _grey(inside.astype(np.uint8) * 255)))
+    mesh = opened.path / "meshes" / f"{opened.measured(sample)['object']}.ply"
+    if mesh.is_file():
+        panels.append(("ground-truth mesh", _grey(_mesh_picture(mesh, 480))))
+    columns = 5
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.4 * columns, 3.7 * rows), dpi=_DPI, layout="constrained")
+    figure.suptitle(f"{sample} ({opened.split_of_sample(sample)})")
+    for place, (title, draw) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, place + 1)
+        draw(axes)
+        axes.set_title(title, fontsize=9)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    _save(figure.savefig, path)
+
+
+def _grey(image: NDArray) -> "Callable[[Axes], None]":
+    return lambda axes: axes.imshow(image, cmap="gray", vmin=0, vmax=255) and None
+
+
+def _colours(image: NDArray, colours: str, low: float, high: float, unit: str) -> "Callable[[Axes], None]":
+    def draw(axes: "Axes") -> None:
+        shown = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+        bar = axes.figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.03)
+        bar.set_label(unit, fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+
+    return draw
+
+
+def _hidden(image: NDArray, inside: NDArray[np.bool_]) -> NDArray:
+    return np.where(inside, image, np.nan)
+
+
+def _save(save: Callable[..., None], path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(path)
+    except OSError as error:
+        raise DatasetError(f"{path}: can't be written ({error.strerror or error})") from error
+
+
+def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
+    """The mesh from above and to the side, lit from the eye; uint8 (size, size)."""
+    import trimesh
+
+    from fpp_ml_bench.loaders.raycast import TracedObject
+    from fpp_ml_bench.loaders.scene import SolidMesh, turned
+
+    loaded = trimesh.load(path, force="mesh", process=False)
+    mesh = SolidMesh(path.stem, np.asarray(loaded.vertices), np.asarray(loaded.faces, dtype=np.int32))
+    vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
+    tilt = np.deg2rad(25.0)
+    rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    vertices_m = vertices_m @ rotation.T
+    radius = np.linalg.norm(vertices_m, axis=1).max()
+    distance = 4.0 * radius
+    line = np.linspace(-1, 1, size) * (1.05 * radius / distance)
+    x, y = np.meshgrid(line, line)
+    hits = TracedObject(mesh, vertices_m + np.array([0, 0, distance])).primary(x, y)
+    toward = -np.column_stack([x.ravel()[hits.pixels], y.ravel()[hits.pixels], np.ones(hits.pixels.size)])
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    picture = np.full(size * size, 255, dtype=np.uint8)
+    picture[hits.pixels] = 30 + 190 * np.clip(np.einsum("ij,ij->i", hits.normals, toward), 0, 1)
+    return picture.reshape(size, size)
+
+
+def contact_sheet(opened: DatasetFolder, split: str, path: Path) -> None:
+    """Write every object (rows, two a line) in its six views as one PNG, under white light where that frame is stored."""
+    import cv2
+
+    samples = opened.samples(split)
+    objects = list(dict.fromkeys(opened.measured(sample)["object"] for sample in samples))
+    available = stored_frames(opened.sequence, opened.manifest.stored)
+    index = opened.sequence.white if opened.sequence.white in available else 0
+    label_px, columns = 18, 2
+    line_px = _TILE_PX + label_px
+    lines = -(-len(objects) // columns)
+    width = len(VIEWS) * _TILE_PX
+    sheet = np.full((lines * line_px, columns * width + 8), 255, dtype=np.uint8)
+    known = set(samples)
+    for place, name in enumerate(objects):
+        top, left = (place // columns) * line_px, (place % columns) * (width + 8)
+        for number, view in enumerate(VIEWS):
+            sample = sample_name(name, view)
+            if sample not in known:
+                continue
+            tile = cv2.resize(opened.frame(sample, index), (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
+            column = left + number * _TILE_PX
+            sheet[top + label_px : top + line_px, column : column + _TILE_PX] = cv2.convertScaleAbs(tile, alpha=1.4)
+        title = f"{name} ({opened.split_of_sample(sample_name(name, VIEWS[0]))})"
+        cv2.putText(sheet, title, (left + 4, top + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
+    encoded, png = cv2.imencode(".png", sheet)
+    if not encoded:
+        raise DatasetError(f"{path}: the picture could not be encoded")
+    _save(lambda target: target.write_bytes(png.tobytes()) and None, path)

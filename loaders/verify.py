@@ -1,0 +1,138 @@
+"""Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or sample."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of
+from fpp_ml_bench.loaders.manifest import MANIFEST, Manifest, ShardFile, dataset_files, file_hash, read_manifest
+from fpp_ml_bench.loaders.schema import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, group_columns, stored_groups
+from fpp_ml_bench.loaders.shards import depth_range_mm
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ImagePlaces = dict[str, list[tuple[str, str, str]]]
+"""Hash of an image -> where it stands: (split, sample, column)."""
+
+
+def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -> list[str]:
+    """Findings of a complete check of a dataset folder; an empty list means intact.
+
+    Checks: every file of the manifest is there with its checksum; no foreign file; every Arrow file holds the rows and
+    columns it should; labels and depth ranges agree with the images; depths are finite and not negative; no object is
+    in two splits, none lacks a view, the benchmark's own objects are in their split; no image appears in two splits.
+    Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file.
+    """
+    manifest = read_manifest(folder)
+    findings = foreign_files(folder, manifest)
+    places: ImagePlaces = {}
+    opened = None
+    for file in (*manifest.others, *manifest.shards):
+        damage = file_damage(folder, file.path, file.bytes, file.xxh3_128)
+        if damage:
+            findings.append(damage)
+        elif isinstance(file, ShardFile):
+            # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
+            opened = opened or DatasetFolder.unchecked(folder, manifest)
+            findings += _shard_findings(opened, file, places)
+        progress(1)
+    return findings + split_findings(manifest) + duplicate_images(places)
+
+
+def foreign_files(folder: Path, manifest: Manifest) -> list[str]:
+    """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are not counted."""
+    known = {MANIFEST, *(shard.path for shard in manifest.shards), *(other.path for other in manifest.others)}
+    return [
+        f"{path}: is not part of this dataset; remove it"
+        for path in dataset_files(folder)
+        if path.relative_to(folder).as_posix() not in known and not path.name.startswith("cache-")
+    ]
+
+
+def file_damage(folder: Path, name: str, size: int, expected_hash: str) -> str | None:
+    """What is wrong with one file, or None."""
+    path = folder / name
+    if not path.is_file():
+        return f"{path}: is missing; copy or build the dataset again"
+    if path.stat().st_size != size:
+        return f"{path}: has {path.stat().st_size} bytes, expected {size}; copy or build the dataset again"
+    if file_hash(path) != expected_hash:
+        return f"{path}: its content has changed (checksum differs); copy or build the dataset again"
+    return None
+
+
+def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces) -> list[str]:
+    """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
+    import xxhash
+
+    path = opened.path / shard.path
+    manifest = opened.manifest
+    rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
+    frames = stored_groups(opened.sequence, manifest.stored).get(shard.group)
+    if frames is None or len(rows) != shard.rows:
+        return [f"{path}: the manifest has no such rows or columns"]
+    expected = group_columns(opened.sequence, shard.group, frames, manifest.exact)
+    batches = opened.record_batches(shard)
+    if not batches or batches[0].schema.names != expected or sum(len(b) for b in batches) != shard.rows:
+        return [f"{path}: its rows or columns are not those the manifest says"]
+    findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
+    for column in expected:
+        if not (column.startswith("frame_") or column in (DEPTH, DEPTH_EXACT)):
+            continue
+        images = (image for batch in opened.column_images(shard, column) for image in batch)
+        for row, image in zip(rows, images, strict=True):
+            if column in (DEPTH, DEPTH_EXACT) and not (np.isfinite(image).all() and image.min() >= 0):
+                findings.append(
+                    f"{path}: sample {row['sample']!r}, column {column}: depths that are not finite or negative"
+                )
+            if column == DEPTH and depth_range_mm(image, row["sample"]) != (row["depth_min_mm"], row["depth_max_mm"]):
+                findings.append(f"{path}: sample {row['sample']!r}: depth_min and depth_max do not fit its depth")
+            if image.min() != image.max():  # a uniform image (black without noise) says nothing about what it shows
+                digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image))
+                places.setdefault(digest, []).append((shard.split, row["sample"], column))
+    opened.forget(shard)
+    return findings
+
+
+def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: "list[pa.RecordBatch]") -> list[str]:
+    findings = []
+    stored = [record for batch in batches for record in batch.select(LABELS).to_pylist()]
+    for row, labels in zip(rows, stored, strict=True):
+        expected = {"sample": row["sample"], "object": row["object"], "view": row["view"], "split": shard.split}
+        if labels != expected:
+            findings.append(f"{path}: expected labels {expected}, found {labels}")
+    return findings
+
+
+def split_findings(manifest: Manifest) -> list[str]:
+    """Rules of the split by object, checked on the manifest's rows."""
+    findings = []
+    home: dict[str, str] = {}
+    for split, rows in manifest.samples.items():
+        views: dict[str, list[str]] = {}
+        for row in rows:
+            views.setdefault(row["object"], []).append(row["view"])
+        for name, seen in views.items():
+            if home.setdefault(name, split) != split:
+                findings.append(f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak")
+            if sorted(seen) != sorted(VIEWS):
+                findings.append(
+                    f"object {name!r} in {split}: expected the views {', '.join(VIEWS)}, found {', '.join(seen)}"
+                )
+            if manifest.origin == "generated" and name in OBJECTS and split_of(name) != split:
+                findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
+    return findings
+
+
+def duplicate_images(places: ImagePlaces) -> list[str]:
+    """Images that stand in more than one split, by the hash of their pixels."""
+    findings = []
+    for found in places.values():
+        if len({split for split, _, _ in found}) > 1:
+            named = ", ".join(f"{split}/{sample} {column}" for split, sample, column in found[:4])
+            findings.append(f"the same image stands in two splits: {named}")
+    return findings
