@@ -2,7 +2,7 @@
 
 The order is the paper's (Section 3.2): N horizontal sinusoids, N vertical sinusoids, horizontal Gray code, vertical
 Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52 frames. *Horizontal* fringes have horizontal stripes: they vary
-along the projector's rows and measure its coordinate ``v``. *Vertical* fringes vary along its columns and measure ``u``.
+along the projector's rows and measure its coordinate ``v``. *Vertical* fringes vary along its columns, measure ``u``.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,11 @@ class Frame:
         """What a person reads under the picture."""
         if self.kind == "sinusoid":
             return f"{self.index}: {self.direction} sinusoid, step {self.step}"
-        return f"{self.index}: {self.direction} Gray bit {self.step}" if self.kind == "gray" else f"{self.index}: {self.kind}"
+        return (
+            f"{self.index}: {self.direction} Gray bit {self.step}"
+            if self.kind == "gray"
+            else f"{self.index}: {self.kind}"
+        )
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,8 @@ class Sequence:
             raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
         if min(self.bits_horizontal, self.bits_vertical) < 1 or max(self.bits_horizontal, self.bits_vertical) > 15:
             raise ValueError(
-                f"Gray bits must be 1 to 15 a direction, got {self.bits_horizontal} horizontal, {self.bits_vertical} vertical"
+                f"Gray bits must be 1 to 15 a direction, got {self.bits_horizontal} horizontal and "
+                f"{self.bits_vertical} vertical"
             )
 
     def __len__(self) -> int:

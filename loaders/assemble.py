@@ -21,7 +21,14 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.card import write_card
 from fpp_ml_bench.loaders.folder_lock import writing
 from fpp_ml_bench.loaders.manifest import (
-    MANIFEST, Manifest, ShardFile, dataset_files, describe_file, file_hash, read_manifest, write_atomically,
+    MANIFEST,
+    Manifest,
+    ShardFile,
+    dataset_files,
+    describe_file,
+    file_hash,
+    read_manifest,
+    write_atomically,
 )  # fmt: skip
 from fpp_ml_bench.loaders.shards import ShardPlan
 
@@ -46,11 +53,13 @@ class Assembly:
     def key(self) -> dict[str, Any]:
         """What must be equal for a resumed run to go on with this folder's work."""
         content = asdict(self.manifest)
-        return {name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")}
+        return {
+            name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
+        }
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset; ``progress`` is told of finished rows. Returns the manifest that stands at the end."""
+    """Write or finish the dataset; ``progress`` is told of finished rows. Returns the manifest at the end."""
     with writing(folder) as scratch:
         if (folder / MANIFEST).exists():
             return _already_there(folder, assembly)
@@ -102,7 +111,7 @@ def _compare(folder: Path, theirs: dict[str, Any], ours: dict[str, Any]) -> None
             differing.append(f"{key} (there {_short(theirs.get(key))}, now {_short(ours[key])})")
     if differing:
         raise BuildError(
-            f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete this one"
+            f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete it"
         )
 
 
@@ -179,7 +188,7 @@ _rows_done: Any = None
 
 
 def _start_worker(rows_done: Any) -> None:
-    """Count rows where the parent sees them, and do not outlive it: an orphan would go on writing an unlocked folder."""
+    """Count rows where the parent sees them, and do not outlive it: an orphan would write an unlocked folder."""
     global _rows_done
     _rows_done = rows_done
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -23,7 +23,7 @@ _FLOAT = np.float32
 
 @dataclass(frozen=True)
 class Exposure:
-    """What every frame of a dataset shares: pattern light in [0, 1] per frame (its last entry doubled), and the noise."""
+    """What every frame of a dataset shares: pattern light in [0, 1] (its last entry doubled), and the noise."""
 
     frames: tuple[Frame, ...]
     light: tuple[NDArray[np.float32], ...]
@@ -32,7 +32,9 @@ class Exposure:
     @classmethod
     def of(cls, rig: Rig, noise: Noise) -> "Exposure":
         """Pattern light as the projector's 8-bit images give it."""
-        profiles = (pattern_profile(rig, frame.index).astype(np.float32) / _FLOAT(GREY_LEVELS) for frame in rig.sequence)
+        profiles = (
+            pattern_profile(rig, frame.index).astype(np.float32) / _FLOAT(GREY_LEVELS) for frame in rig.sequence
+        )
         return cls(rig.sequence.frames, tuple(np.append(p, p[-1:]) for p in profiles), noise)
 
     def expose(
@@ -53,9 +55,19 @@ class Exposure:
 
             contiguous = pixels.size > 0 and int(pixels[-1]) - int(pixels[0]) == pixels.size - 1
             expose_kernel(
-                out, light, lookup.index, lookup.weight, lit.gain, lit.ambient, pixels, contiguous, normal_table(), keys,
-                read, shot,
-            )  # fmt: skip
+                out,
+                light,
+                lookup.index,
+                lookup.weight,
+                lit.gain,
+                lit.ambient,
+                pixels,
+                contiguous,
+                normal_table(),
+                keys,
+                read,
+                shot,
+            )
             return out
         low = light[lookup.index]
         pattern = low + lookup.weight * (light[lookup.index + 1] - low)

@@ -1,7 +1,7 @@
 """The files that make a dataset folder one that Hugging Face tools open: card, split list, per-split state, rig.
 
 ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
-``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json`` and maps in place.
+``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place.
 """
 
 import json
@@ -78,7 +78,9 @@ def write_card(folder: Path, manifest: Manifest) -> None:
     text = _CARD.format(
         # `datasets` finds an old copy in its cache unless the version changes with the data.
         version=f"1.0.{int(manifest.fingerprint[:7], 16)}",
-        data_files="\n".join(f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples),
+        data_files="\n".join(
+            f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples
+        ),
         origin=manifest.origin,
         rows=sum(len(rows) for rows in manifest.samples.values()),
         height=manifest.size[0],

@@ -31,7 +31,9 @@ def writing(folder: Path) -> Iterator[Path]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise BuildError(f"{folder}: another process is writing this folder; wait for it or choose another") from error
+            raise BuildError(
+                f"{folder}: another process is writing this folder; wait for it or choose another"
+            ) from error
         yield work
         if (folder / MANIFEST).exists():
             shutil.rmtree(work)

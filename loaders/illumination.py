@@ -1,7 +1,8 @@
 """How bright each pixel is: projector light by cosine and inverse square on a matte surface, weak specular, ambient.
 
 The material is the paper's (Section 2.2: matte, roughness 0.95, specular 0.15, the same on object and background
-plane). A surface turned away from the projector gets ambient light only; cast shadows are an option, off as in the paper.
+plane). A surface turned away from the projector gets ambient light only; cast shadows are an option, off as in the
+paper.
 """
 
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ class Lighting:
 
 @dataclass(frozen=True)
 class PatternLookup:
-    """Where each pixel reads a 1-D pattern profile: entry ``index`` (uint16) and the next, blended by ``weight`` (float32)."""
+    """Where each pixel reads a 1-D pattern profile: entry ``index`` uint16 and its next, blended by ``weight``."""
 
     index: NDArray[np.uint16]
     weight: NDArray[np.float32]
@@ -121,7 +122,7 @@ def _by_direction(u: NDArray, v: NDArray) -> tuple[tuple[Direction, NDArray], tu
 
 
 def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:
-    """Which projector pixels (n,), (n,) lie on the pattern, its outer pixels included whole; NaN does not; bool (n,)."""
+    """Which projector pixels (n,), (n,) lie on the pattern, outer pixels included whole; NaN does not; bool (n,)."""
     return (u >= -0.5) & (u <= rig.projector.width - 0.5) & (v >= -0.5) & (v <= rig.projector.height - 0.5)
 
 

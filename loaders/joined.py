@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 def load_dataset(folder: str | Path, config: str = ..., *, split: str) -> "Dataset": ...
 @overload
 def load_dataset(folder: str | Path, config: str = ..., split: None = ...) -> "DatasetDict": ...
-def load_dataset(
-    folder: str | Path, config: str = "single_shot", split: str | None = None
-) -> "Dataset | DatasetDict":
+def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
     """Open a built or imported dataset folder as a ``datasets.Dataset``, or every split as a ``DatasetDict``.
 
     Parameters

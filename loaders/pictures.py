@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, VIEWS, sample_name
+from fpp_ml_bench.constants import VIEWS, sample_name
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.schema import stored_frames
 from fpp_ml_bench.loaders.store import DatasetFolder
@@ -16,7 +16,6 @@ from fpp_ml_bench.pixel_sets import object_mask
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fpp_ml_bench.loaders.scene import SolidMesh
 
 _TILE_PX = 120
 _DPI = 110
@@ -116,7 +115,7 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
 
 
 def contact_sheet(opened: DatasetFolder, split: str, path: Path) -> None:
-    """Write every object (rows, two a line) in its six views as one PNG, under white light where that frame is stored."""
+    """Write every object (two a line) in its six views as one PNG, under white light where that frame is stored."""
     import cv2
 
     samples = opened.samples(split)

@@ -31,7 +31,7 @@ class SolidMesh:
 
 
 def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """Vertices after R_z(degrees), expressed along the camera's axes but still about the turning axis; (V, 3) metres."""
+    """Vertices after R_z(degrees), along the camera's axes but still about the turning axis; (V, 3) metres."""
     angle = np.deg2rad(degrees)
     cosine, sine = np.cos(angle), np.sin(angle)
     x = cosine * vertices_m[:, 0] - sine * vertices_m[:, 1]
@@ -89,6 +89,6 @@ def _misfit(mesh: SolidMesh, view: str, rig: Rig, about_axis_m: NDArray[np.float
     near_mm, far_mm = rig.working_range_mm
     where = f"with its turning axis {rig.standoff_m} m from the camera" if rule == "fixed" else "at any distance"
     return (
-        f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in view "
-        f"{view} {where}; scale it by {low:.3g} or less, or give a rig with a wider range"
+        f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in "
+        f"view {view} {where}; scale it by {low:.3g} or less, or give a rig with a wider range"
     )

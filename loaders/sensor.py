@@ -1,8 +1,8 @@
 """The camera's sensor: counter-based noise and 8-bit quantisation, the same bytes whatever is computed when and where.
 
-The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit integer hash of the pixel
-number under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles. The
-sum of two normals is normal; it reaches 5.2 sigma and takes 16 million levels, and the tables stay in the first-level
+The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit integer hash of the
+pixel number under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles.
+The sum of two normals is normal; it reaches 5.2 sigma and takes 16 million levels, and the tables stay in the first-level
 cache. That is what makes noise cheap (see docs/generating.md) without changing its distribution (tests/test_sensor.py).
 """
 
@@ -27,7 +27,7 @@ class Noise:
 
     @classmethod
     def of_sigma(cls, sigma_grey: float) -> "Noise":
-        """Noise of standard deviation ``sigma_grey`` at mid-grey (127.5), half of its variance shot, half read noise."""
+        """Noise of standard deviation ``sigma_grey`` at mid-grey (127.5); half its variance is shot noise."""
         variance = float(sigma_grey) ** 2
         return cls(read_variance=variance / 2, shot_per_grey=variance / 2 / _MID_GREY)
 

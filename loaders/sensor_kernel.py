@@ -17,7 +17,7 @@ _MASK = (1 << TABLE_BITS) - 1
 def expose_kernel(  # type: ignore[no-untyped-def]
     out, profile, index, weight, gain, ambient, pixels, contiguous, table, keys, read_variance, shot_per_grey
 ):
-    """Expose one frame: ``out`` uint8 (n,); per-pixel ``index`` uint16, ``weight``, ``gain`` float32, ``pixels`` uint32."""
+    """Expose one frame: ``out`` uint8 (n,); per pixel ``index``, ``weight``, ``gain``, ``pixels`` as in `expose`."""
     total = out.size
     hashes = np.empty(_CHUNK, np.uint32)
     normal = np.empty(_CHUNK, np.float32)

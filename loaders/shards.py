@@ -13,7 +13,14 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.manifest import ShardFile, file_hash
 from fpp_ml_bench.loaders.schema import (
-    DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, arrow_schema, group_columns, stored_groups,
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    LABELS,
+    RANGE,
+    arrow_schema,
+    group_columns,
+    stored_groups,
 )  # fmt: skip
 from fpp_ml_bench.pixel_sets import object_mask
 
@@ -104,8 +111,8 @@ class ShardWriter:
                 files.append(entry)
         except (OSError, pa.ArrowException) as error:
             raise BuildError(
-                f"{self._folder / self._plan.path(DATA_GROUP)}: can't be written ({_reason(error)}); free some space or "
-                "choose another disk, then run the same command again: it resumes"
+                f"{self._folder / self._plan.path(DATA_GROUP)}: can't be written ({_reason(error)}); free some space "
+                "or choose another disk, then run the same command again: it resumes"
             ) from error
         finally:
             for path in temporary.values():

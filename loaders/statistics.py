@@ -70,8 +70,8 @@ def ground_truth_summary(manifest: Manifest) -> list[str]:
     """One sentence a split on how far the decoded ground truth is from the exact depth; none for imported data."""
     return [
         f"{s.split}: ground truth within {s.gt_mae_mm:.3f} mm MAE, {s.gt_rmse_mm:.3f} mm RMSE of the exact depth "
-        f"({s.gt_interior_mae_mm:.3f} mm 3 px or more from depth edges); {100 * s.undecoded_share:.2f}% of object pixels "
-        "not decodable"
+        f"({s.gt_interior_mae_mm:.3f} mm 3 px or more from depth edges); {100 * s.undecoded_share:.2f}% of object "
+        "pixels not decodable"
         for s in split_statistics(manifest)
         if s.gt_mae_mm is not None and s.gt_interior_mae_mm is not None and s.undecoded_share is not None
     ]

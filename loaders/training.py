@@ -39,8 +39,8 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     split : ``train``, ``validation`` or ``test``.
     config : which frames are samples of their own: ``single_shot`` (frame 0), ``horizontal``, ``vertical``,
         ``sinusoidal`` or ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
-    normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] per sample, from its own D_min and D_max; a flat
-        sample is 0 throughout). See `fpp_ml_bench.normalisation`.
+    normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] per sample, from its own D_min and D_max; a
+        flat sample is 0 throughout). See `fpp_ml_bench.normalisation`.
     background_removed : set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
 
     Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. `batches` is the
@@ -77,7 +77,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         return FringeDepth(*(tensor[0] for tensor in self.read([index])))
 
     def read(self, indices: Sequence[int], out: FringeDepth | None = None) -> FringeDepth:
-        """Items ``indices`` as one batch: fringe and depth (B, 1, H, W). Written into ``out``, of the same B, if given."""
+        """Items ``indices`` as one batch, fringe and depth (B, 1, H, W); written into ``out``, of the same B, if given."""
         batch = self.empty(len(indices)) if out is None else out
         fringes, depths = batch.fringe.numpy(), batch.depth.numpy()
         for place, index in enumerate(indices):

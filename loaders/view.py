@@ -1,4 +1,4 @@
-"""One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what separates the two."""
+"""One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what separates them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,12 @@ from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import (
-    Lighting, LitPixels, background_plane, hit_points_m, light_surface, lit_object,
+    Lighting,
+    LitPixels,
+    background_plane,
+    hit_points_m,
+    light_surface,
+    lit_object,
 )  # fmt: skip
 from fpp_ml_bench.loaders.raycast import Hits, TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place

@@ -62,7 +62,9 @@ def settings_of(args: argparse.Namespace) -> "BuildSettings":
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
             sequence = replace(
                 sequence,
-                bits_horizontal=max(sequence.bits_horizontal, bits_needed(rig.pattern_length("horizontal"), args.pitch)),
+                bits_horizontal=max(
+                    sequence.bits_horizontal, bits_needed(rig.pattern_length("horizontal"), args.pitch)
+                ),
                 bits_vertical=max(sequence.bits_vertical, bits_needed(rig.pattern_length("vertical"), args.pitch)),
             )
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
@@ -111,7 +113,10 @@ def _summary(out: Path, manifest: "Manifest", images: int, seconds: float) -> No
 
     size = sum(file.bytes for file in (*manifest.shards, *manifest.others))
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
-    print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)} in {seconds:.1f} s ({images / seconds:,.0f} images/s)")
+    print(
+        f"{out}: {parts} samples, {images:,} images, {gigabytes(size)} in {seconds:.1f} s "
+        f"({images / seconds:,.0f} images/s)"
+    )
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
     print(f"next: fpp-bench info {out}")

@@ -20,6 +20,8 @@ def run(args: argparse.Namespace) -> int:
     import json
     from dataclasses import asdict
 
+    from fpp_ml_bench.constants import MM_PER_M
+    from fpp_ml_bench.frames import DIRECTIONS
     from fpp_ml_bench.loaders.statistics import split_statistics
     from fpp_ml_bench.loaders.store import DatasetFolder
 
@@ -48,33 +50,28 @@ def run(args: argparse.Namespace) -> int:
     groups: dict[str, int] = {}
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
-    console = Console(width=max(110, Console().width))
-    console.print(f"[bold]{opened.path}[/bold]  {manifest.origin}, by {manifest.generator.get('name')} "
-                  f"{manifest.generator.get('version')}", highlight=False)  # fmt: skip
-    console.print(f"fingerprint     {opened.fingerprint}", highlight=False)
-    console.print(f"images          {opened.size[0]} x {opened.size[1]} px, {len(opened.sequence)} frames a sequence, stored: "
-                  f"{manifest.stored}", highlight=False)  # fmt: skip
-    console.print(f"configurations  {', '.join(opened.configs)}", highlight=False)
-    console.print(
-        "on disk         " + ", ".join(f"{name} {gigabytes(size)}" for name, size in groups.items()), highlight=False
-    )
     near, far = rig.working_range_mm
-    console.print(
-        f"rig             baseline {1000 * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm = "
-        f"{rig.periods_in_range('horizontal'):.2f} horizontal / {rig.periods_in_range('vertical'):.2f} vertical fringe periods "
-        f"of {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px, "
-        f"{rig.image_px_per_period('vertical'):.1f} image px a period",
-        highlight=False,
-    )
+    periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in DIRECTIONS)
     settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
-    console.print("settings        " + ", ".join(f"{key} {value}" for key, value in settings.items()), highlight=False)
+    generator = manifest.generator
+    height, width = opened.size
+    print(f"dataset         {opened.path}")
+    print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
+    print(f"fingerprint     {opened.fingerprint}")
+    print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
+    print(f"configurations  {', '.join(opened.configs)}")
+    print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
+    print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
+    print(f"fringes         pitch {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px; periods in range {periods}; "
+          f"{rig.image_px_per_period('vertical'):.1f} image px a period")  # fmt: skip
+    print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     table = Table(title="lengths in mm, means over samples", title_justify="left")
     table.add_column("")
     for split in statistics:
         table.add_column(split.split, justify="right")
     for title, cells in _rows(statistics):
         table.add_row(title, *cells)
-    console.print(table)
+    Console().print(table)
     return 0
 
 
