@@ -206,9 +206,8 @@ def report(scene: Scene, rows: list[Row]) -> None:
     inside = (scene.u > margin) & (scene.u < projector.width - 1 - margin)
     inside &= (scene.v > margin) & (scene.v < projector.height - 1 - margin)
     reference = rows[0].seconds
-    print(
-        f"{'method':<42}{'gives':<16}{'frames':>7}{'threads':>8}{'seconds':>10}{'ratio':>8}{'u RMSE':>10}{'depth MAE':>11}"
-    )
+    heads = f"{'frames':>7}{'threads':>8}{'seconds':>10}{'ratio':>8}{'u RMSE':>10}{'depth MAE':>11}"
+    print(f"{'method':<42}{'gives':<16}{heads}")
     for row in rows:
         errors = ""
         if row.u_error is not None and row.depth_error is not None:
