@@ -16,7 +16,9 @@ MAX_BYTES = 64 * 1024 * 1024
 
 def result_json(result: Result) -> bytes:
     """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
-    text = json.dumps(result.model_dump(mode="json"), indent=1, allow_nan=False, ensure_ascii=False)
+    content = result.model_dump(mode="json")
+    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]  # the name first
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     return text.encode("utf-8") + b"\n"
 
 

@@ -9,11 +9,10 @@ from fpp_ml_bench.commands import run_command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, TARGETS
 
-SUMMARY = "score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background"
+SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background."
 EXAMPLES = (
     "fpp-eval predictions --dataset data/mini --split test --json result.json",
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact",
-    "",
     "The folder holds submission.yaml and one {sample}.npy per sample of the split, float (H, W) depth in mm, 0 where",
     "there is no object; nothing else. Whatever is wrong is listed file by file, the exit status is 2, and no JSON is",
     "written. The rules are in evaluation/PROTOCOL.md.",

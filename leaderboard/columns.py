@@ -1,0 +1,81 @@
+"""The leaderboard's columns, once for terminal and Markdown: a title, and the cell of an entry as plain text."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.leaderboard.paper import PaperRow
+from fpp_ml_bench.leaderboard.ranking import Entry, Ranked
+
+NAME_WIDTH = 60
+DEVICE_WIDTH = 40
+SELF_REPORTED = "*"
+NOTE = f"Errors in mm, mean over samples. {SELF_REPORTED} time as its author reports it, not measured by fpp-bench predict."
+
+
+@dataclass(frozen=True)
+class Column:
+    """``text`` makes the cell; numbers stand on the right."""
+
+    title: str
+    text: Callable[[Ranked], str]
+    right: bool = True
+
+
+def _metric(key: str) -> Callable[[Ranked], str]:
+    return lambda row: (percent if key.endswith("_share") else millimetres)(row.entry.value(key))
+
+
+def _time(row: Ranked) -> str:
+    submission = row.entry.result.submission
+    mark = SELF_REPORTED if submission.seconds_source == "self-reported" else ""
+    return seconds(submission.seconds_per_sample) + (mark if submission.seconds_per_sample is not None else "")
+
+
+def device(entry: Entry) -> str:
+    """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
+    hardware = entry.result.submission.hardware
+    if hardware is None:
+        return "-"
+    cores = "1 core" if hardware.cores == 1 else f"{hardware.cores} cores"
+    return printable(hardware.gpu or f"{hardware.cpu}, {cores}", DEVICE_WIDTH)
+
+
+_TITLES = {
+    "object_mae_mm": "Object MAE",
+    "object_rmse_mm": "Object RMSE",
+    "overall_mae_mm": "Overall MAE",
+    "background_mae_mm": "Backgr. MAE",
+    "object_interior_mae_mm": "Interior MAE",
+    "object_edge_mae_mm": "Edge MAE",
+    "object_missing_share": "Missing",
+}
+_ALWAYS_SORTABLE = ("seconds_per_sample", "frames_used")
+
+
+def columns(sort: str) -> list[Column]:
+    """Columns of a ranking by ``sort``; a key that has no column of its own gets one."""
+    shown = list(_TITLES)
+    if sort not in shown and sort not in _ALWAYS_SORTABLE:
+        shown.insert(0, sort)
+    return [
+        Column("#", lambda row: str(row.rank)),
+        Column("Method", lambda row: printable(row.entry.name, NAME_WIDTH), right=False),
+        *(Column(_TITLES.get(key, key.removesuffix("_mm").replace("_", " ")), _metric(key)) for key in shown),
+        Column("s/sample", _time),
+        Column("Frames", lambda row: str(len(row.entry.result.submission.frames_used))),
+        Column("Timed on", lambda row: device(row.entry), right=False),
+    ]
+
+
+PAPER_TITLES = (
+    "Row", "Track", "Test samples", "Object MAE", "Object RMSE", "Overall MAE", "Overall RMSE", "Backgr. MAE",
+    "Backgr. RMSE",
+)  # fmt: skip
+
+
+def paper_cells(row: PaperRow) -> list[str]:
+    """Cells under `PAPER_TITLES`, errors with the paper's two decimals."""
+    keys = (f"{pixels}_{error}_mm" for pixels in ("object", "overall", "background") for error in ("mae", "rmse"))
+    return [row.label, row.track, str(row.test_samples), *(f"{row.errors_mm[key]:.2f}" for key in keys)]

@@ -1,0 +1,78 @@
+"""The leaderboard as files: Markdown for a README, JSON for a page. The same rows give the same bytes."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, device, paper_cells
+from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperTable
+from fpp_ml_bench.leaderboard.ranking import Group, Ranked
+
+_PLAIN = frozenset(" -,+()/%=.")
+
+
+def markdown_text(text: str) -> str:
+    """``text`` as Markdown that shows exactly it: punctuation that could mean something becomes a character entity.
+
+    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins.
+    """
+    safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
+    return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
+
+
+def _table(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(" ---: " if r else " --- " for r in right) + "|"]
+    return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
+
+
+def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
+    """The whole leaderboard as Markdown, ending in a newline."""
+    lines: list[str] = []
+    shown = columns(sort)
+    for group in groups:
+        rows = [[markdown_text(column.text(row)) for column in shown] for row in group.rows]
+        titles = [column.title.replace("#", "Rank") for column in shown]
+        lines += [f"### {markdown_text(group.title)}", "", *_table(titles, [c.right for c in shown], rows), ""]
+    if groups:
+        lines += [NOTE.replace("*", "\\*"), ""]
+    if papers:
+        lines += [f"### {PAPER_HEADING[0].upper() + PAPER_HEADING[1:]}", ""]
+    for paper in papers:
+        rows = [[markdown_text(cell) for cell in paper_cells(row)] for row in paper.rows]
+        right = [number > 1 for number in range(len(PAPER_TITLES))]
+        lines += [f"{markdown_text(f'{paper.name}: {paper.title}, mm')}", "", *_table(PAPER_TITLES, right, rows), ""]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
+    """The whole leaderboard as JSON: groups of ranked rows, and the paper's tables apart."""
+    content = {
+        "sorted_by": sort,
+        "groups": [
+            {**asdict(group.key), "dataset": group.dataset_name, "rows": [_row(row) for row in group.rows]}
+            for group in groups
+        ],
+        "reported_by_the_paper": [asdict(paper) for paper in papers],
+    }
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _row(row: Ranked) -> dict[str, Any]:
+    result = row.entry.result
+    submission = result.submission
+    return {
+        "rank": row.rank,
+        "name": submission.name,
+        "method": submission.method,
+        "metrics": result.metrics.model_dump(mode="json"),
+        "seconds_per_sample": submission.seconds_per_sample,
+        "seconds_source": submission.seconds_source,
+        "timed_on": device(row.entry),
+        "frames_used": len(submission.frames_used),
+        "samples": result.dataset.samples,
+        "created": result.created,
+        "source": row.entry.path.name,
+    }

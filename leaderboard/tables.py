@@ -1,0 +1,49 @@
+"""The leaderboard in the terminal."""
+
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, paper_cells
+from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperTable
+from fpp_ml_bench.leaderboard.ranking import Group
+
+NO_RESULTS = """\
+No results here yet. Score predictions, and their row appears:
+  fpp-bench predict classical data/mini --split test --out predictions
+  fpp-eval predictions --dataset data/mini --split test --json result.json
+  fpp-bench leaderboard result.json
+Without arguments, result*.json and results/*.json of the current folder are read.
+"""
+
+
+def group_tables(groups: Sequence[Group], sort: str) -> list[Table | Text]:
+    """One table a group, or what to do when there is none. Submitted text goes in as `Text`: it is never markup."""
+    if not groups:
+        return [Text(NO_RESULTS)]
+    parts: list[Table | Text] = []
+    for group in groups:
+        table = Table(title=Text(group.title), title_justify="left")
+        shown = columns(sort)
+        for column in shown:
+            table.add_column(column.title, justify="right" if column.right else "left", overflow="fold")
+        for row in group.rows:
+            table.add_row(*(Text(column.text(row)) for column in shown))
+        parts += [table, Text("")]
+    return [*parts[:-1], Text(NOTE + "\n")]
+
+
+def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
+    """The paper's tables under their heading."""
+    if not tables:
+        return []
+    parts: list[Table | Text] = [Text(PAPER_HEADING[0].upper() + PAPER_HEADING[1:], style="bold")]
+    for paper in tables:
+        table = Table(title=f"{paper.name}: {paper.title}, mm", title_justify="left")
+        for number, title in enumerate(PAPER_TITLES):
+            table.add_column(title, justify="right" if number > 1 else "left")
+        for row in paper.rows:
+            table.add_row(*paper_cells(row))
+        parts += [table, Text("")]
+    return parts[:-1]
