@@ -2,8 +2,9 @@
 
 The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit integer hash of the
 pixel number under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles.
-The sum of two normals is normal; it reaches 5.2 sigma and takes 16 million levels, and the tables stay in the first-level
-cache. That is what makes noise cheap (see docs/generating.md) without changing its distribution (tests/test_sensor.py).
+The sum of two normals is normal; it reaches 5.2 sigma and takes 16 million levels, and the tables stay in the
+first-level cache. That is what makes noise cheap (see docs/generating.md) without changing its distribution
+(tests/test_sensor.py).
 """
 
 from dataclasses import dataclass

@@ -77,7 +77,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         return FringeDepth(*(tensor[0] for tensor in self.read([index])))
 
     def read(self, indices: Sequence[int], out: FringeDepth | None = None) -> FringeDepth:
-        """Items ``indices`` as one batch, fringe and depth (B, 1, H, W); written into ``out``, of the same B, if given."""
+        """Items ``indices`` as one batch, fringe and depth (B, 1, H, W); into ``out``, of the same B, if given."""
         batch = self.empty(len(indices)) if out is None else out
         fringes, depths = batch.fringe.numpy(), batch.depth.numpy()
         for place, index in enumerate(indices):

@@ -88,12 +88,13 @@ def settings_of(args: argparse.Namespace) -> "BuildSettings":
 def run(args: argparse.Namespace) -> int:
     from time import perf_counter
 
-    from fpp_ml_bench.commands.console import progress_bar, usable_cpus
+    from fpp_ml_bench.commands.console import progress_bar
+    from fpp_ml_bench.hardware import usable_cores
     from fpp_ml_bench.loaders.build import assembly_of, build
     from fpp_ml_bench.loaders.schema import stored_frames
 
     settings = settings_of(args)
-    workers = usable_cpus() if args.workers is None else args.workers
+    workers = usable_cores() if args.workers is None else args.workers
     if workers < 1:
         raise BuildError(f"--workers {workers}: expected 1 or more")
     assembly = assembly_of(settings)

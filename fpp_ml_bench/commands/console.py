@@ -40,10 +40,3 @@ def gigabytes(count: float) -> str:
 def millimetres(value: float | None) -> str:
     """A length for a table; a dash where there is none."""
     return "-" if value is None else f"{value:.3f}"
-
-
-def usable_cpus() -> int:
-    """Processors that this process may use."""
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -62,8 +62,10 @@ def run(args: argparse.Namespace) -> int:
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    print(f"fringes         pitch {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px; periods in range {periods}; "
-          f"{rig.image_px_per_period('vertical'):.1f} image px a period")  # fmt: skip
+    print(
+        f"fringes         pitch {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px; periods in range {periods}"
+    )
+    print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     table = Table(title="lengths in mm, means over samples", title_justify="left")
     table.add_column("")

@@ -1,0 +1,67 @@
+"""Classical multi-frame FPP: N-step phase, Gray-code order, triangulation (paper Section 2.1).
+
+It is the benchmark's reference: what the optics allow when 10 to 50 frames are captured instead of one. With all steps
+and both directions it is the very process that made the ``depth`` column, so there only ``--target depth_exact`` says
+anything about its error.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.decoding import Decoded, Directions, decode_stack
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.frames import DIRECTIONS, Direction
+from fpp_ml_bench.phase import choose_steps
+from fpp_ml_bench.rig import Rig
+
+
+@dataclass(frozen=True)
+class ClassicalMethod:
+    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned."""
+
+    rig: Rig
+    direction: Directions = "both"
+    steps: int = 18
+    threads: int = 1
+
+    name = "classical"
+    uses_ground_truth_range = False
+
+    def __post_init__(self) -> None:
+        if not 3 <= self.steps <= self.rig.sequence.steps:
+            raise DecodeError(f"steps {self.steps}: expected 3 to the {self.rig.sequence.steps} that were captured")
+
+    @property
+    def directions(self) -> tuple[Direction, ...]:
+        return DIRECTIONS if self.direction == "both" else (self.direction,)
+
+    @property
+    def frames_used(self) -> tuple[int, ...]:
+        """Frames that must be captured, ascending."""
+        sequence = self.rig.sequence
+        used: list[int] = []
+        for direction in self.directions:
+            sinusoids = sequence.sinusoids(direction)
+            used += [sinusoids[n] for n in choose_steps(sequence.steps, self.steps)]
+            used += sequence.gray(direction)
+        return tuple(sorted(used))
+
+    @property
+    def title(self) -> str:
+        which = "both directions" if self.direction == "both" else f"{self.direction} fringes"
+        return f"Classical {self.steps}-step + Gray code, {which}"
+
+    @property
+    def settings(self) -> dict[str, str | int]:
+        return {"direction": self.direction, "steps": self.steps, "threads": self.threads}
+
+    def decode(self, frames: Sequence[NDArray[np.uint8] | None]) -> Decoded:
+        """Full result of a captured sequence; frames that are not in `frames_used` may be None."""
+        return decode_stack(frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads)
+
+    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background or not measured."""
+        return self.decode(frames).depth_mm

@@ -1,0 +1,118 @@
+"""Running a method over a split: one prediction a sample, timed, and a submission that says how it was made."""
+
+import platform
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
+from fpp_ml_bench.hardware import describe_hardware
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+PREDICTION_SUFFIX = ".npy"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run came to: samples written, median seconds a sample."""
+
+    samples: int
+    seconds_per_sample: float
+
+
+def predict_split(
+    opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
+) -> Run:
+    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) mm, and ``submission.yaml`` last.
+
+    A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
+    run that is not counted warms caches and compiled code up. The submission gives the median over the split.
+
+    Raises `PredictionError` for an ``out`` that holds something else than an unfinished run of the same samples, and
+    `DatasetError` when the dataset lacks a frame that the method needs.
+    """
+    samples = opened.samples(split)
+    _prepare(out, samples)
+    seconds = []
+    for number, sample in enumerate(samples):
+        frames = _captured(opened, method, sample)
+        if number == 0:
+            method.predict(frames)
+        started = perf_counter()
+        depth_mm = method.predict(frames)
+        seconds.append(perf_counter() - started)
+        _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", depth_mm, opened.size)
+        progress(1)
+    median = statistics.median(seconds)
+    _write_submission(out / SUBMISSION_FILE, method, median)
+    return Run(len(samples), median)
+
+
+def _captured(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
+    """The sequence as the method may see it: its own frames, read into memory, and None for every other."""
+    frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
+    for index in method.frames_used:
+        frames[index] = opened.frame(sample, index).copy()
+    return frames
+
+
+def _prepare(out: Path, samples: list[str]) -> None:
+    """Make ``out``, or take over one that a stopped run of the same samples left (it has no submission.yaml)."""
+    expected = {f"{sample}{PREDICTION_SUFFIX}" for sample in samples}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
+    found = sorted(path.name for path in out.iterdir())
+    foreign = [name for name in found if name not in expected and not name.endswith(".tmp")]
+    if foreign:
+        raise PredictionError(
+            f"{out}: already holds {foreign[0]}{' and more' if len(foreign) > 1 else ''}; give a new or empty folder"
+        )
+    for name in found:
+        (out / name).unlink()
+
+
+def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
+    if depth_mm.shape != size or depth_mm.dtype != np.float32:
+        raise PredictionError(f"{path}: the method gave {depth_mm.dtype} {depth_mm.shape}, expected float32 {size}")
+    if not np.isfinite(depth_mm).all():
+        raise PredictionError(f"{path}: the method gave depths that are not finite; that is a fault of the method")
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        np.save(file, depth_mm, allow_pickle=False)
+    temporary.replace(path)
+
+
+def _write_submission(path: Path, method: Method, seconds_per_sample: float) -> None:
+    import yaml
+
+    content: dict[str, Any] = {
+        "name": method.title,
+        "method": method.name,
+        "units": "mm",
+        "frames_used": list(method.frames_used),
+        "uses_ground_truth_range": method.uses_ground_truth_range,
+        "seconds_per_sample": float(f"{seconds_per_sample:.6g}"),
+        "seconds_source": "measured",
+        "hardware": describe_hardware().to_dict(),
+        "software": {
+            "fpp_ml_bench": __version__,
+            "python": platform.python_version(),
+            **{package: version(package) for package in ("numpy", "numba")},
+        },
+        "settings": dict(method.settings),
+    }
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    temporary.replace(path)

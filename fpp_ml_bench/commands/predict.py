@@ -1,0 +1,52 @@
+"""``fpp-bench predict``: run a method over a split."""
+
+import argparse
+from pathlib import Path
+
+SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
+EXAMPLES = (
+    "fpp-bench predict classical data/mini --split test --out predictions",
+    "fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4",
+    "fpp-eval predictions --dataset data/mini --split test --target depth_exact --json result.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("method", metavar="METHOD", help="classical: N-step phase, Gray-code order, triangulation")
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty folder for predictions")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
+    classical = parser.add_argument_group("classical")
+    classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    classical.add_argument(
+        "--direction",
+        choices=("horizontal", "vertical", "both"),
+        default="both",
+        help="fringes to use: one direction is enough for a depth (default: both)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.baselines.methods import METHODS, method
+    from fpp_ml_bench.baselines.prediction import predict_split
+    from fpp_ml_bench.commands.console import progress_bar
+    from fpp_ml_bench.errors import PredictionError
+    from fpp_ml_bench.loaders.store import DatasetFolder
+
+    if args.method not in METHODS:
+        raise PredictionError(f"unknown method {args.method!r}; there are {', '.join(METHODS)}")
+    if args.threads < 1:
+        raise PredictionError(f"--threads {args.threads}: expected 1 or more")
+    opened = DatasetFolder(args.dataset)
+    steps = opened.sequence.steps if args.steps is None else args.steps
+    chosen = method(args.method, opened.rig, direction=args.direction, steps=steps, threads=args.threads)
+    samples = len(opened.samples(args.split))
+    with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
+        done = predict_split(opened, chosen, args.split, args.out, advance)
+    print(
+        f"{args.out}: {done.samples} predictions by {chosen.title}; {len(chosen.frames_used)} frames and "
+        f"{done.seconds_per_sample:.3f} s a sample (median)"
+    )
+    print(f"next: fpp-eval {args.out} --dataset {args.dataset} --split {args.split} --json result.json")
+    return 0
