@@ -11,6 +11,7 @@ import stat
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -63,10 +64,11 @@ def read_prediction(path: Path, size: tuple[int, int], buffer: bytearray | None 
         linked = path.is_symlink()
         reason = "is a symbolic link; put the file itself there" if linked else f"can't be read: {error.strerror}"
         raise PredictionError(reason) from None
+    info = os.fstat(descriptor)
+    if not stat.S_ISREG(info.st_mode):
+        os.close(descriptor)
+        raise PredictionError("is not a regular file")
     with os.fdopen(descriptor, "rb", buffering=0) as stream:
-        info = os.fstat(descriptor)
-        if not stat.S_ISREG(info.st_mode):
-            raise PredictionError("is not a regular file")
         view = memoryview(buffer)
         got = _fill(stream, view[: min(HEADER_BYTES, info.st_size)])
         dtype, fortran, start = _check_header(bytes(view[:got]), size)
@@ -136,7 +138,16 @@ def _check_header(head: bytes, size: tuple[int, int]) -> tuple[np.dtype[Any], bo
             raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-    except (ValueError, TypeError, SyntaxError, KeyError, RecursionError, MemoryError, OverflowError) as error:
+    except (
+        ValueError,
+        TypeError,
+        SyntaxError,
+        TokenError,
+        KeyError,
+        RecursionError,
+        MemoryError,
+        OverflowError,
+    ) as error:
         if isinstance(error, PredictionError):
             raise
         raise PredictionError("is no .npy file, or its header is damaged; write it with np.save") from None

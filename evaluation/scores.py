@@ -21,6 +21,8 @@ BLOCK = 9600
 """Pixels a block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
 would then depend on the number of cores; below that a score is the same on every machine of one kind."""
 
+_NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
+
 
 @dataclass(frozen=True, slots=True)
 class ErrorStats:
@@ -85,6 +87,7 @@ class SampleScores:
         }
 
 
+@np.errstate(over="ignore")  # an overflow is no warning here: _finish refuses it
 def score_sample(
     prediction_mm: NDArray[np.floating[Any]],
     target_mm: NDArray[np.floating[Any]],
@@ -113,6 +116,8 @@ def score_sample(
     measured = prediction.take(index)
     errors = measured.astype(np.float64)
     errors -= target.take(index)
+    if not np.isfinite(errors).all():
+        raise PredictionError(_NOT_FINITE)
     missing = measured <= 0
     near = object_near_edge(target_mm, edge_band_px).ravel().take(index)
     interior, edge = _stats(errors[~near]), _stats(errors[near])
@@ -177,5 +182,5 @@ def _finish(pixels: int, absolute: list[float], squares: list[float]) -> ErrorSt
     except (OverflowError, ValueError):  # fsum of huge values, or of inf and -inf
         mae = mean_square = math.inf
     if not math.isfinite(mae) or not math.isfinite(mean_square):
-        raise PredictionError("the errors are not finite, or too large to square (above about 1e140)")
+        raise PredictionError(_NOT_FINITE)
     return ErrorStats(pixels, mae, math.sqrt(mean_square))
