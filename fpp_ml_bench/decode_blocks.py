@@ -38,7 +38,11 @@ gives a sigma of 0.5 px; a fringe order wrong by one puts an 18-px fringe more t
 
 
 class Reason(IntEnum):
-    """Why a pixel has no depth; of several, the lowest is given."""
+    """Why a pixel has no depth; of several, the lowest is given.
+
+    NO_RAY: the camera's lens model has no inverse there, or the ray meets what the projector showed nowhere in front of
+    both devices.
+    """
 
     DECODED = 0
     NO_RAY = 1

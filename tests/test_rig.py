@@ -210,7 +210,7 @@ def test_unreadable_files_are_refused(tmp_path, name, content, says):
 
 
 def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
-    with pytest.raises(RigError, match="absent.yaml.*can't be read"):
+    with pytest.raises(RigError, match=r"absent.yaml.*can't be read"):
         load_rig(tmp_path / "absent.yaml")
     with pytest.raises(RigError, match="can't be written"):
         save_rig(paper_rig(), tmp_path / "no" / "rig.yaml")
