@@ -132,7 +132,7 @@ def vial() -> Solid:
     label = wrapped(rectangle(62, 22), 12, 20, 0.25)
     words = wrapped(text_section("VIAL", 16), 12.2, 25, 0.35)
     lines = [wrapped(rectangle(15, 1.1), 12.2, z, 0.3) for z in (18.5, 15.5, 12.5)]
-    return place(union(glass, crimp, stopper, label, words, *lines), turn=(0, 0, 0))
+    return union(glass, crimp, stopper, label, words, *lines)
 
 
 def cork() -> Solid:

@@ -96,7 +96,7 @@ def open_book() -> Solid:
     leaf = curve([(3, 3), (14, 15), (38, 20), (80, 16), (120, 12), (146, 10)])
     pages = polygon(np.concatenate([leaf, [(146, 0), (3, 0)]]))
     loose = curve([(4, 4), (15, 19), (39, 27), (80, 27), (118, 31), (142, 38)])
-    sheet = stroke([(float(x), float(y)) for x, y in loose], 1.0)
+    sheet = stroke(loose, 1.0)
     cover = rectangle(155, 3.4, 1.2, (76, -1.6))
     right = union(pages.extrude(205), sheet.extrude(205), cover.extrude(215).translate((0, 0, -5))).rotate(
         (0, 0, spread)
@@ -129,7 +129,7 @@ def magazine_stack() -> Solid:
     title = place(text_plate("MAGAZINE", 170, 1.2), (-62, 4, base), (0, 0, -94))
     photo = place(block(110, 150, 2.0, 0), (22, 8, base), (0, 0, -4))
     curl = curve([(-40, 0), (20, 1), (70, 8), (104, 26), (112, 36)])
-    cover = place(stroke([(float(x), float(y)) for x, y in curl], 1.4).extrude(280), (2, 144, base), (90, 0, -4))
+    cover = place(stroke(curl, 1.4).extrude(280), (2, 144, base), (90, 0, -4))
     return place(union(*magazines, title, photo, cover), turn=(0, -9, 6))
 
 

@@ -25,15 +25,12 @@ from fpp_ml_bench.loaders.objects.solids import (
 from fpp_ml_bench.loaders.objects.sweeps import curve, loft, skin, superellipse, tube
 
 
-def _outline(points: np.ndarray) -> list[Point2]:
-    return [(float(x), float(y)) for x, y in points]
-
-
 def hammer() -> Solid:
     """Claw hammer, 330 mm long: turned face, cheek, forked claw, waisted grip with a bulged end."""
     handle = loft(
-        [(0, 26, 34, 2.4), (4, 30, 39, 2.4), (18, 29, 37, 2.4), (60, 25, 30, 2.3), (100, 26, 33, 2.3), (140, 23, 28, 2.2),
-         (200, 18, 23, 2.0), (250, 18, 23, 2.0), (292, 20, 26, 2.4), (312, 20, 26, 2.4)], smooth=6, sides=64,
+        [(0, 26, 34, 2.4), (4, 30, 39, 2.4), (18, 29, 37, 2.4), (60, 25, 30, 2.3), (100, 26, 33, 2.3),
+         (140, 23, 28, 2.2), (200, 18, 23, 2.0), (250, 18, 23, 2.0), (292, 20, 26, 2.4), (312, 20, 26, 2.4)],
+        smooth=6, sides=64,
     )  # fmt: skip
     handle = laid(handle)
     face = place(lathe([(14, 0), (17, 3), (17, 15), (13, 21), (12, 40)], 0.5), (64, 292, 0), (0, -90, 0))
@@ -51,9 +48,8 @@ def hammer() -> Solid:
                 [point[0] + normal[0] * section[:, 0], point[1] + normal[1] * section[:, 0], section[:, 1]], axis=1
             )
         )
-    fork = place(plate(polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)]), 90), (-40, 285, 0), (90, 0, 180)).translate(
-        (0, 0, 0)
-    )
+    wedge = polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)])
+    fork = place(plate(wedge, 90), (-40, 285, 0), (90, 0, 180))
     claw = cut(skin(np.array(rings)), fork)
     grooves = [place(ring(19, 2.0).scale((0.95, 0.8, 1)), (0, y, 0), (-90, 0, 0)) for y in (34, 48, 62, 76, 90)]
     return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(3, 0, 3))
@@ -62,7 +58,7 @@ def hammer() -> Solid:
 def scissors() -> Solid:
     """Household scissors, 205 mm long, a little open: two pointed blades, pivot screw, a round and a long bow."""
     blade = polygon([(-4, -20), (9, -20), (10, 10), (7, 70), (1.5, 108), (0, 108), (-6, 20)], 0.6)
-    shank = stroke(_outline(curve([(2, -16), (2, -32), (7, -46), (12, -56)])), 12)
+    shank = stroke(curve([(2, -16), (2, -32), (7, -46), (12, -56)]), 12)
     halves = []
     for side, reach in ((1, 25.0), (-1, 36.0)):
         bow = np.linspace(0, 2 * np.pi, 72, endpoint=False)
@@ -81,9 +77,9 @@ def scissors() -> Solid:
 
 def large_clamp() -> Solid:
     """Spring clamp, 200 mm long: two jaws with pads crossing at a coiled spring, handles with sleeves."""
-    arm = stroke(_outline(curve([(18, -24), (0, 2), (-24, 30), (-34, 54), (-28, 76), (-14, 90)])), 22)
-    lever = stroke(_outline(curve([(0, 0), (24, -34), (40, -66), (48, -100)])), 26)
-    sleeve = stroke(_outline(curve([(31, -46), (40, -67), (48, -100)])), 34)
+    arm = stroke(curve([(18, -24), (0, 2), (-24, 30), (-34, 54), (-28, 76), (-14, 90)]), 22)
+    lever = stroke(curve([(0, 0), (24, -34), (40, -66), (48, -100)]), 26)
+    sleeve = stroke(curve([(31, -46), (40, -67), (48, -100)]), 34)
     slot = plate(stroke([(20, -28), (29, -46)], 7), 60)
     half = cut(union(plate(softened(arm + lever, 2), 20), plate(softened(sleeve, 1), 28)), slot)
     pad = union(place(block(10, 38, 30, 3), (-6.5, 90, 0), (0, 0, 3)), rod((-12, 90, -17), (-12, 90, 17), 6))
@@ -188,7 +184,8 @@ def pallet_knife() -> Solid:
 def pallet_knife_large() -> Solid:
     """Long palette knife, 290 mm: straight round-ended blade, bolster, riveted flat handle."""
     blade = polygon(np.concatenate([
-        curve([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)]), curve([(0, 174), (-14, 166), (-18, 150), (-17, 90), (-12, 20)])[1:],
+        curve([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)]),
+        curve([(0, 174), (-14, 166), (-18, 150), (-17, 90), (-12, 20)])[1:],
         [(-9, 0), (9, 0)],
     ]))  # fmt: skip
     bolster = block(26, 16, 15, 3, (0, 4, 0))

@@ -41,7 +41,7 @@ _ROWS, _ADVANCE = 7, 6
 
 
 def text_section(text: str, width: float) -> Section:
-    """The text as a flat section, ``width`` mm wide and centred at the origin; cells overlap a little where they meet."""
+    """The text as a flat section, ``width`` mm wide, centred at the origin; cells overlap a little where they meet."""
     runs = []
     for place, letter in enumerate(text):
         for row, cells in enumerate(_GLYPHS[letter].split()):

@@ -40,21 +40,24 @@ def paint_container_bottle() -> Solid:
     )
     notch = block(5, 11, 4, 1, (-13.6, 0, 104))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
-    words = union(wrapped(text_section("PAINT", 34), 22.4, 54, 0.7), wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9))
+    words = union(
+        wrapped(text_section("PAINT", 34), 22.4, 54, 0.7),
+        wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9),
+    )
     return union(body, cut(cap, notch), label, words)
 
 
 def paint_container_jar() -> Solid:
-    """Wide paint jar, 76 x 84 mm, its ribbed lid askew and paint running down from under it."""
+    """Wide paint jar, 76 x 84 mm, with a ribbed lid and paint running down from under it."""
     body = lathe([(32, 0), (37, 3), (38, 8), (38, 52), (36, 58), (33, 62), (33, 68)], 1.2)
-    lid = place(union(ribbed_cap(37.5, 17, 60), ring(34, 1.6, 17), ring(22, 1.0, 17)), (0, 0, 65), (0, 2, 0))
+    lid = place(union(ribbed_cap(37.5, 17, 60), ring(34, 1.6, 17), ring(22, 1.0, 17)), (0, 0, 65), (0, 0, 7))
     runs = []
     for y, top, length in ((-14, 62, 30), (-6, 62, 44), (3, 62, 22), (11, 62, 12), (20, 62, 34)):
         x = -float(np.sqrt(36.4**2 - y**2))
         runs.append(rod((x, y, top), (x, y, top - length), 2.4, 3.6, rounded=True))
     hem = tube([(-36.0 * np.cos(a), 36.0 * np.sin(a), 62.5) for a in np.linspace(-0.7, 0.8, 30)], 3.4)
     words = wrapped(text_section("PAINT", 44), 38, 14, 1.1)
-    return place(union(body, lid, hem, words, *runs), turn=(0, -1, 0))
+    return union(body, lid, hem, words, *runs)
 
 
 def paint_container_spraycan() -> Solid:
@@ -76,7 +79,7 @@ def paint_container_spraycan() -> Solid:
         wrapped(text_section("PAINT", 66), 32.4, 94, 0.9),
         wrapped(stroke(_BRUSH_MARK, 12).scale((1.2, 1.2)), 32.4, 54, 1.0),
     )
-    return place(union(body, button, nozzle, label, words), turn=(0, 0, 0))
+    return union(body, button, nozzle, label, words)
 
 
 def _tube(length: float, width: float, cap_radius: float, cap_height: float, crimp: float = 10.0) -> Solid:
@@ -85,7 +88,8 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
     end = shoulder + length
     levels = [
         (shoulder, 0.80 * width, 0.80 * width, 2.0), (shoulder + 0.18 * length, 0.82 * width, 0.77 * width, 2.0),
-        (shoulder + 0.45 * length, 0.87 * width, 0.62 * width, 2.1), (shoulder + 0.75 * length, 0.94 * width, 0.34 * width, 2.2),
+        (shoulder + 0.45 * length, 0.87 * width, 0.62 * width, 2.1),
+        (shoulder + 0.75 * length, 0.94 * width, 0.34 * width, 2.2),
         (end - crimp, width, 0.09 * width + 1.2, 2.6),
     ]  # fmt: skip
     body = loft(levels, smooth=8)
@@ -107,25 +111,25 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
 
 
 def paint_container_tube_small() -> Solid:
-    """Stubby watercolour tube, 15 x 62 mm, leaning."""
-    body = _tube(46, 22, 7.0, 10, 6)
-    return place(union(body, embossed(body, text_section("RED", 14).translate((0, 44)), 0.5)), turn=(1, 0, 0)).rotate(
+    """Stubby watercolour tube, 21 x 84 mm."""
+    body = _tube(62, 20.5, 7.0, 10, 6)
+    return place(union(body, embossed(body, text_section("RED", 13).translate((0, 48)), 0.5)), turn=(1, 0, 0)).rotate(
         (0, 0, 30)
     )
 
 
 def paint_container_tube() -> Solid:
-    """Oil-paint tube, 27 x 105 mm, rolled up a little at its end."""
-    body = _tube(82, 30, 7.5, 13, 8)
-    roll = rod((-3.2, -15.6, 102), (-3.2, 15.6, 102), 4.6)
-    words = text_section("OIL", 19).translate((0, 62)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 44))
+    """Oil-paint tube, 30 x 130 mm, rolled up a little at its end."""
+    body = _tube(106, 30, 7.5, 13, 8)
+    roll = rod((-3.2, -15.6, 126), (-3.2, 15.6, 126), 4.6)
+    words = text_section("OIL", 19).translate((0, 72)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 50))
     return place(union(body, roll, embossed(body, words, 0.7)), turn=(-1, 0, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube_large() -> Solid:
-    """Large acrylic tube, 48 x 165 mm, squeezed at its waist and standing on a wide flip cap."""
-    body = _tube(125, 52, 19, 26, 9)
-    dent = place(ball(26), (-32, 8, 124))
+    """Large acrylic tube, 52 x 192 mm, squeezed at its waist and standing on a wide flip cap."""
+    body = _tube(156, 52, 19, 26, 9)
+    dent = place(ball(26), (-32, 8, 140))
     hinge = block(6, 12, 8, 1, (18, 0, 24))
     words = text_section("ACRYL", 36).translate((0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
     return place(union(cut(union(body, embossed(body, words, 1.0)), dent), hinge), turn=(1, 0, 0)).rotate((0, 0, 30))
@@ -134,10 +138,11 @@ def paint_container_tube_large() -> Solid:
 def paint_thinner() -> Solid:
     """Rectangular solvent can, 165 x 100 x 240 mm: seams, sunk top with screw spout and a strap handle."""
     body = union(
-        loft([(0, 163, 98, 9), (2, 166, 101, 9), (6, 166, 101, 9), (7, 163, 98, 9), (193, 163, 98, 9), (194, 166, 101, 9), (199, 166, 101, 9), (200, 163, 98, 9)]),
+        loft([(0, 163, 98, 9), (2, 166, 101, 9), (6, 166, 101, 9), (7, 163, 98, 9), (193, 163, 98, 9),
+              (194, 166, 101, 9), (199, 166, 101, 9), (200, 163, 98, 9)]),
     )  # fmt: skip
     top = loft([(196, 157, 92, 9), (203, 157, 92, 9)])
-    spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 208)))
+    spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
     strap = tube(
         curve([(0, 16, 196), (0, 12, 224), (0, -14, 238), (0, -48, 234), (0, -64, 214), (0, -66, 196)]),
         9,

@@ -4,10 +4,8 @@ import numpy as np
 
 from fpp_ml_bench.loaders.objects.solids import (
     Solid,
-    ball,
     block,
     cut,
-    disc,
     facing,
     lathe,
     place,
@@ -16,11 +14,10 @@ from fpp_ml_bench.loaders.objects.solids import (
     rectangle,
     ring,
     rod,
-    softened,
     stroke,
     union,
 )
-from fpp_ml_bench.loaders.objects.sweeps import curve, tube
+from fpp_ml_bench.loaders.objects.sweeps import curve
 
 _TO_LEFT = (0, -90, 0)  # turns a lathe so that its top points to the viewer's left
 
@@ -28,7 +25,7 @@ _TO_LEFT = (0, -90, 0)  # turns a lathe so that its top points to the viewer's l
 def power_drill() -> Solid:
     """Cordless drill, 230 x 215 mm: motor housing with vents, clutch ring, chuck and bit, grip, trigger, battery."""
     housing = place(
-        lathe(np.concatenate([[(24.0, 0.0)], curve([(26, 4), (28, 30), (28, 70), (26.5, 92), (25, 104)])]), 1),
+        lathe(np.concatenate([[(24.0, 0.0)], curve([(26, 4), (28, 30), (28, 70), (26.5, 92), (25, 107)])]), 1),
         (62, 78, 0),
         _TO_LEFT,
     )
@@ -44,7 +41,8 @@ def power_drill() -> Solid:
         rod((-157, 78, 0), (-163, 78, 0), 3, 0.4),
     )
     side = np.concatenate([
-        curve([(2, 70), (2, 40), (10, 0), (18, -34), (20, -50)]), curve([(66, -50), (62, -20), (58, 20), (60, 50), (62, 84)]),
+        curve([(2, 70), (2, 40), (10, 0), (18, -34), (20, -50)]),
+        curve([(66, -50), (62, -20), (58, 20), (60, 50), (62, 84)]),
     ])  # fmt: skip
     grip_outline = polygon(side, 4)
     grip = union(plate(grip_outline, 30), plate(grip_outline.offset(-4), 40))
@@ -75,12 +73,13 @@ def spraygun() -> Solid:
         *(place(block(16, 9, 11, 2), (-76, 60 + s * 15, 0), (0, 0, s * 24)) for s in (-1, 1)),
     )  # fmt: skip
     grip_outline = polygon(np.concatenate([
-        curve([(4, 56), (6, 30), (16, -6), (24, -40), (28, -66)]), curve([(58, -66), (54, -36), (46, -4), (42, 30), (56, 52), (60, 66), (48, 74)]),
+        curve([(4, 56), (6, 30), (16, -6), (24, -40), (28, -66)]),
+        curve([(58, -66), (54, -36), (46, -4), (42, 30), (56, 52), (60, 66), (48, 74)]),
     ]), 3)  # fmt: skip
     grip = union(plate(grip_outline, 18), plate(grip_outline.offset(-4), 25))
     hook = plate(stroke([(-18, 66), (-26, 84), (-38, 86)], 8), 8)
     trigger = plate(
-        stroke([(float(x), float(y)) for x, y in curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)])], 9),
+        stroke(curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)]), 9),
         13,
     )
     pivot = rod((-33, 64, -21), (-33, 64, 21), 6)

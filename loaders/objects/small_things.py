@@ -17,7 +17,6 @@ from fpp_ml_bench.loaders.objects.solids import (
     rectangle,
     ring,
     rod,
-    softened,
     union,
 )
 from fpp_ml_bench.loaders.objects.sweeps import curve, superellipse, tube
@@ -122,7 +121,8 @@ def battery() -> Solid:
     collar = union(ring(12.9, 0.45, 36), ring(12.9, 0.45, 34.8), ring(8, 0.5, 47.3))
     words = union(
         wrapped(text_section("+", 9), 13, 41, 0.5), wrapped(text_section("-", 7), 13, 6, 0.5),
-        wrapped(text_section("BATTERY", 32), 13, 22, 0.5), wrapped(rectangle(30, 1.2), 13, 15, 0.45), wrapped(rectangle(30, 1.2), 13, 29, 0.45),
+        wrapped(text_section("BATTERY", 32), 13, 22, 0.5),
+        wrapped(rectangle(30, 1.2), 13, 15, 0.45), wrapped(rectangle(30, 1.2), 13, 29, 0.45),
     )  # fmt: skip
     return place(union(body, nub, collar, words), turn=(0, -3, 0))
 

@@ -1,12 +1,13 @@
 """Solids the 50 objects are made of: turned, boxed, extruded and joined, all in millimetres.
 
 Everything here is a :class:`manifold3d.Manifold`, closed by construction, so that unions and cuts stay watertight.
-Two drawing frames are used. *Upright* solids (bottles, cans) stand on z = 0 with z up and their front towards -x, where
-the camera stands at the first view. *Drawn* solids (scissors, lettering) are laid out in the xy plane as the viewer sees
-them, z towards the viewer, and :func:`facing` stands them up. Source: own.
+Two drawing frames are used. *Upright* solids (bottles, cans) stand on z = 0 with z up and their front towards -x,
+where the camera stands at the first view. *Drawn* solids (scissors, lettering) are laid out in the xy plane as the
+viewer sees them, z towards the viewer, and :func:`facing` stands them up. Source: own.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, OpType
@@ -76,10 +77,10 @@ def softened(section: Section, radius: float) -> Section:
     return closed.offset(-radius, JoinType.Round, 2.0, arcs).simplify(0.01)
 
 
-def stroke(points: Sequence[Point2], width: float) -> Section:
+def stroke(points: Sequence[Point2] | np.ndarray, width: float) -> Section:
     """A polyline drawn with a round pen of ``width`` mm."""
-    dots = [CrossSection.circle(width / 2, SMALL_SEGMENTS).translate(point) for point in points]
-    pieces = [(a + b).hull() for a, b in zip(dots, dots[1:], strict=False)]
+    dots = [CrossSection.circle(width / 2, SMALL_SEGMENTS).translate((float(x), float(y))) for x, y in points]
+    pieces = [(a + b).hull() for a, b in pairwise(dots)]
     return CrossSection.batch_boolean(pieces, OpType.Add)
 
 

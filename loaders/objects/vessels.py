@@ -4,8 +4,10 @@ import numpy as np
 
 from fpp_ml_bench.loaders.objects.lettering import text_section, wrapped
 from fpp_ml_bench.loaders.objects.solids import (
+    SMALL_SEGMENTS,
     Solid,
     ball,
+    block,
     cut,
     lathe,
     place,
@@ -88,17 +90,18 @@ def cleaning_bucket() -> Solid:
 
 
 def lighting_candles() -> Solid:
-    """Five burning pillar candles of different height and girth, standing together on a round tray."""
-    tray = union(lathe([(104, 0), (110, 2), (110, 6)]), ring(110, 4.0, 7))
-    stands = ((-44, 0, 27, 92), (30, 48, 30, 170), (34, -46, 32, 215), (-26, 64, 19, 128), (-24, -64, 22, 150))
-    return union(tray, *(_candle(radius, height).translate((x, y, 5)) for x, y, radius, height in stands))
+    """Five burning candles of different height and girth, in cups on a narrow holder 250 mm long."""
+    holder = union(block(34, 250, 12, 3, (0, 0, 6)), *(block(44, 14, 8, 2, (0, s * 84, 4)) for s in (-1, 1)))
+    stands = ((-98, 20, 118), (-53, 22, 182), (0, 26, 226), (52, 23, 160), (98, 19, 92))
+    cups = [lathe([(16, 8), (radius + 2, 12), (radius + 3, 26)]).translate((0, y, 0)) for y, radius, _ in stands]
+    return union(holder, *cups, *(_candle(radius, height).translate((0, y, 10)) for y, radius, height in stands))
 
 
 def _candle(radius: float, height: float) -> Solid:
     """Candle with a molten pool, runs of wax, a wick and a flame."""
     body = cut(
-        lathe([(radius, 0), (radius, height)], 1.5),
-        lathe([(radius - 7, height - 7), (radius - 3, height - 2), (radius - 3, height + 4)], 0.8),
+        lathe([(radius, 0), (radius, height - 1), (radius - 1, height)], segments=96),
+        lathe([(radius - 7, height - 7), (radius - 3, height - 2), (radius - 3, height + 4)], segments=96),
     )
     runs = []
     for k in range(5):
@@ -106,10 +109,10 @@ def _candle(radius: float, height: float) -> Solid:
         x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
         runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
     wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
-    flame = lathe(
-        curve([(0.6, height + 4), (4.5, height + 8), (6.6, height + 15), (4.6, height + 25), (0.6, height + 38)])
+    flame_side = curve(
+        [(0.6, height + 4), (4.5, height + 8), (6.6, height + 15), (4.6, height + 25), (0.6, height + 38)], 6
     )
-    return union(body, *runs, wick, flame)
+    return union(body, *runs, wick, lathe(flame_side, segments=SMALL_SEGMENTS))
 
 
 def duct_tape() -> Solid:
@@ -129,7 +132,7 @@ def duct_tape() -> Solid:
         ],
         axis=1,
     )
-    end = stroke([(float(x), float(y)) for x, y in lifted], 1.4).extrude(50)
+    end = stroke(lifted, 1.4).extrude(50)
     roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
     return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 16)).rotate((0, -5, 0))
 
