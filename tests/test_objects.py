@@ -26,7 +26,7 @@ def meshes():
 @pytest.fixture(scope="module")
 def views(meshes):
     """Visible depths in mm of each object's six views, on a coarse grid of the paper's camera."""
-    return {name: [_visible_depth_mm(mesh, degrees) for degrees in VIEW_DEGREES] for name, mesh in meshes.items()}
+    return {name: _visible_depths_mm(mesh) for name, mesh in meshes.items()}
 
 
 def _turn(degrees):
@@ -34,21 +34,24 @@ def _turn(degrees):
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-def _visible_depth_mm(mesh, degrees):
-    """Depths (n,) of the pixels that hit the object; camera 1.8 m away on -x, looking along +x, y left, z up."""
-    turned = mesh.vertices @ _turn(degrees).T
-    scene = rtcore_scene.EmbreeScene()
-    triangles = TriangleMesh(scene, turned[mesh.faces].astype(np.float32))  # must outlive the query
+def _visible_depths_mm(mesh):
+    """For each view, depth (n,) of the pixels that hit; camera 1.8 m away on -x, looking along +x, y left, z up.
+
+    The camera goes round the object instead of the object turning, so that Embree builds its tree once.
+    """
     row, column = np.mgrid[0:SIZE, 0:SIZE]
-    scale = IMAGE_PX / SIZE / FOCAL_PX
-    centre = (SIZE - 1) / 2
-    rays = np.stack(
-        [np.ones(SIZE * SIZE), (centre - column.ravel()) * scale, (centre - row.ravel()) * scale], axis=1
-    ).astype(np.float32)
-    eyes = np.tile(np.array([-STANDOFF_M, 0, 0], np.float32), (len(rays), 1))
-    distance = scene.run(eyes, rays, query="DISTANCE")
+    scale, centre = IMAGE_PX / SIZE / FOCAL_PX, (SIZE - 1) / 2
+    rays = np.stack([np.ones(SIZE * SIZE), (centre - column.ravel()) * scale, (centre - row.ravel()) * scale], axis=1)
+    eyes = np.tile([-STANDOFF_M, 0.0, 0.0], (len(rays), 1))
+    scene = rtcore_scene.EmbreeScene()
+    triangles = TriangleMesh(scene, mesh.triangles.astype(np.float32))  # must outlive the queries
+    depths = []
+    for degrees in VIEW_DEGREES:
+        turn = _turn(degrees)  # (R^T v)^T = v^T R: the scene seen from a camera turned the other way
+        distance = scene.run((eyes @ turn).astype(np.float32), (rays @ turn).astype(np.float32), query="DISTANCE")
+        depths.append(1000.0 * distance[distance < 1e3])  # the ray's component along the axis is 1
     del triangles
-    return 1000.0 * distance[distance < 1e3]  # a ray's x component is 1: its parameter is the depth
+    return depths
 
 
 def _digest(mesh):
@@ -122,8 +125,8 @@ def test_six_views_of_an_object_differ(views):
 
 
 def test_the_same_name_gives_the_same_bytes(meshes):
-    for name, mesh in meshes.items():
-        assert _digest(object_mesh(name)) == _digest(mesh), name
+    for name in OBJECTS[::3]:
+        assert _digest(object_mesh(name)) == _digest(meshes[name]), name
 
 
 def test_another_process_gives_the_same_bytes(meshes):
