@@ -224,7 +224,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=960, help="camera image width and height in px (default 960)")
     parser.add_argument("--repeats", type=int, default=7, help="timed calls, of which the median counts (default 7)")
     args = parser.parse_args()
+    if args.size < 240 or args.repeats < 1:
+        parser.error("--size must be at least 240 (the peers' own limits) and --repeats at least 1")
     scene = make_scene(args.size)
+    load = os.getloadavg()[0]
+    print(
+        f"{args.size} x {args.size} px, median of {args.repeats}; {os.cpu_count()} cores, load at the start {load:.1f}"
+    )
     rows = run_ours(scene, args.repeats) + run_fringes(scene, args.repeats) + run_opencv(scene, args.repeats)
     report(scene, rows)
 
