@@ -83,7 +83,7 @@ def container_bottle() -> Solid:
 
 
 def spray_bottle() -> Solid:
-    """Trigger sprayer, 92 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
+    """Trigger sprayer, 78 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
     body = lathe(
         np.concatenate([
             [(31, 0), (37, 1)],
