@@ -1,0 +1,141 @@
+"""Reading frame 0 and depth as float32 batches: PNG + .mat, plain ``datasets``, and our loader, in the same run.
+
+    python benchmarks/read_speed.py [--size 960] [--objects 4] [--batch 4] [--repeats 7]
+
+Every way gives the same numbers (checked): fringe and depth float32 (B, 1, H, W), grey levels and mm.
+The files are in the page cache; one process, one thread. Plain ``datasets`` is ``load_dataset(FOLDER, "single_shot")``
+in torch format with ``dtype=torch.float32``, reading `fringe` and `depth` columns only. Medians over repeats of reading
+every row once.
+"""
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+import numpy as np
+
+from fpp_ml_bench.constants import OBJECTS
+from fpp_ml_bench.hardware import describe_hardware
+from fpp_ml_bench.loaders.build import build
+from fpp_ml_bench.loaders.settings import BuildSettings
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.rig import paper_rig
+
+
+def write_png_mat(opened: DatasetFolder, samples: list[str], folder: Path) -> None:
+    """The published form of the same samples: 8-bit PNG and zlib-compressed .mat."""
+    import cv2
+    import scipy.io
+
+    for sample in samples:
+        cv2.imwrite(str(folder / f"{sample}.png"), opened.frame(sample, 0))
+        scipy.io.savemat(folder / f"{sample}.mat", {"depthMap": opened.depth_mm(sample)}, do_compression=True)
+
+
+def read_png_mat(samples: list[str], folder: Path, batch: int, size: tuple[int, int]) -> float:
+    import cv2
+    import scipy.io
+
+    total = 0.0
+    for start in range(0, len(samples), batch):
+        chosen = samples[start : start + batch]
+        fringe = np.empty((len(chosen), 1, *size), dtype=np.float32)
+        depth = np.empty_like(fringe)
+        for place, sample in enumerate(chosen):
+            fringe[place, 0] = cv2.imread(str(folder / f"{sample}.png"), cv2.IMREAD_UNCHANGED)
+            depth[place, 0] = scipy.io.loadmat(folder / f"{sample}.mat")["depthMap"]
+        total += float(fringe[0, 0, -1, -1]) + float(depth.max())
+    return total
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=960)
+    parser.add_argument("--objects", type=int, default=4, help="objects, six rows each (default: 4, one shard)")
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--repeats", type=int, default=7)
+    args = parser.parse_args()
+    machine = describe_hardware()
+    print(f"{machine.cpu}, {machine.cores} cores; {args.size} px, batches of {args.batch}")
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:
+        os.environ["HF_DATASETS_CACHE"] = str(Path(scratch) / "cache")
+        compare(Path(scratch), args)
+    return 0
+
+
+def compare(scratch: Path, args: argparse.Namespace) -> None:
+    import datasets
+    import torch
+
+    from fpp_ml_bench.loaders.training import FringeDepthDataset
+
+    torch.set_num_threads(1)
+    datasets.disable_progress_bars()
+    names = [name for name in OBJECTS if name not in ("mustard_bottle", "mug")][: args.objects]
+    folder = scratch / "dataset"
+    build(folder, BuildSettings(rig=paper_rig(args.size), objects=tuple(names), stored="single_shot"), 1)
+    opened = DatasetFolder(folder)
+    samples = opened.samples("train")
+    files = scratch / "files"
+    files.mkdir()
+    write_png_mat(opened, samples, files)
+
+    plain = datasets.load_dataset(str(folder), "single_shot", split="train")
+    plain = plain.select_columns(["frame_00", "depth"]).with_format("torch", dtype=torch.float32)
+    ours = FringeDepthDataset(folder, "train", "single_shot", "raw")
+
+    def through_datasets() -> float:
+        total = 0.0
+        for start in range(0, len(plain), args.batch):
+            batch = plain[start : start + args.batch]
+            total += float(batch["frame_00"][0, -1, -1]) + float(batch["depth"].max())
+        return total
+
+    def through_ours() -> float:
+        total = 0.0
+        for batch in ours.batches(args.batch):
+            total += float(batch.fringe[0, 0, -1, -1]) * 255 + float(batch.depth.max())
+        return total
+
+    def copies_only() -> float:
+        image = np.zeros((*opened.size,), dtype=np.uint8)
+        depth_mm = np.ones((*opened.size,), dtype=np.float32)
+        fringe_out, depth_out = np.empty_like(depth_mm), np.empty_like(depth_mm)
+        for _ in samples:
+            np.copyto(fringe_out, image)
+            np.copyto(depth_out, depth_mm)
+        return 0.0
+
+    ways: list[tuple[str, Callable[[], float]]] = [
+        ("PNG + .mat (cv2, scipy)", lambda: read_png_mat(samples, files, args.batch, opened.size)),
+        ("plain datasets, torch format", through_datasets),
+        ("ours, FringeDepthDataset.batches", through_ours),
+        ("the copies alone, in cache", copies_only),
+    ]
+    totals, milliseconds = [], []
+    for _, way in ways:
+        way()
+        seconds = []
+        for _ in range(args.repeats):
+            started = time.perf_counter()
+            total = way()
+            seconds.append(time.perf_counter() - started)
+        totals.append(total)
+        milliseconds.append(1000 * statistics.median(seconds) / len(samples))
+    if not np.allclose(totals[:3], totals[0], rtol=1e-6):
+        raise SystemExit(f"the three ways disagree: {totals[:3]}")
+    print(f"{'way':36s} {'ms a row':>9s} {'times faster than PNG + .mat':>30s}")
+    for (name, _), ms in zip(ways, milliseconds, strict=True):
+        print(f"{name:36s} {ms:9.3f} {milliseconds[0] / ms:30.1f}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
