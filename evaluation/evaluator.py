@@ -95,7 +95,7 @@ def evaluate(
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=submission,
         dataset={
-            "name": printable(Path(dataset.path).resolve().name) or "dataset",
+            "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "fingerprint": dataset.fingerprint,
             "split": split,
             "size": [height, width],

@@ -32,7 +32,7 @@ def _scores(result: Result) -> Table:
     table = Table(caption="mm; mean and median over samples, pooled over all pixels", caption_justify="left")
     table.add_column("Pixel set")
     for title in ("MAE mean", "MAE median", "MAE pooled", "RMSE mean", "RMSE median", "RMSE pooled"):
-        table.add_column(title, justify="right")
+        table.add_column(title.replace(" ", "\n"), justify="right", no_wrap=True)
     for pixels in PIXEL_SETS:
         cells = [
             millimetres(getattr(part, f"{pixels}_{error}_mm"))
@@ -85,7 +85,7 @@ def _worst(result: Result) -> Table | None:
     table = Table(title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples", title_justify="left")
     table.add_column("Sample")
     for title in ("Object MAE", "Object RMSE", "Background MAE", "Near edges", "Not measured"):
-        table.add_column(title, justify="right")
+        table.add_column(title.replace(" ", "\n"), justify="right", no_wrap=True)
     for row in sorted(rows, key=_badness)[:WORST]:
         cells: list[Any] = [millimetres(row.object_mae_mm), millimetres(row.object_rmse_mm)]
         cells += [millimetres(row.background_mae_mm), percent(row.object_edge_share), percent(row.object_missing_share)]

@@ -11,16 +11,17 @@ from fpp_ml_bench.leaderboard.ranking import Entry, Ranked
 NAME_WIDTH = 60
 DEVICE_WIDTH = 40
 SELF_REPORTED = "*"
-NOTE = f"Errors in mm, mean over samples. {SELF_REPORTED} time as its author reports it, not measured by fpp-bench predict."
+NOTE = f"Errors in mm, mean over samples. {SELF_REPORTED} time as reported by its author, not measured here."
 
 
 @dataclass(frozen=True)
 class Column:
-    """``text`` makes the cell; numbers stand on the right."""
+    """``text`` makes the cell; numbers stand on the right. Narrower than ``from_width`` characters, it is left out."""
 
     title: str
     text: Callable[[Ranked], str]
     right: bool = True
+    from_width: int = 0
 
 
 def _metric(key: str) -> Callable[[Ranked], str]:
@@ -42,14 +43,15 @@ def device(entry: Entry) -> str:
     return printable(hardware.gpu or f"{hardware.cpu}, {cores}", DEVICE_WIDTH)
 
 
+WIDE = 120
 _TITLES = {
-    "object_mae_mm": "Object MAE",
-    "object_rmse_mm": "Object RMSE",
-    "overall_mae_mm": "Overall MAE",
-    "background_mae_mm": "Backgr. MAE",
-    "object_interior_mae_mm": "Interior MAE",
-    "object_edge_mae_mm": "Edge MAE",
-    "object_missing_share": "Missing",
+    "object_mae_mm": ("Object MAE", 0),
+    "object_rmse_mm": ("Object RMSE", 0),
+    "overall_mae_mm": ("Overall MAE", 0),
+    "background_mae_mm": ("Backgr. MAE", WIDE),
+    "object_interior_mae_mm": ("Interior MAE", WIDE),
+    "object_edge_mae_mm": ("Edge MAE", WIDE),
+    "object_missing_share": ("Missing", WIDE),
 }
 _ALWAYS_SORTABLE = ("seconds_per_sample", "frames_used")
 
@@ -59,13 +61,17 @@ def columns(sort: str) -> list[Column]:
     shown = list(_TITLES)
     if sort not in shown and sort not in _ALWAYS_SORTABLE:
         shown.insert(0, sort)
+    titled = {key: _TITLES.get(key, (key.removesuffix("_mm").replace("_", " "), 0)) for key in shown}
     return [
         Column("#", lambda row: str(row.rank)),
         Column("Method", lambda row: printable(row.entry.name, NAME_WIDTH), right=False),
-        *(Column(_TITLES.get(key, key.removesuffix("_mm").replace("_", " ")), _metric(key)) for key in shown),
+        *(
+            Column(title, _metric(key), from_width=0 if key == sort else from_width)
+            for key, (title, from_width) in titled.items()
+        ),
         Column("s/sample", _time),
         Column("Frames", lambda row: str(len(row.entry.result.submission.frames_used))),
-        Column("Timed on", lambda row: device(row.entry), right=False),
+        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDE + 12),
     ]
 
 

@@ -38,7 +38,7 @@ class Entry:
 
 @dataclass(frozen=True, order=True)
 class GroupKey:
-    """What two results must share to be compared. ``fingerprint`` stands for the dataset, whatever its folder's name."""
+    """What two results must share to be compared. ``fingerprint`` stands for the dataset, not its folder's name."""
 
     track: str
     split: str
@@ -84,7 +84,7 @@ def discover(here: Path) -> list[Path]:
 
 
 def expand(paths: Iterable[Path]) -> list[Path]:
-    """Files as given, folders as the ``*.json`` in them by name. SubmissionError for an empty folder or a file named twice."""
+    """Files as given, folders as the ``*.json`` in them. SubmissionError for an empty folder or a file given twice."""
     files: list[Path] = []
     for path in paths:
         found = sorted(path.glob("*.json")) if path.is_dir() else [path]

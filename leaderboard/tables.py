@@ -1,6 +1,7 @@
 """The leaderboard in the terminal."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 from rich.table import Table
 from rich.text import Text
@@ -18,20 +19,28 @@ Without arguments, result*.json and results/*.json of the current folder are rea
 """
 
 
-def group_tables(groups: Sequence[Group], sort: str) -> list[Table | Text]:
-    """One table a group, or what to do when there is none. Submitted text goes in as `Text`: it is never markup."""
+def group_tables(groups: Sequence[Group], sort: str, width: int) -> list[Table | Text]:
+    """One table a group for ``width`` characters, or what to do when there is no group.
+
+    Submitted text goes in as `Text`: it is never markup.
+    """
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
+    every = columns(sort)
+    shown = [column for column in every if column.from_width <= width]
     for group in groups:
         table = Table(title=Text(group.title), title_justify="left")
-        shown = columns(sort)
         for column in shown:
-            table.add_column(column.title, justify="right" if column.right else "left", overflow="fold")
+            # Titles in two lines leave the width to the names.
+            justify: Literal["right", "left"] = "right" if column.right else "left"
+            table.add_column(column.title.replace(" ", "\n", 1), justify=justify, overflow="fold", no_wrap=column.right)
         for row in group.rows:
             table.add_row(*(Text(column.text(row)) for column in shown))
         parts += [table, Text("")]
-    return [*parts[:-1], Text(NOTE + "\n")]
+    left_out = [column.title for column in every if column not in shown]
+    hint = f" In a wider terminal, --markdown and --json: {', '.join(left_out)}." if left_out else ""
+    return [*parts[:-1], Text(NOTE + hint + "\n")]
 
 
 def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:

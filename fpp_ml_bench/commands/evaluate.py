@@ -13,15 +13,18 @@ SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid,
 EXAMPLES = (
     "fpp-eval predictions --dataset data/mini --split test --json result.json",
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact",
-    "The folder holds submission.yaml and one {sample}.npy per sample of the split, float (H, W) depth in mm, 0 where",
-    "there is no object; nothing else. Whatever is wrong is listed file by file, the exit status is 2, and no JSON is",
-    "written. The rules are in evaluation/PROTOCOL.md.",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of predictions")
+    parser.add_argument(
+        "folder",
+        type=Path,
+        metavar="DIR",
+        help="folder of submission.yaml and one {sample}.npy per sample, float (H, W) depth in mm, 0 = background; "
+        "whatever is wrong with it is listed file by file, and no JSON is written",
+    )
     parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
     parser.add_argument(
         "--split",

@@ -30,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the ranking as JSON too")
     parser.add_argument(
         "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
-        help=f"tables the paper reports: {', '.join(_TABLES)} (default: architecture, normalization; --paper alone: all)",
+        help=f"tables the paper reports: {', '.join(_TABLES)} (default: architecture, normalization; alone: all)",
     )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the tables and write what was asked for. Raises SubmissionError naming a file that is no sound result."""
-    from fpp_ml_bench.evaluation.console import show
+    from fpp_ml_bench.evaluation.console import output_width, show
     from fpp_ml_bench.leaderboard.export import markdown, table_json
     from fpp_ml_bench.leaderboard.paper import chosen_tables
     from fpp_ml_bench.leaderboard.ranking import discover, expand, rank, read_entries
@@ -53,5 +53,5 @@ def run(args: argparse.Namespace) -> int:
             write_atomically(path, text(groups, papers, args.sort).encode("utf-8"))
         except OSError as error:
             raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
-    show(*group_tables(groups, args.sort), *paper_rich_tables(papers))
+    show(*group_tables(groups, args.sort, output_width()), *paper_rich_tables(papers))
     return 0
