@@ -251,4 +251,4 @@ def test_numbers_stay_whole_in_narrow_terminals(width, make, capsys, monkeypatch
     out = board(capsys, path, "--sort", "object_edge_mae_mm", "--paper", "none")
     assert all(len(line) <= width for line in out.splitlines())
     assert out.count("1234.500") == (7 - 1 if width >= 120 else 4)
-    assert ("In a wider terminal" in " ".join(out.split())) == (width < 120)
+    assert ("In a wider terminal" in " ".join(out.split())) == (width < 132)
