@@ -2,7 +2,7 @@
 
 ``object_mesh(name)`` is all there is to call. Every builder draws its object in millimetres at its real size, in a pose
 that shows it to the camera of the first view; the table below says which builder, and how much larger than life the
-object stands in the scene. The paper (Section 3.2) enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all;
+object stands in the scene. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all;
 ours follow that and depart from it where the paper's image statistics need it: every view covers 3 to 40% of the image
 and a tenth on average, half the views span less than about 80 mm in depth, and nothing leaves 1.5 to 2.1 m.
 Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
@@ -37,7 +37,7 @@ SLIVER_MM = 1e-2  # edges shorter than this are collapsed: booleans leave sliver
 
 # name: (builder, times real size)
 BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
-    "master_chef_can": (cans.master_chef_can, 1.38),
+    "master_chef_can": (cans.master_chef_can, 1.32),
     "cracker_box": (boxes.cracker_box, 1.75),
     "sugar_box": (boxes.sugar_box, 2.1),
     "tomato_soup_can": (cans.tomato_soup_can, 2.25),
@@ -45,13 +45,13 @@ BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
     "tuna_fish_can": (cans.tuna_fish_can, 3.0),
     "pudding_box": (boxes.pudding_box, 2.7),
     "gelatin_box": (boxes.gelatin_box, 3.3),
-    "potted_meat_can": (cans.potted_meat_can, 2.8),
+    "potted_meat_can": (cans.potted_meat_can, 2.65),
     "banana": (vessels.banana, 3.0),
     "pitcher": (vessels.pitcher, 1.85),
     "bleach_cleanser": (bottles.bleach_cleanser, 1.35),
     "bowl": (vessels.bowl, 2.6),
     "mug": (vessels.mug, 3.2),
-    "power_drill": (power_tools.power_drill, 1.75),
+    "power_drill": (power_tools.power_drill, 1.72),
     "wood_block": (boxes.wood_block, 2.1),
     "scissors": (hand_tools.scissors, 2.6),
     "marker": (small_things.marker, 4.0),
@@ -62,27 +62,27 @@ BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
     "cleaning_bucket": (vessels.cleaning_bucket, 1.5),
     "container_bottle": (bottles.container_bottle, 1.8),
     "container_tin": (cans.container_tin, 1.32),
-    "vial": (bottles.vial, 5.0),
-    "lighting_candles": (vessels.lighting_candles, 1.85),
+    "vial": (bottles.vial, 4.6),
+    "lighting_candles": (vessels.lighting_candles, 1.75),
     "magazine_stack": (boxes.magazine_stack, 1.27),
     "wooden_boards": (boxes.wooden_boards, 1.0),
-    "paint_container_bottle": (paint.paint_container_bottle, 3.1),
-    "paint_container_jar": (paint.paint_container_jar, 1.75),
-    "paint_container_spraycan": (paint.paint_container_spraycan, 2.1),
+    "paint_container_bottle": (paint.paint_container_bottle, 3.0),
+    "paint_container_jar": (paint.paint_container_jar, 1.68),
+    "paint_container_spraycan": (paint.paint_container_spraycan, 2.05),
     "paint_container_tube_small": (paint.paint_container_tube_small, 4.35),
     "paint_container_tube": (paint.paint_container_tube, 2.88),
     "paint_container_tube_large": (paint.paint_container_tube_large, 1.78),
-    "paint_brush": (hand_tools.paint_brush, 2.4),
+    "paint_brush": (hand_tools.paint_brush, 2.35),
     "paint_brush_large": (hand_tools.paint_brush_large, 2.1),
     "pallet_knife": (hand_tools.pallet_knife, 2.15),
-    "pallet_knife_large": (hand_tools.pallet_knife_large, 2.0),
-    "spraygun": (power_tools.spraygun, 1.5),
+    "pallet_knife_large": (hand_tools.pallet_knife_large, 1.95),
+    "spraygun": (power_tools.spraygun, 1.45),
     "paint_thinner": (paint.paint_thinner, 1.7),
-    "battery": (small_things.battery, 5.0),
-    "battery_case": (small_things.battery_case, 4.3),
-    "chalk_stick": (small_things.chalk_stick, 5.0),
+    "battery": (small_things.battery, 4.9),
+    "battery_case": (small_things.battery_case, 4.2),
+    "chalk_stick": (small_things.chalk_stick, 4.9),
     "pen": (small_things.pen, 4.2),
-    "cork": (bottles.cork, 4.6),
+    "cork": (bottles.cork, 4.5),
     "clamp": (hand_tools.clamp, 2.0),
     "boxcutter": (hand_tools.boxcutter, 2.5),
     "hammer": (hand_tools.hammer, 1.8),

@@ -87,7 +87,7 @@ def wood_block() -> Solid:
     ends = [solid.translate((6, -4, s * 100)) for solid in grain for s in (-1, 1)]
     knot = rod((-39, -12, 30), (-46, -12, 30), 9)
     chipped = place(block(20, 20, 40), (-42, 42, 96), (0, 30, 45))
-    return place(cut(body, *cracks, *sides, *ends, knot, chipped), turn=(0, -1, 3))
+    return place(cut(body, *cracks, *sides, *ends, knot, chipped), turn=(0, -0.4, 2))
 
 
 def open_book() -> Solid:

@@ -47,9 +47,9 @@ def power_drill() -> Solid:
     grip_outline = polygon(side, 4)
     grip = union(plate(grip_outline, 30), plate(grip_outline.offset(-4), 40))
     trigger = union(plate(polygon([(4, 50), (-8, 44), (-8, 32), (0, 20), (12, 16), (10, 50)], 2), 16))
-    shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 34, 0)
-    battery = block(104, 42, 38, 6, (30, -81, 0))
-    latch = union(block(14, 12, 42, 3, (-4, -78, 0)), block(108, 3, 40, 1, (30, -70, 0)))
+    shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 34)
+    battery = block(104, 42, 36, 6, (30, -81, 0))
+    latch = union(block(14, 12, 40, 3, (-4, -78, 0)), block(108, 3, 38, 1, (30, -70, 0)))
     vents = [block(5, 26, 80, 2, (x, 84, 0)) for x in (22, 31, 40, 49)]
     cap = place(lathe([(27, 0), (27, 6), (20, 12)], 1.5), (60, 78, 0), (0, 90, 0))
     body = cut(union(housing, cap, grip), *(v - block(200, 200, 56, 0, (0, 84, 0)) for v in vents))
