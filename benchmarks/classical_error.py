@@ -113,18 +113,16 @@ def main() -> int:
     steps = [n for n in STEPS if n <= opened.sequence.steps]
     points = [measure(opened, args.split, direction, n) for direction in COLOURS for n in steps]
     height, width = opened.size
-    print(
-        f"{args.dataset} {opened.fingerprint[:8]}, {args.split}, {len(opened.samples(args.split))} samples, {height}x{width}\n"
-    )
-    print(
-        "| fringes | N | frames | interior MAE mm | x sqrt(N) | with edge pixels | not measured | background MAE | ms |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+    about = f"{args.split}, {len(opened.samples(args.split))} samples of {height}x{width} px"
+    print(f"{args.dataset} {opened.fingerprint[:8]}, {about}\n")
+    columns = ("fringes", "N", "frames", "interior MAE mm", "x sqrt(N)", "with edge pixels", "not measured",
+               "background MAE mm", "ms")  # fmt: skip
+    print(f"| {' | '.join(columns)} |")
+    print("|---" * len(columns) + "|")
     for p in points:
-        print(
-            f"| {p.direction} | {p.steps} | {p.frames} | {p.interior_mae_mm:.3f} | {p.interior_mae_mm * p.steps**0.5:.3f} "
-            f"| {p.measured_mae_mm:.3f} | {100 * p.missing_share:.4f}% | {p.background_mae_mm:.3f} | {1000 * p.seconds:.0f} |"
-        )
+        errors = f"{p.interior_mae_mm:.3f} | {p.interior_mae_mm * p.steps**0.5:.3f} | {p.measured_mae_mm:.3f}"
+        rest = f"{100 * p.missing_share:.4f}% | {p.background_mae_mm:.3f} | {1000 * p.seconds:.0f}"
+        print(f"| {p.direction} | {p.steps} | {p.frames} | {errors} | {rest} |")
     draw(points, args.out)
     print(f"\n{args.out}")
     return 0
