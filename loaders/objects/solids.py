@@ -8,12 +8,13 @@ viewer sees them, z towards the viewer, and :func:`facing` stands them up. Sourc
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, OpType
 
-Solid = Manifold
-Section = CrossSection
+Solid: TypeAlias = Manifold
+Section: TypeAlias = CrossSection
 Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]
 
