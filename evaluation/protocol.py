@@ -27,8 +27,10 @@ BESIDE = (
     "object_edge_mae_mm",
     "object_edge_rmse_mm",
     "object_valid_mae_mm",
+    "object_interior_valid_mae_mm",
     "object_edge_share",
     "object_missing_share",
+    "object_interior_missing_share",
 )
 """Reported beside the headline: the object away from and along depth edges, and what was not measured at all."""
 

@@ -41,8 +41,10 @@ class Metrics(Headline):
     object_edge_mae_mm: NonNegative | None
     object_edge_rmse_mm: NonNegative | None
     object_valid_mae_mm: NonNegative | None
+    object_interior_valid_mae_mm: NonNegative | None
     object_edge_share: Share | None
     object_missing_share: Share | None
+    object_interior_missing_share: Share | None
 
 
 class SampleResult(Metrics):

@@ -51,17 +51,26 @@ def combine(*parts: ErrorStats) -> ErrorStats:
 
 @dataclass(frozen=True, slots=True)
 class SampleScores:
-    """Scores of one sample on its disjoint pixel sets; ``object`` is ``interior`` and ``edge`` together.
+    """Scores of one sample; ``object`` is ``interior`` and ``edge`` together.
 
-    ``valid`` covers the object pixels that were measured (predicted above 0 mm), ``missing`` counts the others.
+    ``interior_valid`` and ``edge_valid`` are those pixels of the two that were measured (predicted above 0 mm).
     """
 
     object: ErrorStats
     background: ErrorStats
     interior: ErrorStats
     edge: ErrorStats
-    valid: ErrorStats
-    missing: int
+    interior_valid: ErrorStats
+    edge_valid: ErrorStats
+
+    @property
+    def valid(self) -> ErrorStats:
+        return combine(self.interior_valid, self.edge_valid)
+
+    @property
+    def missing(self) -> int:
+        """Object pixels that were not measured."""
+        return self.object.pixels - self.valid.pixels
 
     @property
     def overall(self) -> ErrorStats:
@@ -69,7 +78,7 @@ class SampleScores:
 
     def metrics(self) -> dict[str, float | None]:
         """The keys of ``protocol.METRICS``; None where the sample has no pixel to say anything about."""
-        overall, pixels = self.overall, self.object.pixels
+        overall, valid, inside, pixels = self.overall, self.valid, self.interior, self.object.pixels
         return {
             "overall_mae_mm": overall.mae_mm,
             "overall_rmse_mm": overall.rmse_mm,
@@ -81,10 +90,16 @@ class SampleScores:
             "object_interior_rmse_mm": self.interior.rmse_mm,
             "object_edge_mae_mm": self.edge.mae_mm,
             "object_edge_rmse_mm": self.edge.rmse_mm,
-            "object_valid_mae_mm": self.valid.mae_mm,
-            "object_edge_share": self.edge.pixels / pixels if pixels else None,
-            "object_missing_share": self.missing / pixels if pixels else None,
+            "object_valid_mae_mm": valid.mae_mm,
+            "object_interior_valid_mae_mm": self.interior_valid.mae_mm,
+            "object_edge_share": _share(self.edge.pixels, pixels),
+            "object_missing_share": _share(pixels - valid.pixels, pixels),
+            "object_interior_missing_share": _share(inside.pixels - self.interior_valid.pixels, inside.pixels),
         }
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
 
 
 @np.errstate(over="ignore")  # an overflow is no warning here: _finish refuses it
@@ -120,16 +135,19 @@ def score_sample(
         raise PredictionError(_NOT_FINITE)
     missing = measured <= 0
     near = object_near_edge(target_mm, edge_band_px).ravel().take(index)
-    interior, edge = _stats(errors[~near]), _stats(errors[near])
-    misses = int(np.count_nonzero(missing))
-    inside = combine(interior, edge)
+    if missing.any():
+        interior_valid, edge_valid = _stats(errors[~(near | missing)]), _stats(errors[near & ~missing])
+        interior = combine(interior_valid, _stats(errors[missing & ~near]))
+        edge = combine(edge_valid, _stats(errors[missing & near]))
+    else:
+        interior, edge = interior_valid, edge_valid = _stats(errors[~near]), _stats(errors[near])
     return SampleScores(
-        object=inside,
+        object=combine(interior, edge),
         background=_background_stats(prediction, target, index),
         interior=interior,
         edge=edge,
-        valid=_stats(errors[~missing]) if misses else inside,
-        missing=misses,
+        interior_valid=interior_valid,
+        edge_valid=edge_valid,
     )
 
 

@@ -62,8 +62,11 @@ def _scores(result: Result) -> Table:
 def _notes(result: Result) -> Text:
     scores = result.metrics
     lines = [
-        f"Object pixels near a depth edge: {percent(scores.object_edge_share)}; not measured: "
-        f"{percent(scores.object_missing_share)}; MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm."
+        f"Object pixels near a depth edge: {percent(scores.object_edge_share)}.",
+        f"Object pixels not measured: {percent(scores.object_missing_share)} "
+        f"({percent(scores.object_interior_missing_share)} of those away from edges), scored with their whole depth. "
+        f"MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm, away from edges "
+        f"{millimetres(scores.object_interior_valid_mae_mm)} mm.",
     ]
     if result.samples_without_object:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")

@@ -130,6 +130,22 @@ def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
     assert s.metrics()["object_missing_share"] == 0.3
     assert s.valid == ErrorStats(14, 1.0, 1.0)
     assert s.object.mae_mm == pytest.approx((5 * 1800 + 1803 + 14) / 20, rel=1e-15)
+    assert s.object.rmse_mm == pytest.approx(math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15)
+
+
+def test_missing_pixels_are_told_apart_by_the_edge_band():
+    target = disk_depth((80, 80), 7)
+    near, inside = object_near_edge(target, 3), target > 0
+    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * inside
+    gone = np.random.default_rng(0).random(target.shape) < 0.2
+    prediction[gone & inside] = 0.0
+    s = score_sample(prediction, target)
+    assert (s.interior_valid.mae_mm, s.edge_valid.mae_mm) == (0.25, 5.0)
+    found = s.metrics()
+    assert found["object_interior_valid_mae_mm"] == 0.25
+    assert found["object_missing_share"] == (gone & inside).sum() / inside.sum()
+    assert found["object_interior_missing_share"] == (gone & inside & ~near).sum() / (inside & ~near).sum()
+    assert_agrees(prediction, target)
 
 
 def test_empty_sets_have_no_score():
