@@ -24,13 +24,12 @@ from fpp_ml_bench.loaders.manifest import (
     MANIFEST,
     Manifest,
     ShardFile,
-    dataset_files,
     describe_file,
     file_hash,
-    read_manifest,
     write_atomically,
 )  # fmt: skip
 from fpp_ml_bench.loaders.shards import ShardPlan
+from fpp_ml_bench.loaders.store import DatasetFolder
 
 SETTINGS = "settings.json"
 Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
@@ -49,6 +48,14 @@ class Assembly:
     work: Work
     manifest: Manifest
     bytes_per_row: int
+    mesh_folder: str | None = None
+    """Where the work leaves a PLY of each object, below the dataset folder."""
+
+    def mesh_paths(self, rows: list[dict[str, Any]]) -> list[str]:
+        """Mesh files of the objects that ``rows`` show, relative to the dataset folder."""
+        if self.mesh_folder is None:
+            return []
+        return [f"{self.mesh_folder}/{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
 
     def key(self) -> dict[str, Any]:
         """What must be equal for a resumed run to go on with this folder's work."""
@@ -59,14 +66,34 @@ class Assembly:
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset; ``progress`` is told of finished rows. Returns the manifest at the end."""
+    """Write or finish the dataset. Returns the manifest at the end.
+
+    ``progress`` is told of finished rows: first of those that an interrupted run left, then of each that is made. It is
+    not called at all when the dataset stands already.
+
+    Raises `BuildError` when the folder is in use, holds something else, or can't be written.
+    """
+    try:
+        return _assemble(folder, assembly, workers, progress)
+    except OSError as error:
+        raise BuildError(
+            f"{folder}: the work can't go on ({error}); put that right (a full disk: free some space), then run the "
+            "same command again: it resumes"
+        ) from error
+
+
+def _assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
     with writing(folder) as scratch:
         if (folder / MANIFEST).exists():
             return _already_there(folder, assembly)
         _same_settings(folder, scratch, assembly)
-        for leftover in scratch.glob("*.tmp"):
+        for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
             leftover.unlink()
-        receipts = {plan.name: receipt for plan in assembly.plans if (receipt := _receipt(folder, scratch, plan))}
+        receipts = {}
+        for plan in assembly.plans:
+            receipt = _receipt(folder, scratch, plan)
+            if receipt and all((folder / name).is_file() for name in assembly.mesh_paths(receipt[1])):
+                receipts[plan.name] = receipt
         missing = [plan for plan in assembly.plans if plan.name not in receipts]
         progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
         _enough_space(folder, assembly, missing)
@@ -77,20 +104,22 @@ def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress 
 
 
 def _already_there(folder: Path, assembly: Assembly) -> Manifest:
-    standing = read_manifest(folder)
+    standing = DatasetFolder(folder).manifest  # every file is there, in full length
     _compare(folder, {key: asdict(standing)[key] for key in assembly.key()}, assembly.key())
     return standing
 
 
 def _same_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
     path = scratch / SETTINGS
+    # Another version may make other bytes: a finished dataset of its own is none the worse, half of one is.
+    asked = {**assembly.key(), "generator": assembly.manifest.generator}
     if path.exists():
         try:
             begun = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise BuildError(f"{path}: damaged; delete {folder} and start again") from error
-        _compare(folder, begun, assembly.key())
-    write_atomically(path, json.dumps(assembly.key(), indent=1).encode())
+        _compare(folder, begun, asked)
+    write_atomically(path, json.dumps(asked, indent=1).encode())
 
 
 def _compare(folder: Path, theirs: dict[str, Any], ours: dict[str, Any]) -> None:
@@ -217,13 +246,9 @@ def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manife
         samples.setdefault(plan.split, []).extend(rows)
     shards = [file for files, _ in receipts for file in files]
     manifest = replace(assembly.manifest, samples=samples, shards=shards)
-    write_card(folder, manifest)
-    written = {shard.path for shard in shards} | {MANIFEST}
-    others = [
-        describe_file(folder, path)
-        for path in dataset_files(folder)
-        if path.relative_to(folder).as_posix() not in written
-    ]
-    manifest = replace(manifest, others=others)
+    rows = [row for part in samples.values() for row in part]
+    # Named one by one: a file that somebody else left here is foreign, and stays so to `fpp-bench verify`.
+    names = [*write_card(folder, manifest), *assembly.mesh_paths(rows)]
+    manifest = replace(manifest, others=[describe_file(folder, folder / name) for name in sorted(names)])
     manifest.write(folder)
     return manifest

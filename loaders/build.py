@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.constants import OBJECTS, SPLITS, VIEWS, sample_name, split_of
+from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.loaders.assemble import Assembly, Progress, Receipt, assemble
 from fpp_ml_bench.loaders.manifest import Manifest
 from fpp_ml_bench.loaders.meshes import solid_mesh, write_ply
@@ -54,12 +54,11 @@ def _studio_of(settings: BuildSettings) -> Studio:
 def plan_build(settings: BuildSettings) -> list[ShardPlan]:
     """Shards of a build: splits in order, objects in the benchmark's order, then the user's."""
     mine = {mesh.name: mesh.split for mesh in settings.user_meshes}
-    ordered = [name for name in (*OBJECTS, *mine) if name in settings.objects]
     plans = []
     for split in SPLITS:
         objects = {
             name: [(sample_name(name, view), name, view) for view in VIEWS]
-            for name in ordered
+            for name in settings.objects
             if mine.get(name, split_of(name)) == split
         }
         if objects:
@@ -84,7 +83,7 @@ def assembly_of(settings: BuildSettings) -> Assembly:
         shards=[],
     )
     # Two float32 depth maps and one byte a frame.
-    return Assembly(plan_build(settings), BuildShard(settings), manifest, pixels * (len(frames) + 8))
+    return Assembly(plan_build(settings), BuildShard(settings), manifest, pixels * (len(frames) + 8), MESH_FOLDER)
 
 
 def build(folder: Path, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None) -> Manifest:

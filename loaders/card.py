@@ -49,8 +49,8 @@ train = datasets.load_from_disk("THIS FOLDER")["train"]                      # i
 """
 
 
-def write_card(folder: Path, manifest: Manifest) -> None:
-    """Write card, rig and Hugging Face state files of a dataset whose shards stand."""
+def write_card(folder: Path, manifest: Manifest) -> list[str]:
+    """Write card, rig and Hugging Face state files of a dataset whose shards stand; their paths below ``folder``."""
     from fpp_ml_bench.rig_io import rig_from_dict, save_rig
 
     rig = rig_from_dict(manifest.rig)
@@ -90,6 +90,8 @@ def write_card(folder: Path, manifest: Manifest) -> None:
         package=__version__,
     )
     write_atomically(folder / "README.md", text.encode())
+    states = [f"{split}/{name}" for split in manifest.samples for name in ("state.json", "dataset_info.json")]
+    return ["README.md", "dataset_dict.json", RIG_FILE, *states]
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -34,8 +34,10 @@ def writing(folder: Path) -> Iterator[Path]:
             raise BuildError(
                 f"{folder}: another process is writing this folder; wait for it or choose another"
             ) from error
-        yield work
-        if (folder / MANIFEST).exists():
-            shutil.rmtree(work)
+        try:
+            yield work
+        finally:
+            if (folder / MANIFEST).exists():
+                shutil.rmtree(work, ignore_errors=True)
     finally:
         os.close(lock)

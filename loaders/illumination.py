@@ -69,7 +69,12 @@ class LitPixels:
             )
             for direction, mine in self.lookup.items()
         }
-        return LitPixels(lookup, patch(self.gain, other.gain), patch(self.ambient, other.ambient), other.shadow_rays)
+        return LitPixels(
+            lookup,
+            patch(self.gain, other.gain),
+            patch(self.ambient, other.ambient),
+            self.shadow_rays + other.shadow_rays,
+        )
 
 
 def projector_centre_m(rig: Rig) -> NDArray[np.float64]:

@@ -68,7 +68,7 @@ def write_ply(mesh: SolidMesh, path: Path) -> None:
 
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_bytes(trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
     temporary.replace(path)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import VIEWS, sample_name
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.frames import DIRECTIONS
 from fpp_ml_bench.loaders.schema import stored_frames
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.pixel_sets import object_mask
@@ -27,8 +28,9 @@ def sample_picture(opened: DatasetFolder, sample: str, path: Path) -> None:
 
     sequence = opened.sequence
     stored = set(stored_frames(sequence, opened.manifest.stored))
-    wished = [0, *sequence.sinusoids("vertical")[:1], sequence.gray("horizontal")[-3], sequence.gray("vertical")[-3],
-              sequence.white]  # fmt: skip
+    # The third finest Gray bit: its stripes are still told apart in a small picture.
+    codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
+    wished = [0, sequence.sinusoids("vertical")[0], *codes, sequence.white]
     panels: list[tuple[str, Callable[[Axes], None]]] = []
     for index in (i for i in wished if i in stored):
         panels.append((sequence.frames[index].title, _grey(opened.frame(sample, index))))

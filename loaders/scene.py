@@ -62,7 +62,7 @@ def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) 
 
     ``fixed`` puts the axis at the rig's standoff; ``varied`` draws the distance, seeded by (seed, object, view), over
     all that keeps the object within the working range and the image. Raises `MeshError` for an object that does not
-    fit, with the scale that would.
+    fit, with the scale at which it would in every view.
     """
     about_axis_m = turned(mesh.vertices_m, VIEW_DEGREES[VIEWS.index(view)])
     nearest_m, farthest_m = distance_bounds_m(about_axis_m, rig)
@@ -74,21 +74,35 @@ def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) 
         distance_m = nearest_m + (farthest_m - nearest_m) * uniform(seed, mesh.name, view, "distance")
         fits = nearest_m <= farthest_m
     if not fits:
-        raise MeshError(_misfit(mesh, view, rig, about_axis_m, rule))
+        raise MeshError(_misfit(mesh, view, rig, rule))
     return about_axis_m + np.array([0.0, 0.0, distance_m]), distance_m
 
 
-def _misfit(mesh: SolidMesh, view: str, rig: Rig, about_axis_m: NDArray[np.float64], rule: PlacementRule) -> str:
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        near, far = distance_bounds_m(about_axis_m * middle, rig)
-        fits = near <= (rig.standoff_m if rule == "fixed" else far) <= far
-        low, high = (middle, high) if fits else (low, middle)
+def _misfit(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule) -> str:
     size = " x ".join(f"{extent:.3f}" for extent in np.ptp(mesh.vertices_m, axis=0))
     near_mm, far_mm = rig.working_range_mm
     where = f"with its turning axis {rig.standoff_m} m from the camera" if rule == "fixed" else "at any distance"
+    scale = _largest_scale(mesh, rig, rule)
+    advice = f"scale it, offset included, by {scale:g} or less" if scale > 0 else "no scale makes it fit: move it"
     return (
         f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in "
-        f"view {view} {where}; scale it by {low:.3g} or less, or give a rig with a wider range"
+        f"view {view} {where}; {advice}, or give a rig with a wider range"
     )
+
+
+def _largest_scale(mesh: SolidMesh, rig: Rig, rule: PlacementRule) -> float:
+    """Factor up to 1 at which the mesh fits in every view, rounded down to three digits; 0 if none does."""
+    views = [turned(mesh.vertices_m, degrees) for degrees in VIEW_DEGREES]
+
+    def fits(scale: float) -> bool:
+        bounds = (distance_bounds_m(about_axis_m * scale, rig) for about_axis_m in views)
+        return all(near <= (rig.standoff_m if rule == "fixed" else far) <= far for near, far in bounds)
+
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    if low < 1e-6:  # not even a point fits there
+        return 0.0
+    digit = 10.0 ** (np.floor(np.log10(low)) - 2)
+    return float(np.floor(low / digit) * digit)

@@ -28,7 +28,11 @@ class UserMesh:
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """Everything that decides the bytes of a dataset."""
+    """Everything that decides the bytes of a dataset.
+
+    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's and then the users' by name, whatever order
+    they were given in: it is the order of the rows.
+    """
 
     rig: Rig
     objects: tuple[str, ...]
@@ -52,6 +56,10 @@ class BuildSettings:
         if len(set(self.objects)) != len(self.objects):
             twice = next(name for name in self.objects if self.objects.count(name) > 1)
             raise BuildError(f"object {twice!r} is named twice")
+        mine = sorted(self.user_meshes, key=lambda mesh: mesh.name)
+        order = (*OBJECTS, *(mesh.name for mesh in mine))
+        object.__setattr__(self, "user_meshes", tuple(mine))
+        object.__setattr__(self, "objects", tuple(sorted(self.objects, key=order.index)))
         if self.placement not in PLACEMENTS:
             raise BuildError(f"placement {self.placement!r}: expected {' or '.join(PLACEMENTS)}")
         if self.stored not in CONFIGS:

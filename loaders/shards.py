@@ -248,7 +248,12 @@ def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
 
 
 def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
-    """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for an empty map."""
+    """Least and greatest depth above 0 of a sample (paper Section 3.3), mm.
+
+    Raises `BuildError` for a map without any, or with a depth that is negative or not finite.
+    """
+    if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
+        raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
     inside = depth_mm[object_mask(depth_mm)]
     if inside.size == 0:
         raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm, so there is nothing to measure")

@@ -195,7 +195,14 @@ class DatasetFolder:
         """A column of one file as images: per record batch one read-only view (rows, H, W)."""
         key = shard.path, column
         if key not in self._images:
-            self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
+            try:
+                self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
+            except (ValueError, KeyError, AttributeError) as error:
+                height, width = self.size
+                raise DatasetError(
+                    f"{self.path / shard.path}: column {column} does not hold images of {height} x {width} px "
+                    f"({error}); run: fpp-bench verify"
+                ) from error
         return self._images[key]
 
     def _views(self, column: "pa.Array") -> NDArray:

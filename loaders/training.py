@@ -79,6 +79,8 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     def read(self, indices: Sequence[int], out: FringeDepth | None = None) -> FringeDepth:
         """Items ``indices`` as one batch, fringe and depth (B, 1, H, W); into ``out``, of the same B, if given."""
         batch = self.empty(len(indices)) if out is None else out
+        if len(batch.fringe) != len(indices):
+            raise ValueError(f"out holds {len(batch.fringe)} items, expected {len(indices)}, one for each index")
         fringes, depths = batch.fringe.numpy(), batch.depth.numpy()
         for place, index in enumerate(indices):
             row, frame = self.pair(index)

@@ -2,15 +2,27 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.manifest import MANIFEST, Manifest, ShardFile, dataset_files, file_hash, read_manifest
-from fpp_ml_bench.loaders.schema import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, group_columns, stored_groups
-from fpp_ml_bench.loaders.shards import depth_range_mm
+from fpp_ml_bench.loaders.schema import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    LABELS,
+    RANGE,
+    arrow_schema,
+    group_columns,
+    stored_groups,
+)  # fmt: skip
 from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.pixel_sets import object_mask
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,9 +50,12 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
             opened = opened or DatasetFolder.unchecked(folder, manifest)
-            findings += _shard_findings(opened, file, places)
+            try:
+                findings += _shard_findings(opened, file, places)
+            except DatasetError as error:  # no Arrow file, or images of another size
+                findings.append(str(error))
         progress(1)
-    return findings + split_findings(manifest) + duplicate_images(places)
+    return findings + coverage_findings(manifest) + split_findings(manifest) + duplicate_images(places)
 
 
 def foreign_files(folder: Path, manifest: Manifest) -> list[str]:
@@ -77,7 +92,8 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
         return [f"{path}: the manifest has no such rows or columns"]
     expected = group_columns(opened.sequence, shard.group, frames, manifest.exact)
     batches = opened.record_batches(shard)
-    if not batches or batches[0].schema.names != expected or sum(len(b) for b in batches) != shard.rows:
+    right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
+    if not right or sum(len(b) for b in batches) != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
     findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
     for column in expected:
@@ -85,12 +101,8 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
             continue
         images = (image for batch in opened.column_images(shard, column) for image in batch)
         for row, image in zip(rows, images, strict=True):
-            if column in (DEPTH, DEPTH_EXACT) and not (np.isfinite(image).all() and image.min() >= 0):
-                findings.append(
-                    f"{path}: sample {row['sample']!r}, column {column}: depths that are not finite or negative"
-                )
-            if column == DEPTH and depth_range_mm(image, row["sample"]) != (row["depth_min_mm"], row["depth_max_mm"]):
-                findings.append(f"{path}: sample {row['sample']!r}: depth_min and depth_max do not fit its depth")
+            if column in (DEPTH, DEPTH_EXACT):
+                findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
             if image.min() != image.max():  # a uniform image (black without noise) says nothing about what it shows
                 digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image))
                 places.setdefault(digest, []).append((shard.split, row["sample"], column))
@@ -98,13 +110,43 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
     return findings
 
 
+def _types(schema: "pa.Schema") -> "list[tuple[str, pa.DataType]]":
+    """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
+    return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
+
+
+def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray[np.float32]) -> list[str]:
+    if not (np.isfinite(image).all() and image.min() >= 0):
+        return [f"{where}: depths that are not finite or negative"]
+    inside = image[object_mask(image)]
+    if inside.size == 0:
+        return [f"{where}: no depth above 0, so there is nothing to measure"]
+    if column == DEPTH and (inside.min(), inside.max()) != (row["depth_min_mm"], row["depth_max_mm"]):
+        return [f"{where}: depth_min and depth_max do not fit its depth"]
+    return []
+
+
 def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: "list[pa.RecordBatch]") -> list[str]:
     findings = []
-    stored = [record for batch in batches for record in batch.select(LABELS).to_pylist()]
+    stored = [record for batch in batches for record in batch.select([*LABELS, *RANGE]).to_pylist()]
     for row, labels in zip(rows, stored, strict=True):
         expected = {"sample": row["sample"], "object": row["object"], "view": row["view"], "split": shard.split}
+        expected.update(zip(RANGE, (row["depth_min_mm"], row["depth_max_mm"]), strict=True))
         if labels != expected:
             findings.append(f"{path}: expected labels {expected}, found {labels}")
+    return findings
+
+
+def coverage_findings(manifest: Manifest) -> list[str]:
+    """Rows that no file holds, or more than one: every group's files must follow on from each other."""
+    findings = []
+    sequence = Sequence(**manifest.rig["sequence"])
+    for split, rows in manifest.samples.items():
+        for group in stored_groups(sequence, manifest.stored):
+            files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
+            held = [row for shard in files for row in range(shard.first_row, shard.first_row + shard.rows)]
+            if held != list(range(len(rows))):
+                findings.append(f"{split}, {group}: the files hold {len(held)} rows, expected each of {len(rows)} once")
     return findings
 
 

@@ -57,24 +57,22 @@ class Studio:
         hits = traced.primary(*rig.camera.rays())
         lit = lit_object(hits, rig, self.lighting, traced)
         stream = (settings.seed, mesh.name, view)
-        self._expose(hits, lit, traced, stream)
+        background = self._shadowed_background(traced) if self.lighting.shadows else self._background
+        whole = background.patched(hits.pixels, lit)
+        self._expose(hits, lit, whole, stream)
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
         seen = object_mask(exact_mm)
         depth_mm = decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         measured = {
             "distance_mm": distance_m * MM_PER_M,
-            "rays": hits.rays + lit.shadow_rays,
+            "rays": hits.rays + whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
         frames = {index: self._frames[index] for index in self._stored}
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 
-    def _expose(self, hits: Hits, lit: LitPixels, traced: TracedObject, stream: tuple[object, ...]) -> None:
-        background = self._background
-        if self.lighting.shadows:
-            background = self._shadowed_background(traced)
-        whole = background.patched(hits.pixels, lit)
+    def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
         pixels = hits.pixels.astype(np.uint32)
         for index in range(len(self._frames)):
             image = self._frames[index].reshape(-1)

@@ -98,7 +98,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"fpp-ml-bench {__version__}")
     parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
-    args, _ = parser.parse_known_args(words)
+    args, others = parser.parse_known_args(words)
+    if others and others[0] == words[0]:
+        print(f"fpp-bench: error: unknown option {words[0]!r} before a command; see fpp-bench --help", file=sys.stderr)
+        return BAD_INPUT
     if args.command is not None:
         from difflib import get_close_matches
 

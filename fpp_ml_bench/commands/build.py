@@ -100,24 +100,29 @@ def run(args: argparse.Namespace) -> int:
     assembly = assembly_of(settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
     frames = len(stored_frames(settings.rig.sequence, settings.stored))
+    steps: list[int] = []
     started = perf_counter()
     with progress_bar("building", rows, "images", frames) as advance:
-        manifest = build(args.out, settings, workers, advance)
+
+        def count(finished: int) -> None:
+            steps.append(finished)
+            advance(finished)
+
+        manifest = build(args.out, settings, workers, count)
     seconds = perf_counter() - started
-    _summary(args.out, manifest, rows * frames, seconds)
+    # The first step is what an interrupted run had left: it took no time now.
+    _summary(args.out, manifest, rows * frames, sum(steps[1:]) * frames, seconds)
     return 0
 
 
-def _summary(out: Path, manifest: "Manifest", images: int, seconds: float) -> None:
+def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: float) -> None:
     from fpp_ml_bench.commands.console import gigabytes
     from fpp_ml_bench.loaders.statistics import ground_truth_summary
 
     size = sum(file.bytes for file in (*manifest.shards, *manifest.others))
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
-    print(
-        f"{out}: {parts} samples, {images:,} images, {gigabytes(size)} in {seconds:.1f} s "
-        f"({images / seconds:,.0f} images/s)"
-    )
+    rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
+    print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)}; {rate}")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
     print(f"next: fpp-bench info {out}")

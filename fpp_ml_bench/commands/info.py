@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
             "settings": opened.manifest.settings,
             "rig": opened.manifest.rig,
             "splits": [asdict(split) for split in statistics],
+            "samples": opened.splits,
         }
         print(json.dumps(content, indent=1, allow_nan=False))
         return 0
