@@ -43,7 +43,7 @@ class ScoredDataset(Protocol):
     @property
     def has_exact(self) -> bool: ...
     def samples(self, split: str) -> list[str]: ...
-    def depth_mm(self, sample: str, column: str = ...) -> NDArray[np.float32]: ...
+    def target_mm(self, sample: str, column: str = ...) -> NDArray[np.float32]: ...
 
 
 def evaluate(
@@ -150,7 +150,7 @@ def _in_order(
     for path, sample in files:
         if not path.is_symlink() and not path.exists():
             continue  # listed as missing already
-        waiting.append(pool.submit(work, path, sample, dataset.depth_mm(sample, target)))
+        waiting.append(pool.submit(work, path, sample, dataset.target_mm(sample, target)))
         if len(waiting) > 2 * WORKERS:
             yield waiting.popleft().result()
     while waiting:

@@ -102,9 +102,6 @@ def value_problems(prediction: NDArray[np.floating[Any]], target_max_mm: float) 
         if not finite.size:
             return problems
         low, high = float(finite.min()), float(finite.max())
-    if low < 0 and protocol.REFUSE_NEGATIVE:
-        count = int(np.count_nonzero(prediction < 0))
-        problems.append(f"holds {count} negative values, down to {low:.6g} mm; clip depth at 0 before saving it")
     if max(high, -low) > protocol.LARGEST_MM:
         problems.append(
             f"holds values up to {max(high, -low):.3g} mm in magnitude; the limit is {protocol.LARGEST_MM:g}"

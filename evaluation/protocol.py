@@ -36,9 +36,6 @@ BESIDE = (
 
 METRICS = HEADLINE + BESIDE
 
-REFUSE_NEGATIVE = True
-"""A negative depth is no depth: predictions must be clipped at 0 by whoever made them, not by the evaluator."""
-
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""
 

@@ -1,5 +1,6 @@
 """Predictions and descriptions that must not be scored: through the real command, exit status 2, no JSON, named."""
 
+import json
 import os
 import re
 import struct
@@ -11,7 +12,6 @@ import pytest
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.commands.evaluate import main
-from fpp_ml_bench.evaluation import protocol
 
 SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"
@@ -111,7 +111,6 @@ FILES = {
     "infinities": (with_value(np.inf, 3), "holds 3 infinite of 1280 values"),
     "minus infinity": (with_value(-np.inf), "holds 1 infinite"),
     "all NaN": (with_value(np.nan, 1280), "holds 1280 NaN of 1280 values"),
-    "negative": (with_value(-0.5, 2), "holds 2 negative values, down to -0.5 mm; clip"),
     "absurd": (with_value(3e38), "the limit is 1e\\+30"),
     "metres": (rewrite(lambda d: d / 1000), "looks like metres"),
     "normalised": (rewrite(lambda d: d / d.max()), "looks like metres or normalised depth: its largest value is 1"),
@@ -173,13 +172,14 @@ def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions)
 def test_several_faults_of_one_file_are_all_named(capsys, tmp_path, dataset, predictions):
     rewrite(lambda d: np.where(np.arange(1280).reshape(32, 40) == 0, np.nan, d / 1000 - 1e-3))(predictions)
     error = refused(capsys, tmp_path, dataset, predictions)
-    assert f"{FILE}: holds 1 NaN" in error and "negative values" in error and "looks like metres" in error
+    assert f"{FILE}: holds 1 NaN" in error and "looks like metres" in error
 
 
-def test_negative_values_can_be_scored_by_one_switch(capsys, tmp_path, dataset, predictions, monkeypatch):
+def test_negative_values_are_errors_like_any_other(tmp_path, dataset, predictions):
     with_value(-1.0, 3)(predictions)
-    monkeypatch.setattr(protocol, "REFUSE_NEGATIVE", False)
-    assert main([str(predictions), "--dataset", str(dataset.path)]) == 0
+    written = tmp_path / "result.json"
+    assert main([str(predictions), "--dataset", str(dataset.path), "--json", str(written)]) == 0
+    assert json.loads(written.read_text())["metrics"]["overall_mae_mm"] > 0
 
 
 def test_file_names_cannot_speak_to_the_terminal(capsys, tmp_path, dataset, predictions):
