@@ -1,0 +1,184 @@
+"""MATLAB files with one real matrix: v5 (zlib-compressed or not) and v7.3 (HDF5, stored transposed).
+
+v5 is parsed here and not by ``scipy.io.loadmat``, which reads the same values but trusts a file's lengths: of damaged
+uncompressed files it ends the whole process on some (segmentation fault, SciPy 1.17). Every length is checked here
+before it is used. Writing goes through SciPy, whose ``loadmat`` therefore reads what is written.
+"""
+
+import io
+import math
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import LayoutError
+
+_HEADER_BYTES = 128
+_COMPRESSED, _MATRIX = 15, 14
+_FLAGS, _DIMENSIONS, _NAME = 6, 5, 1
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_COMPLEX = 0x0800
+_LARGEST_BYTES = 1 << 30
+_WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
+
+
+class _Damaged(Exception):
+    """The file's content contradicts itself; the message says how."""
+
+
+def read_matrix(path: Path, variable: str) -> NDArray:
+    """Variable ``variable`` of a v5 or v7.3 file as MATLAB shows it: a real numeric matrix (rows, columns), any dtype.
+
+    Raises `LayoutError` naming the file when it can't be read, holds no such variable (it names those it holds), or the
+    variable is not a real numeric matrix.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
+    try:
+        if content.startswith(b"MATLAB 7.3"):
+            return _read_hdf5(content, variable)
+        return _read_v5(content, variable)
+    except (_Damaged, zlib.error, struct.error) as error:
+        raise LayoutError(f"{path}: {error}") from error
+
+
+def read_scalar(path: Path, variable: str) -> float:
+    """A scalar that MATLAB stores as a 1 x 1 matrix. Raises `LayoutError` as `read_matrix`, or for another shape."""
+    matrix = read_matrix(path, variable)
+    if matrix.shape != (1, 1) or not np.isfinite(matrix).all():
+        raise LayoutError(f"{path}: {variable} must be one finite number, stored 1 x 1, got {_shape(matrix)}")
+    return float(matrix[0, 0])
+
+
+def matrix_bytes(values: Mapping[str, NDArray | float]) -> bytes:
+    """A compressed v5 file holding ``values``; equal values give equal bytes (the header carries no date)."""
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    savemat(buffer, {name: np.atleast_2d(value) for name, value in values.items()}, do_compression=True)
+    return _WRITTEN_BY.ljust(116) + buffer.getvalue()[116:]
+
+
+def _shape(array: NDArray) -> str:
+    return " x ".join(map(str, array.shape)) + f" {array.dtype}"
+
+
+@dataclass(frozen=True)
+class _Matrix:
+    name: str
+    kind: int
+    complex: bool
+    dimensions: tuple[int, ...]
+    order: str
+    body: memoryview
+
+    def real(self) -> NDArray:
+        if self.kind not in _CLASSES or self.complex:
+            raise _Damaged(f"{self.name}: expected a real numeric matrix, got MATLAB class {self.kind}"
+                           f"{', complex' if self.complex else ''}")  # fmt: skip
+        if len(self.dimensions) != 2:
+            raise _Damaged(f"{self.name}: expected a matrix (rows, columns), got shape {self.dimensions}")
+        kind, data, _ = _element(self.body, self.order)
+        if kind not in _STORED:
+            raise _Damaged(f"{self.name}: unknown data type {kind}; the file is damaged")
+        stored = np.dtype(self.order + _STORED[kind])
+        if len(data) != math.prod(self.dimensions) * stored.itemsize:
+            raise _Damaged(f"{self.name}: {len(data)} bytes do not make {self.dimensions}; the file is damaged")
+        # MATLAB keeps whole numbers in the smallest type that holds them; the class says what they are.
+        values = np.frombuffer(data, stored).reshape(self.dimensions, order="F")
+        return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[self.kind]))
+
+
+def _read_v5(content: bytes, variable: str) -> NDArray:
+    if len(content) < _HEADER_BYTES:
+        raise _Damaged(f"expected a MATLAB v5 or v7.3 file, got {len(content)} bytes; the file is cut off")
+    mark = content[126:128]
+    order = {b"IM": "<", b"MI": ">"}.get(mark)
+    if order is None or struct.unpack(order + "H", content[124:126])[0] != 0x0100:
+        raise _Damaged("expected a MATLAB v5 or v7.3 file; this is neither")
+    names = []
+    for matrix in _matrices(memoryview(content)[_HEADER_BYTES:], order):
+        if matrix.name == variable:
+            return matrix.real()
+        names.append(matrix.name or "(unnamed)")
+    raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
+
+
+def _matrices(content: memoryview, order: str) -> Iterator[_Matrix]:
+    while len(content):
+        kind, data, content = _element(content, order, padded=False)
+        if kind == _COMPRESSED:
+            kind, data, rest = _element(memoryview(_decompressed(data)), order)
+            if len(rest):
+                raise _Damaged("a compressed variable holds more than its matrix; the file is damaged")
+        if kind != _MATRIX:
+            raise _Damaged(f"expected a matrix, got element type {kind}; the file is damaged")
+        yield _matrix(data, order)
+
+
+def _decompressed(data: memoryview) -> bytes:
+    unpacker = zlib.decompressobj()
+    content = unpacker.decompress(data, _LARGEST_BYTES)
+    if not unpacker.eof:
+        raise _Damaged("a compressed variable is cut off or too large; the file is damaged")
+    return content
+
+
+def _matrix(data: memoryview, order: str) -> _Matrix:
+    found = []
+    for expected in (_FLAGS, _DIMENSIONS, _NAME):
+        kind, part, data = _element(data, order)
+        if kind != expected:
+            raise _Damaged(f"a matrix header has element type {kind} for {expected}; the file is damaged")
+        found.append(part)
+    flags, dimensions, name = found
+    if len(flags) != 8 or len(dimensions) % 4:
+        raise _Damaged("a matrix header has a wrong length; the file is damaged")
+    word = struct.unpack(order + "II", flags)[0]
+    shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+    if any(length < 0 for length in shape):
+        raise _Damaged(f"a matrix has the shape {shape}; the file is damaged")
+    return _Matrix(bytes(name).decode("latin-1"), word & 0xFF, bool(word & _COMPLEX), shape, order, data)
+
+
+def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int, memoryview, memoryview]:
+    """First data element: its type, its bytes, and what follows it. Elements inside a matrix are padded to 8 bytes."""
+    if len(content) < 8:
+        raise _Damaged("a data element is cut off; the file is damaged")
+    kind, length = struct.unpack(order + "II", content[:8])
+    if kind >> 16:  # up to four bytes, packed into the tag itself
+        kind, length = kind & 0xFFFF, kind >> 16
+        if length > 4:
+            raise _Damaged("a small data element is too long; the file is damaged")
+        return kind, content[4 : 4 + length], content[8:]
+    if length > len(content) - 8:
+        raise _Damaged(f"a data element of {length} bytes has only {len(content) - 8}; the file is cut off or damaged")
+    stop = 8 + (length + 7 & ~7 if padded else length)
+    return kind, content[8 : 8 + length], content[stop:]
+
+
+def _read_hdf5(content: bytes, variable: str) -> NDArray:
+    import h5py
+
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            if variable not in file:
+                names = [name for name in file if not name.startswith("#")]
+                raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
+            found = file[variable]
+            if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "iuf" or found.ndim != 2:
+                raise _Damaged(f"{variable}: expected a real numeric matrix (rows, columns)")
+            if found.size * found.dtype.itemsize > _LARGEST_BYTES:
+                raise _Damaged(f"{variable}: {found.shape} is too large for a depth map")
+            # MATLAB is column-major, HDF5 row-major: the file holds the transpose.
+            return np.ascontiguousarray(np.asarray(found).T)
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError) as error:
+        raise _Damaged(f"can't be read as MATLAB v7.3 (HDF5): {error}") from error
