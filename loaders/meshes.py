@@ -1,6 +1,9 @@
 """Meshes by name: the 50 procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
 
+import io
+import logging
 import math
+import struct
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,19 +40,12 @@ def _solid(name: str, mesh: "trimesh.Trimesh") -> SolidMesh:
 def load_user_mesh(description: UserMesh) -> SolidMesh:
     """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted.
 
-    Raises `MeshError` for a file that can't be read as a mesh, has no triangles or has vertices that are not finite.
+    Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or
+    triangles between vertices that are not there.
     """
     import trimesh
 
-    path = Path(description.path)
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (OSError, ValueError, TypeError, KeyError, IndexError, NotImplementedError, AttributeError) as error:
-        raise MeshError(f"{path}: can't be read as a mesh ({error}); expected {', '.join(MESH_SUFFIXES)}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise MeshError(f"{path}: holds no triangles; export it as a triangle mesh")
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{path}: has vertices that are not finite numbers; repair the mesh")
+    mesh = _read_mesh(Path(description.path))
     vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
         angle = math.radians(degrees)
@@ -60,6 +56,37 @@ def load_user_mesh(description: UserMesh) -> SolidMesh:
     return SolidMesh(
         description.name, vertices_m + np.asarray(description.offset_m), np.asarray(mesh.faces, dtype=np.int32)
     )
+
+
+# What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8
+# sends it looking for a package that guesses encodings).
+_READER_ERRORS = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, NameError, OSError,
+    RuntimeError, TypeError, ValueError, struct.error,
+)  # fmt: skip
+
+
+def _read_mesh(path: Path) -> "trimesh.Trimesh":
+    import trimesh
+
+    # Its log would put a traceback of its own on the screen; what matters of it is in our message.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        content = path.read_bytes()
+        if kind == "obj":  # its comments may be in any encoding, and its numbers are ASCII
+            content = content.decode("utf-8", errors="replace").encode()
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh", process=False)
+    except _READER_ERRORS as error:
+        reason = "damaged, or of another format" if isinstance(error, ImportError | NameError) else error
+        raise MeshError(f"{path}: can't be read as a mesh ({reason}); expected {', '.join(MESH_SUFFIXES)}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or np.shape(mesh.vertices)[1:] != (3,):
+        raise MeshError(f"{path}: holds no triangles; export it as a triangle mesh")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError(f"{path}: has vertices that are not finite numbers; repair the mesh")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise MeshError(f"{path}: has triangles between vertices that are not there; it is damaged, export it again")
+    return mesh
 
 
 def write_ply(mesh: SolidMesh, path: Path) -> None:

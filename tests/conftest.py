@@ -1,0 +1,51 @@
+"""What several test files share: Hugging Face caches out of the way, and one tiny real dataset, built once."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+
+# Before anything imports `datasets`: its caches belong to this run, and it must not look for a network.
+_CACHE = tempfile.TemporaryDirectory(prefix="fpp-bench-tests-")
+os.environ["HF_HOME"] = _CACHE.name
+os.environ["HF_DATASETS_CACHE"] = str(Path(_CACHE.name) / "datasets")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ["HF_HUB_DISABLE_TELEMETRY"] = "1"
+
+TINY_SIZE = 176
+"""The smallest size at pitch 18 is about 170 px."""
+TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
+"""Two objects of one split, so that a shard holds more than one; and one of each other split."""
+
+
+def tiny_settings(**changes):
+    """Settings of the tiny dataset, or of one that differs from it in ``changes``."""
+    from fpp_ml_bench.loaders.settings import BuildSettings
+    from fpp_ml_bench.rig import paper_rig
+
+    return BuildSettings(**{"rig": paper_rig(TINY_SIZE), "objects": TINY_OBJECTS, **changes})
+
+
+def file_bytes(folder):
+    """Every file below a folder by its relative path."""
+    folder = Path(folder)
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """Folder of the tiny dataset, all 52 frames, on one process. Shared by all tests: copy it before changing it."""
+    from fpp_ml_bench.loaders.build import build
+
+    folder = tmp_path_factory.mktemp("tiny") / "dataset"
+    build(folder, tiny_settings(), workers=1)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def opened(tiny):
+    """The tiny dataset, opened for reading."""
+    from fpp_ml_bench.loaders.store import DatasetFolder
+
+    return DatasetFolder(tiny)
