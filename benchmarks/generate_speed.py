@@ -72,6 +72,7 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     rays = rig.camera.rays()
     hits = traced.primary(*rays)
     lit = lit_object(hits, rig, studio.lighting, traced)
+    whole = studio._background.patched(hits.pixels, lit)
     row = studio.photograph(mesh, "A60")
     frames = [row.frames[i] for i in range(len(rig.sequence))]
     assert row.depth_exact_mm is not None
@@ -82,7 +83,7 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
         ("mesh to Embree", median_ms(lambda: TracedObject(mesh, vertices_m))),
         ("primary rays, exact depth", median_ms(lambda: traced.primary(*rays))),
         ("illumination of the object", median_ms(lambda: lit_object(hits, rig, studio.lighting, traced))),
-        (f"{count} exposures with noise", median_ms(lambda: studio._expose(hits, lit, traced, stream))),
+        (f"{count} exposures with noise", median_ms(lambda: studio._expose(hits, lit, whole, stream))),
         ("decoded ground truth (object only)", median_ms(lambda: decode_stack(frames, rig, mask=seen))),
     ]
     return [(name, ms, ms / count) for name, ms in times]

@@ -7,6 +7,7 @@ along the projector's rows and measure its coordinate ``v``. *Vertical* fringes 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 Direction = Literal["horizontal", "vertical"]
@@ -68,7 +69,7 @@ class Sequence:
     def bits(self, direction: Direction) -> int:
         return self.bits_horizontal if direction == "horizontal" else self.bits_vertical
 
-    @property
+    @cached_property
     def frames(self) -> tuple[Frame, ...]:
         described: list[tuple[Kind, Direction | None, int]] = []
         for direction in DIRECTIONS:

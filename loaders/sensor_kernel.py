@@ -1,7 +1,8 @@
-"""The compiled twin of `fpp_ml_bench.loaders.camera.expose`: pattern lookup, shading, noise, quantising, in one pass.
+"""The compiled twin of `fpp_ml_bench.loaders.camera`: pattern lookup, shading, noise, quantising, in one pass.
 
-Each stage is a loop of its own over a chunk that stays in the cache: simple loops are what the compiler turns into
-vector instructions (2.5 times faster here than one loop that does it all).
+Pixels are worked off in chunks, and for each chunk all frames: what the frames share (where a pixel reads the pattern,
+how bright it is) is then read from memory once. Each stage is a loop of its own, for simple loops are what the compiler
+turns into vector instructions (2.5 times faster here than one loop that does it all).
 """
 
 import numpy as np
@@ -9,46 +10,54 @@ import numpy as np
 from fpp_ml_bench.acceleration import njit
 from fpp_ml_bench.loaders.sensor import TABLE_BITS
 
-_CHUNK = 4096
+_CHUNK = 2048
 _MASK = (1 << TABLE_BITS) - 1
 
 
 @njit
 def expose_kernel(  # type: ignore[no-untyped-def]
-    out, profile, index, weight, gain, ambient, pixels, contiguous, table, keys, read_variance, shot_per_grey
-):
-    """Expose one frame: ``out`` uint8 (n,); per pixel ``index``, ``weight``, ``gain``, ``pixels`` as in `expose`."""
-    total = out.size
+    out, frames, light, vertical, u_index, u_weight, v_index, v_weight, gain, ambient, pixels, table, keys,
+    read_variance, shot_per_grey,
+):  # fmt: skip
+    """Expose ``frames`` (k,) at n pixels: row i of ``out`` uint8 (k, n) is frame ``frames[i]``.
+
+    ``light`` float32 (F, L + 1) pattern light along the varying coordinate, ``vertical`` bool (F,) which of the two;
+    per pixel its lookups, ``gain``, ``ambient``, number ``pixels`` uint32; ``keys`` uint32 (k, 2) noise streams.
+    """
+    numbers = np.empty(_CHUNK, np.uint32)
     hashes = np.empty(_CHUNK, np.uint32)
     normal = np.empty(_CHUNK, np.float32)
-    light = np.empty(_CHUNK, np.float32)
-    for start in range(0, total, _CHUNK):
-        n = min(_CHUNK, total - start)
-        if contiguous:
-            first = np.uint32(pixels[0] + start)
+    lit = np.empty(_CHUNK, np.float32)
+    for start in range(0, pixels.size, _CHUNK):
+        # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
+        stop = min(start + _CHUNK, pixels.size)
+        n = stop - start
+        u_at, u_by = u_index[start:stop], u_weight[start:stop]
+        v_at, v_by = v_index[start:stop], v_weight[start:stop]
+        factor, offset, number = gain[start:stop], ambient[start:stop], pixels[start:stop]
+        for k in range(n):
+            numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
+        for row in range(frames.size):
+            profile, target = light[frames[row]], out[row, start:stop]
+            first, second = keys[row, 0], keys[row, 1]
             for k in range(n):
-                hashes[k] = np.uint32(first + np.uint32(k))
-        else:
+                h = numbers[k] ^ first
+                h ^= h >> np.uint32(16)
+                h = np.uint32(h * np.uint32(0x7FEB352D))
+                h ^= h >> np.uint32(15)
+                h = np.uint32(h + second)
+                h = np.uint32(h * np.uint32(0x846CA68B))
+                h ^= h >> np.uint32(16)
+                hashes[k] = h
             for k in range(n):
-                hashes[k] = pixels[start + k]
-        for k in range(n):
-            h = np.uint32(hashes[k] * np.uint32(0x9E3779B1)) ^ keys[0]
-            h ^= h >> np.uint32(16)
-            h = np.uint32(h * np.uint32(0x7FEB352D))
-            h ^= h >> np.uint32(15)
-            h = np.uint32(h + keys[1])
-            h = np.uint32(h * np.uint32(0x846CA68B))
-            h ^= h >> np.uint32(16)
-            hashes[k] = h
-        for k in range(n):
-            h = hashes[k]
-            normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
-        for k in range(n):
-            i = index[start + k]
-            low = profile[i]
-            light[k] = low + weight[start + k] * (profile[i + 1] - low)
-        for k in range(n):
-            signal = ambient[start + k] + gain[start + k] * light[k]
-            value = signal + np.sqrt(read_variance + shot_per_grey * signal) * normal[k] + np.float32(0.5)
-            value = min(max(value, np.float32(0)), np.float32(255))
-            out[start + k] = np.uint8(np.int32(value))
+                h = hashes[k]
+                normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
+            at, by = (u_at, u_by) if vertical[frames[row]] else (v_at, v_by)
+            for k in range(n):
+                low = profile[at[k]]
+                lit[k] = low + by[k] * (profile[at[k] + 1] - low)
+            for k in range(n):
+                signal = offset[k] + factor[k] * lit[k]
+                value = signal + np.sqrt(read_variance + shot_per_grey * signal) * normal[k] + np.float32(0.5)
+                value = min(max(value, np.float32(0)), np.float32(255))
+                target[k] = np.uint8(np.int32(value))

@@ -73,13 +73,14 @@ class Studio:
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 
     def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
-        pixels = hits.pixels.astype(np.uint32)
-        for index in range(len(self._frames)):
-            image = self._frames[index].reshape(-1)
-            if index in self._stored:
-                self.exposure.expose(index, whole, self._pixels, stream, image)
-            else:
-                image[hits.pixels] = self.exposure.expose(index, lit, pixels, stream)
+        images = self._frames.reshape(len(self._frames), -1)
+        for run in _runs(self._stored):
+            self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
+        others = [index for index in range(len(images)) if index not in self._stored]
+        if others:
+            pixels = hits.pixels.astype(np.uint32)
+            for index, values in zip(others, self.exposure.expose(others, lit, pixels, stream), strict=True):
+                images[index, hits.pixels] = values
 
     def _shadowed_background(self, traced: TracedObject) -> LitPixels:
         rig = self.settings.rig
@@ -87,6 +88,17 @@ class Studio:
         normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (self._pixels.size, 3))
         plane = Hits(self._pixels.astype(np.int64), everywhere, normals, rays=0)
         return light_surface(hit_points_m(plane, rig), normals, rig, self.lighting, traced)
+
+
+def _runs(indices: tuple[int, ...]) -> list[range]:
+    """Ascending indices as runs of neighbours."""
+    runs: list[range] = []
+    for index in indices:
+        if runs and runs[-1].stop == index:
+            runs[-1] = range(runs[-1].start, index + 1)
+        else:
+            runs.append(range(index, index + 1))
+    return runs
 
 
 def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32]) -> dict[str, Any]:
