@@ -17,7 +17,7 @@ SUFFIXES = ("obj", "ply", "stl", "glb")
 @pytest.fixture(scope="module")
 def wedge():
     """A closed mesh without any symmetry: the hull of seven points, in millimetres."""
-    points = np.random.default_rng(8).uniform(-60, 60, (7, 3)) + [5, -9, 30]
+    points = np.add(np.random.default_rng(8).uniform(-60, 60, (7, 3)), [5, -9, 30])
     return trimesh.convex.convex_hull(points)
 
 

@@ -20,7 +20,7 @@ def traced(vertices_m, faces):
 
 
 def traced_mesh(mesh, distance_m=1.8):
-    return traced(mesh.vertices + [0, 0, distance_m], mesh.faces)
+    return traced(np.add(mesh.vertices, [0, 0, distance_m]), mesh.faces)
 
 
 def depth_image(hits):
@@ -54,7 +54,8 @@ SHAPES = {
         (0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)
     ),
     "two bodies": trimesh.util.concatenate(
-        [trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.icosphere(1, 0.06).apply_translation([0.05, 0.03, -0.1])]
+        [trimesh.creation.box((0.1, 0.1, 0.1)),
+         trimesh.creation.icosphere(1, 0.06).apply_translation([0.05, 0.03, -0.1])]
     ),
 }  # fmt: skip
 
@@ -62,7 +63,7 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_depth_is_that_of_the_facets(name):
     mesh = SHAPES[name]
-    vertices_m = mesh.vertices + [0, 0, 1.8]
+    vertices_m = np.add(mesh.vertices, [0, 0, 1.8])
     found, expected = depth_image(traced_mesh(mesh).primary(X, Y)), brute_force(vertices_m, mesh.faces)
     differing = (found > 0) != (expected > 0)
     assert differing.sum() <= 2  # a ray within float32 of the outline
@@ -110,12 +111,12 @@ def test_fine_sphere_to_its_chord_error():
 def test_facing_and_tilted_planes():
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
     faces = [[0, 1, 2], [0, 2, 3]]
-    hits = traced(square + [0, 0, 2.0], faces).primary(X, Y)
+    hits = traced(np.add(square, [0, 0, 2.0]), faces).primary(X, Y)
     assert hits.pixels.size == X.size == hits.rays
     np.testing.assert_allclose(hits.depth_m, 2.0, atol=1e-12)
     np.testing.assert_allclose(hits.normals, [[0, 0, -1]] * X.size, atol=1e-12)
     normal = np.array([0.3, -0.2, -1.0])
-    tilted = square + [0, 0, 2.0]
+    tilted = np.add(square, [0, 0, 2.0])
     tilted[:, 2] = 2.0 + 0.3 * tilted[:, 0] - 0.2 * tilted[:, 1]
     hits = traced(tilted, faces).primary(X, Y)
     expected = 2.0 / (1 - 0.3 * X + 0.2 * Y)  # z = 2 + 0.3 x z - 0.2 y z
@@ -133,7 +134,7 @@ def test_box_front_face():
 
 def test_only_rays_in_the_bounding_box_are_traced():
     mesh = trimesh.creation.icosphere(3, 0.1)
-    vertices = mesh.vertices + [0.1, -0.05, 1.8]
+    vertices = np.add(mesh.vertices, [0.1, -0.05, 1.8])
     hits = traced(vertices, mesh.faces).primary(X, Y)
     u, v = RIG.camera.project(vertices)
     expected = (np.floor(u.max()) - np.ceil(u.min()) + 1) * (np.floor(v.max()) - np.ceil(v.min()) + 1)
@@ -143,7 +144,7 @@ def test_only_rays_in_the_bounding_box_are_traced():
 
 def test_flipped_winding_changes_nothing():
     mesh = SHAPES["torus"]
-    vertices_m = mesh.vertices + [0.0013, 0.0007, 1.8]  # no ray runs exactly along an edge
+    vertices_m = np.add(mesh.vertices, [0.0013, 0.0007, 1.8])  # no ray runs exactly along an edge
     plain = traced(vertices_m, mesh.faces).primary(X, Y)
     rng = np.random.default_rng(0)
     flipped = mesh.faces.copy()
@@ -165,7 +166,7 @@ def test_edge_on_and_degenerate_triangles():
     assert np.isfinite(hits.depth_m).all() and np.isfinite(hits.normals).all()
     assert ((hits.depth_m >= 1.7 - 1e-9) & (hits.depth_m <= 1.9 + 1e-9)).all()
     mesh = SHAPES["icosphere"]
-    vertices = np.vstack([mesh.vertices + [0, 0, 1.8], [[0, 0, 1.55], [0, 0, 1.55], [0, 0, 1.6]]])
+    vertices = np.vstack([np.add(mesh.vertices, [0, 0, 1.8]), [[0, 0, 1.55], [0, 0, 1.55], [0, 0, 1.6]]])
     n = len(mesh.vertices)
     degenerate = np.vstack([[[n, n + 1, n + 2], [n, n, n], [0, 0, 1]], mesh.faces])
     plain = traced_mesh(mesh).primary(X, Y)
@@ -206,7 +207,7 @@ def test_rays_without_a_direction_see_nothing():
 
 def test_object_beside_the_image_is_not_hit():
     mesh = trimesh.creation.icosphere(2, 0.1)
-    hits = traced(mesh.vertices + [3.0, 0, 1.8], mesh.faces).primary(X, Y)
+    hits = traced(np.add(mesh.vertices, [3.0, 0, 1.8]), mesh.faces).primary(X, Y)
     assert hits.pixels.size == 0 and hits.rays == 0
 
 

@@ -82,10 +82,10 @@ def test_bounds_are_tight():
     for degrees in VIEW_DEGREES:
         about = turned(mesh.vertices_m, degrees)
         near_m, far_m = distance_bounds_m(about, RIG)
-        assert inside(about + [0, 0, near_m], RIG) and inside(about + [0, 0, far_m], RIG)
-        assert not inside(about + [0, 0, far_m + 0.001], RIG)
+        assert inside(np.add(about, [0, 0, near_m]), RIG) and inside(np.add(about, [0, 0, far_m]), RIG)
+        assert not inside(np.add(about, [0, 0, far_m + 0.001]), RIG)
         # Two image px of margin are kept, which 1 mm does not use up: 25 mm at the near end does.
-        assert not inside(about + [0, 0, near_m - 0.06], RIG)
+        assert not inside(np.add(about, [0, 0, near_m - 0.06]), RIG)
 
 
 def test_placement_depends_on_seed_object_and_view_alone():
