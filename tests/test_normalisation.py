@@ -1,0 +1,102 @@
+"""The paper's three depth representations (Section 3.3), computed again here in float64, and the way back."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fpp_ml_bench.normalisation import NORMALISATIONS, denormalise, normalise
+
+
+def depth_map(low=1510.123, high=1987.654, shape=(40, 50)):
+    rng = np.random.default_rng(0)
+    depth = np.where(rng.random(shape) < 0.5, rng.uniform(low, high, shape), 0).astype(np.float32)
+    inside = depth[depth > 0]
+    return depth, float(inside.min()), float(inside.max())
+
+
+def paper(depth_mm, name, low, high):
+    """Section 3.3 in float64, background 0."""
+    d = depth_mm.astype(np.float64)
+    if name == "raw":
+        return d
+    if name == "global":
+        return d / 1000
+    return np.where(d > 0, (d - low) / (high - low), 0.0)
+
+
+@pytest.mark.parametrize("name", NORMALISATIONS)
+def test_is_the_papers_equation_to_one_rounding(name):
+    depth, low, high = depth_map()
+    found = normalise(depth, name, low, high)
+    assert found.dtype == np.float32 and found.shape == depth.shape
+    # Two roundings at most (the span, the quotient): one unit in the last place.
+    np.testing.assert_allclose(found, paper(depth, name, low, high), rtol=2**-22, atol=0)
+    assert (found[depth == 0] == 0).all()
+
+
+def test_individual_spans_zero_to_one_exactly():
+    depth, low, high = depth_map()
+    found = normalise(depth, "individual", low, high)
+    assert found.min() == 0 and found.max() == 1
+    assert (found[depth == np.float32(low)] == 0).all()
+
+
+@pytest.mark.parametrize("name", NORMALISATIONS)
+def test_way_back(name):
+    depth, low, high = depth_map()
+    back = denormalise(normalise(depth, name, low, high), name, low, high)
+    assert back.dtype == np.float64
+    inside = depth > 0
+    np.testing.assert_allclose(back[inside], depth[inside], rtol=0, atol=2e-4)
+    expected = low if name == "individual" else 0.0
+    assert (back[~inside] == expected).all()  # paper Section 5.3.2: a predicted 0 becomes D_min
+
+
+def test_flat_depth_map_is_defined():
+    depth = np.array([[0, 1800.5], [1800.5, 0]], np.float32)
+    found = normalise(depth, "individual", 1800.5, 1800.5)
+    assert (found == 0).all()
+    assert (denormalise(found, "individual", 1800.5, 1800.5) == 1800.5).all()
+
+
+@pytest.mark.parametrize("name", NORMALISATIONS)
+def test_out_buffer_is_filled_whole(name):
+    depth, low, high = depth_map()
+    out = np.full(depth.shape, np.nan, np.float32)
+    assert normalise(depth, name, low, high, out=out) is out
+    np.testing.assert_array_equal(out, normalise(depth, name, low, high))
+    before = depth.copy()
+    normalise(depth, name, low, high, out=out)
+    np.testing.assert_array_equal(depth, before)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(np.nan, 2.0), (1.0, np.nan), (1.0, np.inf), (-np.inf, 2.0), (2000.0, 1500.0)]
+)
+def test_ranges_that_are_none(low, high):
+    with pytest.raises(ValueError, match="depth_min <= depth_max"):
+        normalise(np.zeros((2, 2), np.float32), "individual", low, high)
+    with pytest.raises(ValueError, match="depth_min <= depth_max"):
+        denormalise(np.zeros((2, 2), np.float32), "individual", low, high)
+
+
+def test_unknown_names():
+    for function in (normalise, denormalise):
+        with pytest.raises(ValueError, match="raw, global, individual"):
+            function(np.zeros((2, 2), np.float32), "Individual", 1.0, 2.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats(1500, 2100, width=32),
+    st.floats(0, 600, width=32).filter(lambda s: s == 0 or s > 1e-3),
+    st.lists(st.floats(0, 1, width=32), min_size=1, max_size=20),
+)
+def test_individual_stays_between_zero_and_one(low, span, shares):
+    low, high = np.float32(low), np.float32(low + span)
+    depth = np.clip(np.float32(low) + np.array(shares, np.float32) * (high - low), low, high).astype(np.float32)
+    found = normalise(depth[None], "individual", float(low), float(high))
+    assert ((found >= 0) & (found <= 1)).all()
+    order = np.argsort(depth, kind="stable")
+    assert (np.diff(found[0][order]) >= 0).all()
