@@ -49,6 +49,11 @@ train = datasets.load_from_disk("THIS FOLDER")["train"]                      # i
 """
 
 
+def data_version(fingerprint: str) -> str:
+    """Version for a card: ``datasets`` finds an old copy in its cache unless the version changes with the data."""
+    return f"1.0.{int(fingerprint[:7], 16)}"
+
+
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
     """Write card, rig and Hugging Face state files of a dataset whose shards stand; their paths below ``folder``."""
     from fpp_ml_bench.rig_io import rig_from_dict, save_rig
@@ -76,8 +81,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
     _write_json(folder / "dataset_dict.json", {"splits": list(manifest.samples)})
     save_rig(rig, folder / RIG_FILE)
     text = _CARD.format(
-        # `datasets` finds an old copy in its cache unless the version changes with the data.
-        version=f"1.0.{int(manifest.fingerprint[:7], 16)}",
+        version=data_version(manifest.fingerprint),
         data_files="\n".join(
             f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples
         ),

@@ -21,6 +21,7 @@ from fpp_ml_bench.rig import Rig
 AGREEMENT_MM = 0.01
 """Variants of one depth map may differ by this much: float32 in m keeps 0.0001 mm, a wrong unit or file is mm away."""
 _UNIT_SLACK = 10.0
+_ROUNDING = 1e-6
 _SHOWN_MISFITS = 3
 
 
@@ -145,7 +146,7 @@ class SampleReader:
         inside = object_mask(values)
         if not inside.any():
             raise LayoutError(f"{path}: no pixel is above 0, so there is no object")
-        if variant == "individual" and values.max() > 1:
+        if variant == "individual" and values.max() > 1 + _ROUNDING:
             raise LayoutError(f"{path}: expected values in [0, 1], got up to {values.max():g}")
         depth_mm = np.where(inside, denormalise(values, variant, *limits), 0.0)
         near, far = self.rig.working_range_mm

@@ -1,0 +1,67 @@
+"""Exporting a dataset: which forms there are, and what each needs."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from fpp_ml_bench.errors import BuildError, DatasetError
+from fpp_ml_bench.loaders.export_folder import exporting
+from fpp_ml_bench.loaders.store import ALL_SPLITS, DatasetFolder
+
+MESH_FOLDER = "meshes"
+FORMS = ("parquet", "mat", "meshes", "patterns")
+SAMPLE_FORMS = ("parquet", "mat")
+"""Forms whose work is counted in samples."""
+
+
+def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
+    """Splits that ``split`` names, in row order; raises `DatasetError` when the dataset has no such samples."""
+    dataset.samples(split)
+    return list(dataset.splits) if split == ALL_SPLITS else [split]
+
+
+def export(
+    dataset: DatasetFolder, out: Path, forms: list[str], splits: list[str], threads: int = 1,
+    progress: Callable[[int], None] = lambda rows: None,
+) -> None:  # fmt: skip
+    """Write ``forms`` (of `FORMS`) of a dataset: one form into ``out`` itself, several each into a folder of its name.
+
+    ``out`` must be new or empty and appears complete or not at all; ``progress`` is told of samples written. Raises
+    `BuildError` for ``out`` or the disk, `DatasetError` for what the dataset does not have.
+    """
+    if not forms or not set(forms) <= set(FORMS):
+        raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
+    if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
+        raise BuildError(f"{out}: lies in the dataset itself; give another folder")
+    meshes = _meshes(dataset, splits) if "meshes" in forms else []
+    with exporting(out) as staging:
+        for form in forms:
+            folder = staging / form if len(forms) > 1 else staging
+            folder.mkdir(exist_ok=True)
+            if form == "parquet":
+                from fpp_ml_bench.loaders.export_parquet import write_parquet
+
+                write_parquet(dataset, folder, splits, progress)
+            elif form == "mat":
+                from fpp_ml_bench.loaders.export_tree import write_tree
+
+                write_tree(dataset, folder, splits, threads, lambda: progress(1))
+            elif form == "meshes":
+                for path in meshes:
+                    shutil.copyfile(path, folder / path.name)
+            else:
+                from fpp_ml_bench.patterns import export_patterns
+
+                export_patterns(dataset.rig, folder)
+
+
+def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
+    rows = (row for split in splits for row in dataset.manifest.samples[split])
+    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
+    for path in paths:
+        if not path.is_file():
+            why = (
+                "imported datasets have no meshes" if dataset.manifest.origin == "imported" else "run: fpp-bench verify"
+            )
+            raise DatasetError(f"{path}: the mesh is missing; {why}")
+    return paths

@@ -1,0 +1,63 @@
+"""An export's folder appears complete or not at all: it is written beside its place and renamed when it is done."""
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fpp_ml_bench.errors import BuildError
+
+_LOCK = ".lock"
+
+
+@contextmanager
+def exporting(out: Path) -> Iterator[Path]:
+    """Yield a folder to write into; it becomes ``out`` when the block ends well, and is removed when it does not.
+
+    What an export that was killed left behind is cleared away. Raises `BuildError` when ``out`` holds anything, is a
+    file, is being written by another process, or the disk refuses.
+    """
+    target = out.resolve()
+    if target.exists() and not target.is_dir():
+        raise BuildError(f"{out}: is a file; give a new folder")
+    if target.is_dir() and any(target.iterdir()):
+        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to one or overwrites it")
+    staging = target.with_name(f".{target.name}.export")
+    try:
+        staging.mkdir(parents=True, exist_ok=True)
+        lock = os.open(staging / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise BuildError(f"{out}: can't be written ({error.strerror or error})") from error
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise BuildError(
+                f"{out}: another process is exporting there; wait for it or choose another folder"
+            ) from error
+        try:
+            _clear(staging)
+            yield staging
+            (staging / _LOCK).unlink()
+            staging.replace(target)
+        except OSError as error:
+            shutil.rmtree(staging, ignore_errors=True)
+            raise BuildError(
+                f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
+                "space or choose another disk"
+            ) from error
+        except BaseException:
+            shutil.rmtree(staging, ignore_errors=True)
+            raise
+    finally:
+        os.close(lock)
+
+
+def _clear(staging: Path) -> None:
+    for entry in staging.iterdir():
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        elif entry.name != _LOCK:
+            entry.unlink()

@@ -1,0 +1,163 @@
+"""Exporting a dataset as Parquet, from which plain ``datasets.load_dataset(OUT, CONFIG)`` opens every configuration.
+
+One file a shard holds all columns, so no pixel is stored twice; the card's ``columns:`` say which of them a
+configuration reads, and a column store reads no other. zstd; frames as dictionary-coded bytes, depth with its bytes
+split by significance, which suits smooth floats.
+"""
+
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.loaders.card import data_version
+from fpp_ml_bench.loaders.manifest import Manifest, ShardFile
+from fpp_ml_bench.loaders.schema import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    LABELS,
+    RANGE,
+    arrow_schema,
+    config_columns,
+    stored_frames,
+)  # fmt: skip
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ROW_GROUP_BYTES = 1 << 28
+"""Rows are written, and read by ``datasets``, in groups of about this size before compression."""
+_MOST_ROWS = 24
+_CARD = """\
+---
+license: mit
+pretty_name: FPP-ML-Bench
+task_categories:
+- depth-estimation
+size_categories:
+- n<1K
+tags:
+- fringe-projection-profilometry
+- structured-light
+- metrology
+configs:
+{configs}
+---
+# FPP-ML-Bench dataset ({origin}), Parquet
+
+{rows} samples of {height} x {width} px; depth in mm, 0 = background. Fingerprint of the dataset this was exported from:
+`{fingerprint}`.
+
+```python
+import datasets
+train = datasets.load_dataset("THIS FOLDER", "{config}", split="{split}")
+```
+
+Configurations: {names}. A configuration reads only its own columns.
+"""
+
+
+def write_parquet(
+    dataset: DatasetFolder, folder: Path, splits: list[str], row_done: Callable[[int], None] = lambda rows: None
+) -> None:
+    """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it.
+
+    Raises ``OSError`` when the disk refuses; one group of rows is held in memory.
+    """
+    manifest = dataset.manifest
+    for shard in manifest.shards:
+        if shard.group == DATA_GROUP and shard.split in splits:
+            stem = Path(shard.path).stem.removeprefix(f"{DATA_GROUP}-")
+            path = folder / "data" / f"{shard.split}-{stem}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write_shard(dataset, shard, path, row_done)
+    (folder / "README.md").write_text(_card(dataset, splits), encoding="utf-8")
+
+
+def all_columns(dataset: DatasetFolder) -> list[str]:
+    """Every column that the dataset stores, in the order of the widest configuration."""
+    frames = (dataset.sequence.frames[i].column for i in stored_frames(dataset.sequence, dataset.manifest.stored))
+    return [*LABELS, *frames, DEPTH, *([DEPTH_EXACT] if dataset.has_exact else []), *RANGE]
+
+
+def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, row_done: Callable[[int], None]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = all_columns(dataset)
+    schema = arrow_schema(columns, dataset.size)
+    table = _joined(dataset, shard, schema)
+    depths = [name for name in columns if name in (DEPTH, DEPTH_EXACT)]
+    leaf = ".list.element.list.element"
+    rows = _rows_per_group(dataset)
+    try:
+        with pq.ParquetWriter(
+            path,
+            schema,
+            compression="zstd",
+            use_dictionary=[
+                name if name in LABELS else name + leaf for name in columns if name not in (*depths, *RANGE)
+            ],
+            column_encoding={name + leaf: "BYTE_STREAM_SPLIT" for name in depths},
+            # Least and greatest grey level of an image help no reader.
+            write_statistics=[*LABELS, *RANGE],
+        ) as writer:
+            for first in range(0, table.num_rows, rows):
+                part = table.slice(first, rows)
+                writer.write_table(part, row_group_size=rows)
+                row_done(part.num_rows)
+    except pa.ArrowException as error:
+        raise OSError(f"{path.name}: {error}") from error
+
+
+def _joined(dataset: DatasetFolder, shard: ShardFile, schema: "pa.Schema") -> "pa.Table":
+    """The columns of all groups for the rows of one data shard, on the memory-mapped files."""
+    import pyarrow as pa
+
+    found: dict[str, pa.ChunkedArray] = {}
+    for part in dataset.manifest.shards:
+        if (part.split, part.first_row, part.rows) == (shard.split, shard.first_row, shard.rows):
+            batches = dataset.record_batches(part)
+            for name in batches[0].schema.names:
+                # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
+                pieces = (batch.column(name) for batch in batches)
+                found[name] = pa.chunked_array([getattr(piece, "storage", piece) for piece in pieces])
+    return pa.Table.from_arrays([found[name] for name in schema.names], schema=schema)
+
+
+def _rows_per_group(dataset: DatasetFolder) -> int:
+    height, width = dataset.size
+    frames = len(stored_frames(dataset.sequence, dataset.manifest.stored))
+    row_bytes = height * width * (frames + (8 if dataset.has_exact else 4))
+    return max(1, min(_MOST_ROWS, ROW_GROUP_BYTES // row_bytes))
+
+
+def _card(dataset: DatasetFolder, splits: list[str]) -> str:
+    import yaml
+
+    manifest: Manifest = dataset.manifest
+    # Two exports of the same dataset with other splits must not share a cache either.
+    identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
+    configs = [
+        {
+            "config_name": config,
+            **({"default": True} if config == dataset.configs[0] else {}),
+            "version": data_version(identity),
+            "data_files": [{"split": split, "path": f"data/{split}-*.parquet"} for split in splits],
+            "columns": config_columns(dataset.sequence, config, dataset.has_exact),
+        }
+        for config in dataset.configs
+    ]
+    return _CARD.format(
+        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(),
+        origin=manifest.origin,
+        rows=sum(len(dataset.samples(split)) for split in splits),
+        height=dataset.size[0],
+        width=dataset.size[1],
+        fingerprint=manifest.fingerprint,
+        config=dataset.configs[0],
+        split=splits[0],
+        names=", ".join(f"`{config}`" for config in dataset.configs),
+    )
