@@ -1,6 +1,6 @@
 """Generating, noise and all, written to disk: images a second, where the time goes, and a plain pipeline beside it.
 
-    python benchmarks/generate_speed.py [--size 960] [--objects 8] [--workers 2] [--folder DIR]
+    python benchmarks/generate_speed.py [--size 960] [--objects 16] [--workers 2] [--folder DIR]
 
 Ours is the real builder (`fpp_ml_bench.loaders.build.build`): ray casting, 52 exposures with shot and read noise,
 ground-truth decoding, Arrow shards with checksums. It runs twice, once into ``--folder`` and once into memory
@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 
-from fpp_ml_bench.constants import OBJECTS
+from fpp_ml_bench.constants import OBJECTS, split_of
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.loaders.build import build
@@ -122,11 +122,13 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=960)
-    parser.add_argument("--objects", type=int, default=8, help="objects, six views each (default: 8)")
+    parser.add_argument("--objects", type=int, default=16, help="training objects, six views each (default: 16)")
     parser.add_argument("--workers", type=int, default=describe_hardware().cores)
     parser.add_argument("--folder", type=Path, default=Path.cwd(), help="a folder on the disk to measure")
     args = parser.parse_args()
-    settings = BuildSettings(rig=paper_rig(args.size), objects=OBJECTS[: args.objects])
+    # Of one split, so that the shards are of equal size and no worker waits for another at the end.
+    objects = tuple(name for name in OBJECTS if split_of(name) == "train")[: args.objects]
+    settings = BuildSettings(rig=paper_rig(args.size), objects=objects)
     machine = describe_hardware()
     print(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gib} GiB; {args.size} px, {args.workers} workers")
 
