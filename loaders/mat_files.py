@@ -20,7 +20,8 @@ from fpp_ml_bench.errors import LayoutError
 
 _HEADER_BYTES = 128
 _COMPRESSED, _MATRIX = 15, 14
-_FLAGS, _DIMENSIONS, _NAME = 6, 5, 1
+_FLAGS, _DIMENSIONS, _NAME = (6,), (5, 6), (1, 16)
+_HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _COMPLEX = 0x0800
@@ -43,7 +44,7 @@ def read_matrix(path: Path, variable: str) -> NDArray:
     except OSError as error:
         raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
     try:
-        if content.startswith(b"MATLAB 7.3"):
+        if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
             return _read_hdf5(content, variable)
         return _read_v5(content, variable)
     except (_Damaged, zlib.error, struct.error) as error:
@@ -136,8 +137,8 @@ def _matrix(data: memoryview, order: str) -> _Matrix:
     found = []
     for expected in (_FLAGS, _DIMENSIONS, _NAME):
         kind, part, data = _element(data, order)
-        if kind != expected:
-            raise _Damaged(f"a matrix header has element type {kind} for {expected}; the file is damaged")
+        if kind not in expected:
+            raise _Damaged(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
         found.append(part)
     flags, dimensions, name = found
     if len(flags) != 8 or len(dimensions) % 4:

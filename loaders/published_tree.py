@@ -249,19 +249,21 @@ class _Scan:
 
     def _objects(self, samples: dict[str, list[PublishedSample]]) -> None:
         """An object has all its views, in one split."""
-        first: dict[str, PublishedSample] = {}
+        first: dict[str, dict[str, PublishedSample]] = {}
         views: dict[str, set[str]] = {}
         for sample in (sample for found in samples.values() for sample in found):
             views.setdefault(sample.object, set()).add(sample.view)
-            known = first.setdefault(sample.object, sample)
-            if known.split != sample.split:
-                self.problems.append(
-                    f"{sample.fringes[0]}: object {sample.object} is in two splits, see {known.fringes[0]}"
-                )
+            first.setdefault(sample.object, {}).setdefault(sample.split, sample)
+        for name, by_split in first.items():
+            here, *others = (sample.fringes[0] for sample in by_split.values())
+            if others:
+                self.problems.append(f"{here}: object {name} is in two splits, see {', '.join(map(str, others))}")
         for name, seen in views.items():
             if missing := [view for view in VIEWS if view not in seen]:
                 stems = ", ".join(sample_name(name, view) for view in missing)
-                self.problems.append(f"{first[name].fringes[0].parent}: object {name} lacks {stems}")
+                self.problems.append(
+                    f"{next(iter(first[name].values())).fringes[0].parent}: object {name} lacks {stems}"
+                )
 
     def _sizes(self, samples: dict[str, list[PublishedSample]]) -> tuple[int, int]:
         """Image size that most PNG headers say; every other file is a problem."""
