@@ -18,8 +18,9 @@ from fpp_ml_bench.evaluation.predictions import buffer_for, list_problems, read_
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, PROTOCOL_VERSION, TARGETS
 from fpp_ml_bench.evaluation.result import Environment, Result, result_from_rows
 from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, HardwareInfo, Submission, read_submission
+from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
 from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.evaluation.timing import HardwareInfo
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.hardware import describe_hardware, usable_cores
 from fpp_ml_bench.pixel_sets import edge_jump_mm

@@ -13,8 +13,9 @@ from pydantic import Field, field_validator, model_validator
 from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS, RESULT_SCHEMA_VERSION, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Share, StrictModel, Text
 from fpp_ml_bench.evaluation.scores import ErrorStats, combine
-from fpp_ml_bench.evaluation.submission import HardwareInfo, Submission
+from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.evaluation.summary import mean_over_samples, median_over_samples, pooled_scores
+from fpp_ml_bench.evaluation.timing import HardwareInfo, Timing
 
 AGREES = 1e-9
 """Relative difference at which two computations of one average still count as the same number."""
@@ -104,6 +105,10 @@ class Result(StrictModel):
     @property
     def track(self) -> Track:
         return self.submission.track
+
+    @property
+    def timing(self) -> Timing | None:
+        return self.submission.timing
 
     @field_validator("created")
     @classmethod

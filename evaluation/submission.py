@@ -13,21 +13,12 @@ from pydantic import Field, model_validator
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track
-from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, StrictModel, Text, validate
+from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
 from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.evaluation.timing import HardwareInfo, Timing
 
 SUBMISSION_FILE = "submission.yaml"
 MAX_BYTES = 65536
-
-
-class HardwareInfo(StrictModel):
-    """The machine a time was measured on, as `fpp_ml_bench.hardware.describe_hardware` puts it."""
-
-    cpu: Text
-    cores: Count
-    memory_gib: NonNegative
-    gpu: Text | None
-    platform: Text
 
 
 class Submission(StrictModel):
@@ -47,6 +38,7 @@ class Submission(StrictModel):
     hardware: HardwareInfo | None = None
     software: dict[Text, Text] = Field(default_factory=dict, max_length=100)
     settings: dict[Text, Scalar] = Field(default_factory=dict, max_length=200)
+    timing: Timing | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "Submission":
@@ -54,6 +46,8 @@ class Submission(StrictModel):
             raise ValueError("frames_used names a frame twice")
         if self.seconds_per_sample is not None and (self.seconds_source is None or self.hardware is None):
             raise ValueError("seconds_per_sample needs seconds_source and hardware beside it, or null when unknown")
+        if self.timing is not None and self.timing.frames != len(self.frames_used):
+            raise ValueError("timing.frames is not the number of frames_used; time this very method")
         return self
 
     @property

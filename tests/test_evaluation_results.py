@@ -55,7 +55,7 @@ def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
     assert result["dataset"] == {
         "name": "tiny", "fingerprint": dataset.fingerprint, "split": "test", "size": [32, 40], "samples": 4,
     }  # fmt: skip
-    assert result["submission"] == DESCRIPTION
+    assert result["submission"] == {**DESCRIPTION, "timing": None}
     assert result["target"] == "depth"
     assert result["edge_band_px"] == 3 and result["edge_jump_mm"] == 240.0
     assert set(result["metrics"]) == set(METRICS) and set(result["pooled"]) == set(HEADLINE)
