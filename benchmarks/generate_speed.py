@@ -83,7 +83,10 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
         ("mesh to Embree", median_ms(lambda: TracedObject(mesh, vertices_m))),
         ("primary rays, exact depth", median_ms(lambda: traced.primary(*rays))),
         ("illumination of the object", median_ms(lambda: lit_object(hits, rig, studio.lighting, traced))),
-        (f"{count} exposures with noise", median_ms(lambda: studio._expose(hits, lit, whole, stream))),
+        (
+            f"{count} exposures with noise",
+            median_ms(lambda: studio._expose(studio._slots[:, 0], hits, lit, whole, stream)),
+        ),
         ("decoded ground truth (object only)", median_ms(lambda: decode_stack(frames, rig, mask=seen))),
     ]
     return [(name, ms, ms / count) for name, ms in times]

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import connection, get_context, parent_process
 from pathlib import Path
@@ -38,6 +39,7 @@ Work = Callable[[Path, Path, ShardPlan, Callable[[], None]], Receipt]
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
 _POLL_S = 0.2
+_THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def _assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress
             return _already_there(folder, assembly)
         _same_settings(folder, scratch, assembly)
         for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
-            leftover.unlink()
+            leftover.unlink(missing_ok=True)  # the two patterns overlap
         receipts = {}
         for plan in assembly.plans:
             receipt = _receipt(folder, scratch, plan)
@@ -189,9 +191,12 @@ def _run(
     context = get_context("spawn")
     rows_done = context.Value("q", 0)
     reported = 0
-    with ProcessPoolExecutor(
-        max_workers=min(workers, len(plans)), mp_context=context, initializer=_start_worker, initargs=(rows_done,)
-    ) as pool:
+    with (
+        _one_thread_a_process(),
+        ProcessPoolExecutor(
+            max_workers=min(workers, len(plans)), mp_context=context, initializer=_start_worker, initargs=(rows_done,)
+        ) as pool,
+    ):
         # The longest shards first, so that none of them is what everybody waits for at the end.
         ordered = sorted(plans, key=lambda plan: -len(plan.samples))
         futures = {pool.submit(_work_in_worker, work, folder, scratch, plan): plan for plan in ordered}
@@ -211,6 +216,21 @@ def _run(
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_a_process() -> Iterator[None]:
+    """Workers started inside get a single-threaded BLAS: its idle threads spin, and cost more than they help here."""
+    before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
+    os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 _rows_done: Any = None

@@ -89,12 +89,11 @@ def light_surface(
     """Illumination of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera; NaN points stay dark."""
     centre_m = projector_centre_m(rig)
     toward = centre_m - points_m
-    distance_m = np.linalg.norm(toward, axis=1)
+    distance_m = _lengths(toward)
     toward /= distance_m[:, None]
     cosine = np.einsum("ij,ij->i", normals, toward)
-    view = -points_m / np.linalg.norm(points_m, axis=1, keepdims=True)
-    halfway = toward + view
-    halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+    halfway = toward - points_m / _lengths(points_m)[:, None]
+    halfway /= _lengths(halfway)[:, None]
     # Blinn-Phong with the exponent that a microfacet roughness of this size has (2 / roughness^4 - 2).
     exponent = max(2.0 / lighting.roughness**4 - 2.0, 0.0)
     gloss = np.clip(np.einsum("ij,ij->i", normals, halfway), 0.0, None) ** exponent
@@ -119,6 +118,11 @@ def light_surface(
         np.where(seen, lighting.ambient_grey, 0.0).astype(np.float32),
         shadow_rays,
     )
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of vectors (n, 3); several times faster than ``np.linalg.norm`` along an axis."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _by_direction(u: NDArray, v: NDArray) -> tuple[tuple[Direction, NDArray], tuple[Direction, NDArray]]:

@@ -33,7 +33,10 @@ OBJECTS_PER_SHARD = 4
 
 @dataclass
 class Row:
-    """One sample on its way to disk: frames by index uint8 (H, W), depths float32 (H, W) in mm, what was measured."""
+    """One sample on its way to disk: frames by index uint8 (H, W), depths float32 (H, W) in mm, what was measured.
+
+    Frames are held until the last row of their object has come: the rows of one object must not share their memory.
+    """
 
     sample: str
     object: str
@@ -132,8 +135,9 @@ class ShardWriter:
         try:
             writers = {group: pa.ipc.new_stream(sinks[group], schemas[group]) for group in self._groups}
             described = []
-            data = _Batch(len(self._plan.samples), self._size)
-            extra: dict[str, _Batch] = {}
+            data = _Batch(self._size)
+            data.restart(len(self._plan.samples))
+            extra = {group: _Batch(self._size) for group in self._groups if group != DATA_GROUP}
             for place, row in enumerate(self._checked(rows)):
                 least, greatest = depth_range_mm(row.depth_mm, row.sample)
                 described.append(
@@ -149,16 +153,13 @@ class ShardWriter:
                 )
                 data.add_row(row, (least, greatest), self._plan.split, self._groups[DATA_GROUP], self._sequence)
                 # Frames beyond the first leave by object: six rows of them are all that is ever held.
-                group_rows, first, last = self._object_rows(place)
-                for group, frames in self._groups.items():
-                    if group == DATA_GROUP:
-                        continue
+                object_rows, first, last = self._object_rows(place)
+                for group, batch in extra.items():
                     if first:
-                        extra[group] = extra.get(group) or _Batch(group_rows, self._size)
-                        extra[group].restart(group_rows)
-                    extra[group].add_frames(row, frames, self._sequence)
+                        batch.restart(object_rows)
+                    batch.hold_frames(row, self._groups[group], self._sequence)
                     if last:
-                        writers[group].write_batch(extra[group].record_batch(schemas[group]))
+                        writers[group].write_batch(batch.record_batch(schemas[group]))
                 row_done()
             writers[DATA_GROUP].write_batch(data.record_batch(schemas[DATA_GROUP]))
             for writer in writers.values():
@@ -185,50 +186,81 @@ class ShardWriter:
 
 
 class _Batch:
-    """Columns of one record batch, each a buffer of its own that Arrow takes without a copy."""
+    """Columns of one record batch, each on memory that Arrow takes without a copy.
 
-    def __init__(self, rows: int, size: tuple[int, int]) -> None:
-        self._capacity, self._size = rows, size
-        self._pixels: dict[str, NDArray] = {}
-        self.restart(rows)
+    Images of a *held* batch stay where the source has them until the batch is written; a column whose images lie one
+    after another in memory is not copied at all. The others are gathered in a buffer that the next batch reuses.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._buffers: dict[str, NDArray] = {}
+        self.restart(0)
 
     def restart(self, rows: int) -> None:
-        if rows > self._capacity:
-            self._capacity, self._pixels = rows, {}
+        """Begin a batch of ``rows`` rows."""
         self._rows, self._filled = rows, 0
+        self._held: dict[str, list[NDArray]] = {}
         self._values: dict[str, list[Any]] = {}
 
-    def _put(self, column: str, image: NDArray) -> None:
+    def _checked(self, column: str, image: NDArray) -> NDArray:
         if image.shape != self._size:
             raise BuildError(f"column {column}: expected an image {self._size}, got {image.shape}")
-        if column not in self._pixels:
-            self._pixels[column] = np.empty((self._capacity, *self._size), dtype=image.dtype)
-        self._pixels[column][self._filled] = image
+        return image
 
-    def add_frames(self, row: Row, frames: tuple[int, ...], sequence: Sequence) -> None:
+    def _copy(self, column: str, image: NDArray) -> None:
+        image = self._checked(column, image)
+        buffer = self._buffers.get(column)
+        if buffer is None or len(buffer) < self._rows:
+            buffer = self._buffers[column] = np.empty((self._rows, *self._size), dtype=image.dtype)
+        buffer[self._filled] = image
+
+    def hold_frames(self, row: Row, frames: tuple[int, ...], sequence: Sequence) -> None:
+        """Take the frames of a row as they are; they must not change before `record_batch` has been written."""
         for index in frames:
-            self._put(sequence.frames[index].column, row.frames[index])
-        self._filled += 1
+            column = sequence.frames[index].column
+            self._held.setdefault(column, []).append(self._checked(column, row.frames[index]))
 
     def add_row(
         self, row: Row, range_mm: tuple[float, float], split: str, frames: tuple[int, ...], sequence: Sequence
     ) -> None:
+        """Copy labels, depths and ``frames`` of a row."""
         values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
         values.update(zip(RANGE, range_mm, strict=True))
         for name, value in values.items():
             self._values.setdefault(name, []).append(value)
-        self._put(DEPTH, row.depth_mm)
+        self._copy(DEPTH, row.depth_mm)
         if row.depth_exact_mm is not None:
-            self._put(DEPTH_EXACT, row.depth_exact_mm)
-        self.add_frames(row, frames, sequence)
+            self._copy(DEPTH_EXACT, row.depth_exact_mm)
+        for index in frames:
+            self._copy(sequence.frames[index].column, row.frames[index])
+        self._filled += 1
+
+    def _images(self, column: str) -> NDArray:
+        if column not in self._held:
+            return self._buffers[column][: self._rows]
+        images = self._held[column]
+        first, step = images[0], images[0].nbytes
+        addresses = [image.__array_interface__["data"][0] for image in images]
+        if all(image.flags.c_contiguous for image in images) and addresses == [
+            addresses[0] + i * step for i in range(len(images))
+        ]:
+            return np.lib.stride_tricks.as_strided(
+                first, (len(images), *first.shape), (step, *first.strides), writeable=False
+            )
+        buffer = self._buffers.get(column)
+        if buffer is None or len(buffer) < len(images):
+            buffer = self._buffers[column] = np.empty((len(images), *self._size), dtype=first.dtype)
+        return np.stack(images, out=buffer[: len(images)])
 
     def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
+        """The batch; its columns live on the held images and the buffers."""
         import pyarrow as pa
 
         columns = [
             pa.array(self._values[field.name], field.type)
             if field.name in self._values
-            else _image_column(self._pixels[field.name][: self._rows], field.type)
+            else _image_column(self._images(field.name), field.type)
             for field in schema
         ]
         return pa.record_batch(columns, schema=schema)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, sample_name
+from fpp_ml_bench.constants import MM_PER_M, VIEWS, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import (
@@ -23,15 +23,19 @@ from fpp_ml_bench.loaders.schema import stored_frames
 from fpp_ml_bench.loaders.sensor import Noise
 from fpp_ml_bench.loaders.settings import BuildSettings
 from fpp_ml_bench.loaders.shards import Row
-from fpp_ml_bench.pixel_sets import edge_distance_px, object_mask
+from fpp_ml_bench.pixel_sets import object_mask, object_near_edge
 
-INTERIOR_PX = 3.0
+INTERIOR_PX = 3
 """Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
 
 
 @dataclass
 class Studio:
-    """A rig with its light and background, ready to photograph objects. Buffers are reused from view to view."""
+    """A rig with its light and background, ready to photograph objects.
+
+    The frames of one object's views lie one after another, so that the shard writer need not copy them; the next
+    object's take their place.
+    """
 
     settings: BuildSettings
 
@@ -41,12 +45,13 @@ class Studio:
         self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
         self._background = background_plane(rig, self.lighting)
         self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
-        shape = (len(rig.sequence), rig.camera.height, rig.camera.width)
-        self._frames = np.zeros(shape, dtype=np.uint8)
         self._stored = stored_frames(rig.sequence, settings.stored)
+        slots = len(VIEWS) if len(self._stored) > 1 else 1
+        self._slots = np.zeros((len(rig.sequence), slots, rig.camera.height, rig.camera.width), dtype=np.uint8)
+        self._taken = 0
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
-        """Sample of ``mesh`` in ``view``. The frames are views into buffers that the next call overwrites.
+        """Sample of ``mesh`` in ``view``; its frames are overwritten six calls later, or by the next if only frame 0 is kept.
 
         Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
         pixels alone: the bytes there, and so the decoded depth, are the same either way.
@@ -59,21 +64,25 @@ class Studio:
         stream = (settings.seed, mesh.name, view)
         background = self._shadowed_background(traced) if self.lighting.shadows else self._background
         whole = background.patched(hits.pixels, lit)
-        self._expose(hits, lit, whole, stream)
-        exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
+        frames = self._slots[:, self._taken % self._slots.shape[1]]
+        self._taken += 1
+        self._expose(frames, hits, lit, whole, stream)
+        exact_mm = np.zeros(frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
         seen = object_mask(exact_mm)
-        depth_mm = decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
+        depth_mm = decode_stack(frames, rig, direction="both", mask=seen).depth_mm
         measured = {
             "distance_mm": distance_m * MM_PER_M,
             "rays": hits.rays + whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
-        frames = {index: self._frames[index] for index in self._stored}
-        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
+        kept = {index: frames[index] for index in self._stored}
+        return Row(sample_name(mesh.name, view), mesh.name, view, kept, depth_mm, exact_mm, measured)
 
-    def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
-        images = self._frames.reshape(len(self._frames), -1)
+    def _expose(
+        self, frames: NDArray[np.uint8], hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]
+    ) -> None:
+        images = frames.reshape(len(frames), -1)
         for run in _runs(self._stored):
             self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
         others = [index for index in range(len(images)) if index not in self._stored]
@@ -111,7 +120,7 @@ def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float
     seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
     both = seen & decoded
     error = depth_mm[both].astype(np.float64) - exact_mm[both]
-    inside = error[edge_distance_px(exact_mm)[both] >= INTERIOR_PX]
+    inside = error[~object_near_edge(exact_mm, INTERIOR_PX)[both]]
     return {
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),
