@@ -45,7 +45,7 @@ def predict_split(
     _prepare(out, samples)
     seconds = []
     for number, sample in enumerate(samples):
-        frames = _captured(opened, method, sample)
+        frames = captured_frames(opened, method, sample)
         if number == 0:
             method.predict(frames)
         started = perf_counter()
@@ -58,7 +58,7 @@ def predict_split(
     return Run(len(samples), median)
 
 
-def _captured(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
+def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
     """The sequence as the method may see it: its own frames, read into memory, and None for every other."""
     frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
     for index in method.frames_used:

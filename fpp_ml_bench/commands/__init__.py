@@ -24,7 +24,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),
     "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
+    "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
     "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
+    "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
 }
 
 _EPILOG = """\

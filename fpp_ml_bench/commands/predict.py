@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from fpp_ml_bench.commands.method_options import add_method_options, chosen_method
+
 SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
 EXAMPLES = (
     "fpp-bench predict classical data/mini --split test --out predictions",
@@ -16,31 +18,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
     parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty folder for predictions")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
-    classical = parser.add_argument_group("classical")
-    classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
-    classical.add_argument(
-        "--direction",
-        choices=("horizontal", "vertical", "both"),
-        default="both",
-        help="fringes to use: one direction is enough for a depth (default: both)",
-    )
+    add_method_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.baselines.methods import METHODS, method
     from fpp_ml_bench.baselines.prediction import predict_split
     from fpp_ml_bench.commands.console import progress_bar
-    from fpp_ml_bench.errors import PredictionError
     from fpp_ml_bench.loaders.store import DatasetFolder
 
-    if args.method not in METHODS:
-        raise PredictionError(f"unknown method {args.method!r}; there are {', '.join(METHODS)}")
-    if args.threads < 1:
-        raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     opened = DatasetFolder(args.dataset)
-    steps = opened.sequence.steps if args.steps is None else args.steps
-    chosen = method(args.method, opened.rig, direction=args.direction, steps=steps, threads=args.threads)
+    chosen = chosen_method(args, opened)
     samples = len(opened.samples(args.split))
     with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
         done = predict_split(opened, chosen, args.split, args.out, advance)

@@ -1,0 +1,182 @@
+"""How long a method takes, measured: latency of one image, throughput of a batch, memory, on a named machine."""
+
+import ctypes
+import gc
+import platform
+import resource
+import statistics
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.baselines.prediction import captured_frames
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.evaluation.timing import HardwareInfo, Timing
+from fpp_ml_bench.hardware import describe_hardware
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+WARM_UP = 3
+_MIB = 2.0**20
+_CLEAR_PEAK = "5"
+"""What resets the kernel's high-water mark of the resident set, written to ``/proc/self/clear_refs`` (proc(5))."""
+
+Frames = Sequence[NDArray[np.uint8] | None]
+
+
+def time_method(
+    opened: DatasetFolder,
+    method: Method,
+    split: str = "test",
+    batch: int = 4,
+    repeats: int = 20,
+    progress: Callable[[int], None] = lambda runs: None,
+) -> Timing:
+    """Time ``method`` on images of ``split``: see `Timing` for what each figure means.
+
+    Frames are in memory before the clock starts, at most ``batch`` sequences of them: neither reading nor writing
+    counts. A method may offer ``predict_batch(list of frames)``, ``device`` (``"cpu"`` or ``"cuda..."``) and
+    ``parameters``; without them it runs one image after another, on the CPU, and has none.
+
+    Raises `DatasetError` for an empty split, or when the dataset lacks a frame that the method needs.
+    """
+    samples = opened.samples(split)
+    if not samples:
+        raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to time")
+    if batch < 1 or repeats < 1:
+        raise ValueError(f"expected a batch and repeats of at least 1, got {batch} and {repeats}")
+    # A batch larger than the split holds its samples again: views, which cost no memory.
+    stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
+    device = str(getattr(method, "device", "cpu"))
+    wait = _synchronise(device)
+
+    def one(number: int) -> float:
+        wait()
+        started = perf_counter()
+        method.predict(stacks[number % len(stacks)])
+        wait()
+        return perf_counter() - started
+
+    for number in range(WARM_UP):
+        one(number)
+    working_mib = _added_by(lambda: one(0))
+    _reset_gpu_peak(device)
+    latencies_ms = []
+    for number in range(repeats):
+        latencies_ms.append(1000 * one(number))
+        progress(1)
+    many, batched = _batch_runner(method)
+    pictures = [stacks[number % len(stacks)] for number in range(batch)]
+    rates = []
+    for number in range(1 + max(1, -(-repeats // batch))):
+        wait()
+        started = perf_counter()
+        many(pictures)
+        wait()
+        if number or not batched:  # the first batch warms the batched path up
+            rates.append(batch / (perf_counter() - started))
+    low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
+    return Timing(
+        provenance="measured",
+        latency_median_ms=_digits(statistics.median(latencies_ms)),
+        latency_p5_ms=_digits(low),
+        latency_p95_ms=_digits(high),
+        repeats=repeats,
+        batch=batch,
+        batched=batched,
+        throughput_per_s=_digits(statistics.median(rates)),
+        peak_memory_mib=round(_peak_mib(), 1),
+        working_memory_mib=None if working_mib is None else round(working_mib, 1),
+        gpu_memory_mib=_gpu_peak_mib(device),
+        parameters=int(getattr(method, "parameters", 0)),
+        frames=len(method.frames_used),
+        image_size=list(opened.size),
+        device=device,
+        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+        software=_software(device),
+    )
+
+
+def _digits(value: float) -> float:
+    """Four significant digits: more would be noise."""
+    return float(f"{value:.4g}")
+
+
+def _batch_runner(method: Method) -> tuple[Callable[[list[Frames]], Any], bool]:
+    """What predicts a batch, and whether it takes the images at once."""
+    at_once = getattr(method, "predict_batch", None)
+    if at_once is not None:
+        return at_once, True
+    return lambda pictures: [method.predict(frames) for frames in pictures], False
+
+
+def _software(device: str) -> dict[str, str]:
+    packages = ["numpy", "numba", *(["torch"] if "torch" in sys.modules else [])]
+    return {
+        "fpp_ml_bench": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+    }
+
+
+def _peak_mib() -> float:
+    """Largest resident set of this process so far (getrusage(2): kB on Linux, bytes on macOS)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / _MIB if sys.platform == "darwin" else peak / 1024
+
+
+def _added_by(run: Callable[[], Any]) -> float | None:
+    """By how much ``run`` raises the resident set at its highest, in MiB; None where the kernel does not tell."""
+    try:
+        _give_back_freed_memory()
+        Path("/proc/self/clear_refs").write_text(_CLEAR_PEAK)
+        before = _status_mib("VmRSS")
+        run()
+        return max(0.0, _status_mib("VmHWM") - before)
+    except (OSError, KeyError):
+        run()
+        return None
+
+
+def _give_back_freed_memory() -> None:
+    """What earlier runs freed would hide what the next one takes; glibc gives it back on request (malloc_trim(3))."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def _status_mib(key: str) -> float:
+    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return float(fields[key].split()[0]) / 1024
+
+
+def _synchronise(device: str) -> Callable[[], object]:
+    """What waits until the device has done everything asked of it; a GPU answers before it has."""
+    if not device.startswith("cuda"):
+        return lambda: None
+    import torch
+
+    return lambda: torch.cuda.synchronize(device)
+
+
+def _reset_gpu_peak(device: str) -> None:
+    if device.startswith("cuda"):
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def _gpu_peak_mib(device: str) -> float | None:
+    if not device.startswith("cuda"):
+        return None
+    import torch
+
+    return round(torch.cuda.max_memory_allocated(device) / _MIB, 1)
