@@ -40,6 +40,8 @@ _LEAST_LIT = 0.02
 _MIDDLE = (0.25, 0.75)
 _MOST_MIDDLE_OF_GRAY, _LEAST_MIDDLE_OF_SINUSOID = 0.15, 0.2
 """A sinusoid spends a third of its pixels in the middle half of its range, a two-valued frame only blurred edges."""
+_LEAST_SHARE = 0.4
+"""A frame of the sequence swings with the modulation that all of them give; one of other fringes with a tenth of it."""
 _LEAST_EDGES_A_LINE = 0.5
 """The coarsest bit changes once on a line across the pattern; fewer changes are outlines of the object."""
 
@@ -191,6 +193,12 @@ def _sinusoids(
     # I_n - A = Re(wave) cos(delta_n) - Im(wave) sin(delta_n), solved for delta_n over all pixels.
     model = np.stack([np.concatenate(real), -np.concatenate(imaginary)], axis=1)
     solved = np.linalg.lstsq(model, np.concatenate(residuals, axis=1).T, rcond=None)[0]
+    foreign = np.flatnonzero(np.hypot(*solved) < _LEAST_SHARE)
+    if foreign.size:
+        # One foreign image disturbs the phase of all others a little: name only those that do not join in.
+        return [
+            f"A_{places[n]}.png: expected {direction} sinusoid step {n}, got an image of other fringes" for n in foreign
+        ]
     found = np.arctan2(solved[1], solved[0])
     off = np.angle(np.exp(1j * (found - shifts)))
     problems = [
@@ -232,6 +240,12 @@ def _codes(
     turned = [
         f"A_{places[i]}.png: expected {direction} Gray bit {i}, varying along image {'xy'[axis]}; it does not"
         for i in np.flatnonzero((across > along) & (across > _LEAST_EDGES_A_LINE))
+    ]
+    grey = (lines.along_x, lines.along_y)[axis][places]
+    turned += [
+        f"A_{places[i]}.png and A_{places[j]}.png: the same image, expected two Gray bits"
+        for i, j in combinations(range(len(places)), 2)
+        if along[i] > _LEAST_EDGES_A_LINE and np.array_equal(grey[i], grey[j])
     ]
     if turned:
         return turned
