@@ -1,5 +1,6 @@
 """Crash safety, with real processes, real signals and a really full disk: nothing half-made, the same bytes at last."""
 
+import contextlib
 import errno
 import os
 import resource
@@ -104,11 +105,20 @@ def whole(tmp_path_factory):
 def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, capsys):
     folder = tmp_path / "killed"
     work = folder / ".build"
+
+    def largest(pattern):
+        """Size of the largest unfinished file of that name."""
+        sizes = [0]
+        for path in work.glob(pattern):
+            with contextlib.suppress(FileNotFoundError):  # finished and renamed meanwhile
+                sizes.append(path.stat().st_size)
+        return max(sizes)
+
     moments = [
-        (1, lambda: any(p.stat().st_size > 1_000_000 for p in work.glob("train*.tmp"))),  # in the middle of a shard
+        (1, lambda: largest("train*.tmp") > 1_000_000),  # in the middle of a shard
         (1, lambda: (work / "train-00000-of-00001.json").exists()),  # straight after the first
-        (2, lambda: any(p.stat().st_size > 100_000 for p in work.glob("*.tmp"))),  # with two worker processes
-        (1, lambda: len(final_shards(folder)) >= 9),
+        (2, lambda: largest("*.tmp") > 100_000),  # with two worker processes
+        (1, lambda: largest("test*.tmp") > 1_000_000),
     ]
     reached = 0
     for workers, moment in moments:
@@ -127,7 +137,6 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
         while group_members(process.pid):
             assert time.monotonic() < end
             time.sleep(0.02)
-        assert not (folder / "manifest.json").exists() or reached == len(moments)
         whole_shards = file_bytes(tiny)
         for shard in final_shards(folder):  # whatever has its final name is complete
             assert shard.read_bytes() == whole_shards[str(shard.relative_to(folder))]
@@ -178,7 +187,13 @@ def test_resume_trusts_no_damaged_work(half_built, whole, damage):
 
 
 def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(half_built, whole):
-    for name in (".README.md.123.tmp", "train/.state.json.9.tmp", "meshes/.mug.ply.tmp", ".build/test.1.data.tmp"):
+    for name in (
+        ".README.md.123.tmp",
+        "train/.state.json.9.tmp",
+        "meshes/.mug.ply.tmp",
+        ".build/test.1.data.tmp",
+        ".build/.x.json.7.tmp",
+    ):
         (half_built / name).write_text("half a file")
     (half_built / "notes.txt").write_text("mine")
     build(half_built, half_settings(), workers=1)
