@@ -2,6 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +13,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.frames import Sequence
-from fpp_ml_bench.loaders.manifest import ShardFile, file_hash
+from fpp_ml_bench.loaders.direct_file import DirectFile
+from fpp_ml_bench.loaders.manifest import ShardFile
 from fpp_ml_bench.loaders.schema import (
     DATA_GROUP,
     DEPTH,
@@ -101,17 +104,23 @@ class ShardWriter:
         stem = f"{self._plan.name}.{os.getpid()}"
         temporary = {group: self._scratch / f"{stem}.{group}.tmp" for group in self._groups}
         try:
-            described = self._write_streams(rows, temporary, row_done)
+            described, sinks = self._write_streams(rows, temporary, row_done)
             files = []
             for group, path in temporary.items():
                 target = self._folder / self._plan.path(group)
-                entry = ShardFile(
-                    self._plan.path(group), self._plan.split, group, self._plan.first_row, len(self._plan.samples),
-                    path.stat().st_size, file_hash(path),
-                )  # fmt: skip
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
-                files.append(entry)
+                files.append(
+                    ShardFile(
+                        path=self._plan.path(group),
+                        split=self._plan.split,
+                        group=group,
+                        first_row=self._plan.first_row,
+                        rows=len(self._plan.samples),
+                        bytes=sinks[group].size,
+                        xxh3_128=sinks[group].xxh3_128,
+                    )
+                )
         except (OSError, pa.ArrowException) as error:
             raise BuildError(
                 f"{self._folder / self._plan.path(DATA_GROUP)}: can't be written ({_reason(error)}); free some space "
@@ -124,16 +133,20 @@ class ShardWriter:
 
     def _write_streams(
         self, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
-    ) -> list[dict[str, Any]]:
+    ) -> tuple[list[dict[str, Any]], dict[str, DirectFile]]:
         import pyarrow as pa
 
         schemas = {
             group: arrow_schema(group_columns(self._sequence, group, frames, self._exact), self._size)
             for group, frames in self._groups.items()
         }
-        sinks = {group: pa.OSFile(str(path), "wb") for group, path in paths.items()}
-        try:
-            writers = {group: pa.ipc.new_stream(sinks[group], schemas[group]) for group in self._groups}
+        with ThreadPoolExecutor(1) as thread, ExitStack() as files:
+            sinks = {group: DirectFile(path, thread) for group, path in paths.items()}
+            for sink in sinks.values():
+                files.callback(sink.close)
+            writers = {
+                group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schemas[group]) for group, sink in sinks.items()
+            }
             described = []
             data = _Batch(self._size)
             data.restart(len(self._plan.samples))
@@ -164,10 +177,7 @@ class ShardWriter:
             writers[DATA_GROUP].write_batch(data.record_batch(schemas[DATA_GROUP]))
             for writer in writers.values():
                 writer.close()
-        finally:
-            for sink in sinks.values():
-                sink.close()
-        return described
+        return described, sinks
 
     def _checked(self, rows: Iterable[Row]) -> Iterator[Row]:
         rows = iter(rows)

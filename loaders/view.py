@@ -51,7 +51,7 @@ class Studio:
         self._taken = 0
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
-        """Sample of ``mesh`` in ``view``; its frames are overwritten six calls later, by the next if only frame 0 is kept.
+        """Sample of ``mesh`` in ``view``; six calls later its frames are overwritten (one, if only frame 0 is kept).
 
         Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
         pixels alone: the bytes there, and so the decoded depth, are the same either way.
