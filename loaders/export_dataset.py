@@ -41,7 +41,7 @@ def export(
             if form == "parquet":
                 from fpp_ml_bench.loaders.export_parquet import write_parquet
 
-                write_parquet(dataset, folder, splits, progress)
+                write_parquet(dataset, folder, splits, threads, progress)
             elif form == "mat":
                 from fpp_ml_bench.loaders.export_tree import write_tree
 

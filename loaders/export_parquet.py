@@ -6,6 +6,7 @@ split by significance, which suits smooth floats.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,19 +61,28 @@ Configurations: {names}. A configuration reads only its own columns.
 
 
 def write_parquet(
-    dataset: DatasetFolder, folder: Path, splits: list[str], row_done: Callable[[int], None] = lambda rows: None
-) -> None:
+    dataset: DatasetFolder, folder: Path, splits: list[str], threads: int = 1,
+    rows_done: Callable[[int], None] = lambda rows: None,
+) -> None:  # fmt: skip
     """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it.
 
-    Raises ``OSError`` when the disk refuses; one group of rows is held in memory.
+    Raises ``OSError`` when the disk refuses. Each thread writes a shard and holds one group of its rows in memory.
     """
     manifest = dataset.manifest
-    for shard in manifest.shards:
-        if shard.group == DATA_GROUP and shard.split in splits:
+    shards = [shard for shard in manifest.shards if shard.group == DATA_GROUP and shard.split in splits]
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(threads) as pool:
+        jobs = []
+        for shard in shards:
             stem = Path(shard.path).stem.removeprefix(f"{DATA_GROUP}-")
             path = folder / "data" / f"{shard.split}-{stem}.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _write_shard(dataset, shard, path, row_done)
+            jobs.append(pool.submit(_write_shard, dataset, shard, path, rows_done))
+        try:
+            for job in as_completed(jobs):
+                job.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     (folder / "README.md").write_text(_card(dataset, splits), encoding="utf-8")
 
 
@@ -82,7 +92,7 @@ def all_columns(dataset: DatasetFolder) -> list[str]:
     return [*LABELS, *frames, DEPTH, *([DEPTH_EXACT] if dataset.has_exact else []), *RANGE]
 
 
-def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, row_done: Callable[[int], None]) -> None:
+def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, rows_done: Callable[[int], None]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -108,7 +118,7 @@ def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, row_done:
             for first in range(0, table.num_rows, rows):
                 part = table.slice(first, rows)
                 writer.write_table(part, row_group_size=rows)
-                row_done(part.num_rows)
+                rows_done(part.num_rows)
     except pa.ArrowException as error:
         raise OSError(f"{path.name}: {error}") from error
 
