@@ -1,31 +1,25 @@
 """Scoring a folder of predictions against one split of a dataset: everything checked, every offender named, at once."""
 
-import platform
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import local
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__
+from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.predictions import buffer_for, list_problems, read_prediction, value_problems
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, PROTOCOL_VERSION, TARGETS
-from fpp_ml_bench.evaluation.result import Environment, Result, result_from_rows
-from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
+from fpp_ml_bench.evaluation import scoring
+from fpp_ml_bench.evaluation.listing import list_folder
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, PROTOCOL_VERSION, TARGETS
+from fpp_ml_bench.evaluation.submission_file import SUBMISSION_FILE, read_plain
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.evaluation.timing import HardwareInfo
 from fpp_ml_bench.frames import Sequence
-from fpp_ml_bench.hardware import describe_hardware, usable_cores
 from fpp_ml_bench.pixel_sets import edge_jump_mm
 
-WORKERS = 4
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.result import Result
+    from fpp_ml_bench.evaluation.submission import Submission
 
 
 class ScoredDataset(Protocol):
@@ -53,35 +47,41 @@ def evaluate(
     split: str = "test",
     target: str = "depth",
     edge_band_px: int = EDGE_BAND_PX,
-) -> Result:
-    """Score ``folder`` (one ``{sample}.npy`` in mm per sample, and ``submission.yaml``) on a split of ``dataset``.
+    mode: str = "standard",
+) -> "Result":
+    """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
-    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast). Memory does not grow with
-    the number of samples, and the result does not depend on the number of cores.
+    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
+    or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
+    of samples, and the result does not depend on the number of cores.
 
     Raises SubmissionError for the description, PredictionError (naming every offending file) for the predictions, and
     DatasetError for a target that is no depth map.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    if target not in TARGETS:
-        raise DatasetError(f"expected target {' or '.join(TARGETS)}, got {printable(target)!r}")
-    if target == "depth_exact" and not dataset.has_exact:
-        raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
-    samples = dataset.samples(split)
-    if not samples:
-        raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
-    submission, refused = None, None
+    samples = _samples(folder, dataset, split, target, mode)
+    content, refused = None, None
     try:
-        submission = _described(folder, len(dataset.sequence))
+        content = read_plain(folder)
     except SubmissionError as error:
         refused = error
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
-    problems = list_problems(folder, samples, split, split_of)
-    rows = []
-    for found, row in _scored(folder, dataset, samples, target, edge_band_px):
-        problems += found
+    listing = list_folder(folder, samples, split, split_of)
+    units, level = _declared(content or {})
+    rules = scoring.Rules(dataset.size, units, level, mode, edge_band_px)  # type: ignore[arg-type]
+    problems, rows = list(listing.problems), []
+    # The description is checked while the first files are scored: pydantic takes long to import.
+    found = scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target))
+    submission: Submission | None = None
+    if content is not None:
+        try:
+            submission = _described(folder, content, len(dataset.sequence), listing.form, mode)
+        except SubmissionError as error:
+            refused = error
+    if refused is not None and units not in ("mm", "m", "normalised"):
+        found = iter(())
+    for offences, row in found:
+        problems += offences
         rows += row
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
@@ -89,9 +89,72 @@ def evaluate(
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {count}:", described + problems)
     if refused or submission is None:
         raise refused or SubmissionError(f"{printable(str(folder), 500)} has no description")
+    return _result(rows, dataset, split, target, mode, edge_band_px, submission)
+
+
+def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode: str) -> list[str]:
+    """The split's samples; refuses arguments that name nothing."""
+    if not folder.is_dir():
+        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+    if target not in TARGETS:
+        raise DatasetError(f"expected target {' or '.join(TARGETS)}, got {printable(target)!r}")
+    if mode not in MODES:
+        raise DatasetError(f"expected mode {' or '.join(MODES)}, got {printable(mode)!r}")
+    if target == "depth_exact" and not dataset.has_exact:
+        raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
+    samples = dataset.samples(split)
+    if not samples:
+        raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
+    return samples
+
+
+def _declared(content: dict[Any, Any]) -> tuple[Any, float | None]:
+    """Units and PNG scale as declared; what they are not is `submission`'s to refuse."""
+    units, level = content.get("units", "mm"), content.get("png_mm_per_level")
+    return units, float(level) if isinstance(level, int | float) and not isinstance(level, bool) else None
+
+
+def _described(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> "Submission":
+    """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
+    from fpp_ml_bench.evaluation.submission import check_submission
+
+    submission = check_submission(folder, content)
+    file = printable(str(folder / SUBMISSION_FILE), 500)
+    outside = [index for index in submission.frames_used if index >= frames]
+    if outside:
+        raise SubmissionError(
+            f"{file}: frames_used: expected indices from 0 to {frames - 1} of "
+            f"this dataset's sequence, got {printable(str(outside), 100)}"
+        )
+    if (form == ".png") != (submission.png_mm_per_level is not None):
+        raise SubmissionError(
+            f"{file}: png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
+            if form == ".png"
+            else f"{file}: png_mm_per_level is given, but the predictions are {form}; remove the key"
+        )
+    if mode == "paper-individual" and submission.units != "normalised":
+        raise SubmissionError(
+            f"{file}: --mode paper-individual scores normalised depth (units: normalised), these are in "
+            f"{submission.units}; score them with --mode standard"
+        )
+    return submission
+
+
+def _result(
+    rows: list[dict[str, Any]],
+    dataset: ScoredDataset,
+    split: str,
+    target: str,
+    mode: str,
+    edge_band_px: int,
+    submission: "Submission",
+) -> "Result":
+    from fpp_ml_bench.evaluation.provenance import environment
+    from fpp_ml_bench.evaluation.result import result_from_rows
+
     height, width = dataset.size
     return result_from_rows(
-        rows,
+        [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
         protocol_version=PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=submission,
@@ -100,92 +163,11 @@ def evaluate(
             "fingerprint": dataset.fingerprint,
             "split": split,
             "size": [height, width],
-            "samples": len(samples),
+            "samples": len(rows),
         },
         target=target,
+        mode=mode,
         edge_band_px=edge_band_px,
         edge_jump_mm=edge_jump_mm(width),
-        environment=_environment(),
-    )
-
-
-def _described(folder: Path, frames: int) -> Submission:
-    """The folder's description, its frame indices checked against a sequence of ``frames`` frames."""
-    submission = read_submission(folder)
-    outside = [index for index in submission.frames_used if index >= frames]
-    if outside:
-        raise SubmissionError(
-            f"{printable(str(folder / SUBMISSION_FILE), 500)}: frames_used: expected indices from 0 to {frames - 1} of "
-            f"this dataset's sequence, got {printable(str(outside), 100)}"
-        )
-    return submission
-
-
-Found = tuple[list[str], list[dict[str, Any]]]
-
-
-def _scored(
-    folder: Path, dataset: ScoredDataset, samples: list[str], target: str, edge_band_px: int
-) -> Iterator[Found]:
-    """Problems and the row of each sample that is there, in order; a few files at a time, read by a few threads."""
-    size = dataset.size
-    memory = local()
-
-    def work(path: Path, sample: str, target_mm: NDArray[np.float32]) -> Found:
-        if not hasattr(memory, "buffer"):
-            memory.buffer = buffer_for(size)
-        return _score_file(path, sample, target_mm, edge_band_px, memory.buffer)
-
-    with ThreadPoolExecutor(min(WORKERS, usable_cores())) as pool:
-        yield from _in_order(pool, [(folder / f"{s}.npy", s) for s in samples], dataset, target, work)
-
-
-def _in_order(
-    pool: ThreadPoolExecutor,
-    files: list[tuple[Path, str]],
-    dataset: ScoredDataset,
-    target: str,
-    work: Callable[[Path, str, NDArray[np.float32]], Found],
-) -> Iterator[Found]:
-    waiting: deque[Future[Found]] = deque()
-    for path, sample in files:
-        if not path.is_symlink() and not path.exists():
-            continue  # listed as missing already
-        waiting.append(pool.submit(work, path, sample, dataset.target_mm(sample, target)))
-        if len(waiting) > 2 * WORKERS:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
-
-
-def _score_file(path: Path, sample: str, target_mm: NDArray[np.float32], band_px: int, buffer: bytearray) -> Found:
-    low, high = float(target_mm.min()), float(target_mm.max())
-    if not (low >= 0 and np.isfinite(high)):
-        raise DatasetError(f"{sample}: the target depth holds NaN, infinite or negative values; run: fpp-bench verify")
-    try:
-        prediction, digest = read_prediction(path, (target_mm.shape[0], target_mm.shape[1]), buffer)
-        problems = value_problems(prediction, high)
-        scores = None if problems else score_sample(prediction, target_mm, band_px)
-    except PredictionError as error:
-        problems, scores = [str(error)], None
-    if scores is None:
-        return [f"{path.name}: {problem}" for problem in problems], []
-    return [], [
-        {
-            "sample": sample,
-            "prediction_sha256": digest,
-            "object_pixels": scores.object.pixels,
-            "background_pixels": scores.background.pixels,
-            **scores.metrics(),
-        }
-    ]
-
-
-def _environment() -> Environment:
-    import pyarrow
-
-    return Environment(
-        python=platform.python_version(),
-        packages={"fpp_ml_bench": __version__, "numpy": np.__version__, "pyarrow": pyarrow.__version__},
-        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+        environment=environment(),
     )

@@ -6,16 +6,21 @@ A change that can move any number in a result raises `PROTOCOL_VERSION`; a chang
 
 from typing import Literal, get_args
 
-PROTOCOL_VERSION = "1.0.0"
-SchemaVersion = Literal["1.0.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "1.0.0"
+PROTOCOL_VERSION = "1.1.0"
+SchemaVersion = Literal["2.0.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.0.0"
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle range"]
+Mode = Literal["standard", "paper-individual"]
+Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)
+MODES: tuple[str, ...] = get_args(Mode)
 
 EDGE_BAND_PX = 3
 """Object pixels nearer than this to a depth edge form the edge set, the others the interior."""
+WIDE_BAND_PX = 8
+"""The same split at a fixed width, reported in every result whatever ``--edge-band`` is: results stay comparable."""
 
 PIXEL_SETS = ("overall", "object", "background")
 HEADLINE = tuple(f"{pixels}_{error}_mm" for pixels in PIXEL_SETS for error in ("mae", "rmse"))
@@ -34,7 +39,25 @@ BESIDE = (
 )
 """Reported beside the headline: the object away from and along depth edges, and what was not measured at all."""
 
-METRICS = HEADLINE + BESIDE
+WITHIN_MM = (1, 2, 5, 10)
+WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
+SIGNED = ("object_bias_mm", "object_valid_bias_mm")
+"""The only scores that may be negative: the others are magnitudes or shares."""
+SPREAD_OF_ERROR = (
+    "object_median_mm",
+    "object_p95_mm",
+    "object_max_mm",
+    *WITHIN,
+    *SIGNED,
+    "object_shift_free_mae_mm",
+    "object_wide_band_mae_mm",
+    "object_wide_interior_mae_mm",
+    "object_wide_band_share",
+)
+"""How the error is distributed over the object set: order statistics, tolerances, bias, what is left without it."""
+
+METRICS = HEADLINE + BESIDE + SPREAD_OF_ERROR
+HIGHER_IS_BETTER = WITHIN
 
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""
@@ -42,3 +65,11 @@ LARGEST_MM = 1e30
 METRES_BELOW = 10.0
 MILLIMETRES_ABOVE = 1000.0
 """A prediction whose largest value is under METRES_BELOW, for a target above MILLIMETRES_ABOVE, is not in mm."""
+METRES_AT_MOST = 100.0
+"""A prediction in m whose median over the object is above this is in mm."""
+NORMALISED_AT_MOST = 1.2
+"""A normalised prediction whose median over the object is above this is no share of the sample's range."""
+
+BOOTSTRAP_RESAMPLES = 10_000
+BOOTSTRAP_SEED = 20_250
+CONFIDENCE = 0.95

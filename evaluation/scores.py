@@ -1,71 +1,87 @@
-"""Scores of one sample: MAE and RMSE over the three pixel sets, in float64, in one pass over the image.
+"""Scores of one sample: MAE and RMSE over the pixel sets, and how the object's error is distributed, in float64.
 
-Numerical contract: differences are formed in float64 whatever the input; every sum is float64 over blocks of
-`BLOCK` pixels that stay in the cache, the block sums added exactly (`math.fsum`). Error magnitudes from 1e-140 to 1e140
-neither overflow nor underflow. The overall score is composed of object and background, so that
-overall MAE = f object + (1 - f) background, with f the object's share of the pixels, holds by construction.
+The overall score is composed of object and background, so that overall MAE = f object + (1 - f) background, with f the
+object's share of the pixels, holds by construction. How sums keep their digits: `fpp_ml_bench.evaluation.error_stats`.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
-from fpp_ml_bench.pixel_sets import object_mask, object_near_edge
+from fpp_ml_bench.evaluation.error_stats import EMPTY as EMPTY
+from fpp_ml_bench.evaluation.error_stats import ErrorStats, combine, mean_of, stats_of
+from fpp_ml_bench.evaluation.object_pass import ObjectErrors, object_errors
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN, WITHIN_MM
+from fpp_ml_bench.pixel_sets import object_near_edge
 
-BLOCK = 9600
-"""Pixels a block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
-would then depend on the number of cores; below that a score is the same on every machine of one kind."""
-
-_NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
+_EDGE, _WIDE, _MISSING = 1, 2, 4
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorStats:
-    """Mean absolute and root mean square error in mm over ``pixels`` pixels; both None for an empty set, never 0."""
+class Distribution:
+    """The object's error in mm beyond its mean: order statistics of |e|, shares of pixels, signed means.
 
-    pixels: int
-    mae_mm: float | None
-    rmse_mm: float | None
+    All None for an empty object. ``shift_free_mae_mm`` is the MAE left after the best single offset, the median of e,
+    has been taken off.
+    """
 
-
-EMPTY = ErrorStats(0, None, None)
-
-
-def combine(*parts: ErrorStats) -> ErrorStats:
-    """Statistics of the union of disjoint pixel sets. Exact for one non-empty part; no square leaves its scale."""
-    filled = [(s.pixels, s.mae_mm, s.rmse_mm) for s in parts if s.mae_mm is not None and s.rmse_mm is not None]
-    if not filled:
-        return EMPTY
-    total = sum(n for n, _, _ in filled)
-    if len(filled) == 1:
-        return ErrorStats(total, filled[0][1], filled[0][2])
-    mae = math.fsum(n / total * mae for n, mae, _ in filled)
-    rmse = math.hypot(*(math.sqrt(n / total) * rmse for n, _, rmse in filled))
-    return ErrorStats(total, mae, rmse)
+    median_mm: float | None = None
+    p95_mm: float | None = None
+    max_mm: float | None = None
+    within: tuple[float | None, ...] = (None,) * len(WITHIN_MM)
+    bias_mm: float | None = None
+    valid_bias_mm: float | None = None
+    shift_free_mae_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SampleScores:
-    """Scores of one sample; ``object`` is ``interior`` and ``edge`` together.
+    """Scores of one sample: statistics of the background and of the object's zones.
 
-    ``interior_valid`` and ``edge_valid`` are those pixels of the two that were measured (predicted above 0 mm).
+    A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
+    measured: predicted 0 mm or less); every score of the object is a union of zones.
     """
 
-    object: ErrorStats
     background: ErrorStats
-    interior: ErrorStats
-    edge: ErrorStats
-    interior_valid: ErrorStats
-    edge_valid: ErrorStats
+    zones: dict[int, ErrorStats]
+    distribution: Distribution
+
+    def _union(self, bits: int = 0, value: int = 0) -> ErrorStats:
+        return combine(*(stats for zone, stats in self.zones.items() if zone & bits == value))
+
+    @property
+    def object(self) -> ErrorStats:
+        return self._union()
+
+    @property
+    def interior(self) -> ErrorStats:
+        return self._union(_EDGE, 0)
+
+    @property
+    def edge(self) -> ErrorStats:
+        return self._union(_EDGE, _EDGE)
+
+    @property
+    def wide_interior(self) -> ErrorStats:
+        return self._union(_WIDE, 0)
+
+    @property
+    def wide_band(self) -> ErrorStats:
+        return self._union(_WIDE, _WIDE)
 
     @property
     def valid(self) -> ErrorStats:
-        return combine(self.interior_valid, self.edge_valid)
+        return self._union(_MISSING, 0)
+
+    @property
+    def interior_valid(self) -> ErrorStats:
+        return self._union(_EDGE | _MISSING, 0)
+
+    @property
+    def edge_valid(self) -> ErrorStats:
+        return self._union(_EDGE | _MISSING, _EDGE)
 
     @property
     def missing(self) -> int:
@@ -78,23 +94,34 @@ class SampleScores:
 
     def metrics(self) -> dict[str, float | None]:
         """The keys of ``protocol.METRICS``; None where the sample has no pixel to say anything about."""
-        overall, valid, inside, pixels = self.overall, self.valid, self.interior, self.object.pixels
+        overall, whole, valid, inside = self.overall, self.object, self.valid, self.interior
+        inside_valid, band, spread = self.interior_valid, self.wide_band, self.distribution
         return {
             "overall_mae_mm": overall.mae_mm,
             "overall_rmse_mm": overall.rmse_mm,
-            "object_mae_mm": self.object.mae_mm,
-            "object_rmse_mm": self.object.rmse_mm,
+            "object_mae_mm": whole.mae_mm,
+            "object_rmse_mm": whole.rmse_mm,
             "background_mae_mm": self.background.mae_mm,
             "background_rmse_mm": self.background.rmse_mm,
-            "object_interior_mae_mm": self.interior.mae_mm,
-            "object_interior_rmse_mm": self.interior.rmse_mm,
+            "object_interior_mae_mm": inside.mae_mm,
+            "object_interior_rmse_mm": inside.rmse_mm,
             "object_edge_mae_mm": self.edge.mae_mm,
             "object_edge_rmse_mm": self.edge.rmse_mm,
             "object_valid_mae_mm": valid.mae_mm,
-            "object_interior_valid_mae_mm": self.interior_valid.mae_mm,
-            "object_edge_share": _share(self.edge.pixels, pixels),
-            "object_missing_share": _share(pixels - valid.pixels, pixels),
-            "object_interior_missing_share": _share(inside.pixels - self.interior_valid.pixels, inside.pixels),
+            "object_interior_valid_mae_mm": inside_valid.mae_mm,
+            "object_edge_share": _share(self.edge.pixels, whole.pixels),
+            "object_missing_share": _share(whole.pixels - valid.pixels, whole.pixels),
+            "object_interior_missing_share": _share(inside.pixels - inside_valid.pixels, inside.pixels),
+            "object_median_mm": spread.median_mm,
+            "object_p95_mm": spread.p95_mm,
+            "object_max_mm": spread.max_mm,
+            **dict(zip(WITHIN, spread.within, strict=True)),
+            "object_bias_mm": spread.bias_mm,
+            "object_valid_bias_mm": spread.valid_bias_mm,
+            "object_shift_free_mae_mm": spread.shift_free_mae_mm,
+            "object_wide_band_mae_mm": band.mae_mm,
+            "object_wide_interior_mae_mm": self.wide_interior.mae_mm,
+            "object_wide_band_share": _share(band.pixels, whole.pixels),
         }
 
 
@@ -102,16 +129,18 @@ def _share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: _finish refuses it
+@np.errstate(over="ignore")  # an overflow is no warning here: `error_stats.finish` refuses it
 def score_sample(
     prediction_mm: NDArray[np.floating[Any]],
     target_mm: NDArray[np.floating[Any]],
     edge_band_px: int = EDGE_BAND_PX,
+    compiled: bool = False,
 ) -> SampleScores:
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
     sets after paper Section 5.3.2 (`fpp_ml_bench.pixel_sets`): object where the target is above 0, else background.
+    ``compiled`` takes the numba pass over the image; the numbers agree to a few units in the last place.
 
     Raises PredictionError for shapes that differ, dtypes that are not real floats, and errors that are not finite.
 
@@ -120,85 +149,63 @@ def score_sample(
     >>> score_sample(target + 2.0, target).overall
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
-    if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
-        )
-    if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
-        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
-    prediction, target = prediction_mm.ravel(), target_mm.ravel()
-    index = np.flatnonzero(object_mask(target))
-    measured = prediction.take(index)
-    errors = measured.astype(np.float64)
-    errors -= target.take(index)
-    if not np.isfinite(errors).all():
-        raise PredictionError(_NOT_FINITE)
-    missing = measured <= 0
-    near = object_near_edge(target_mm, edge_band_px).ravel().take(index)
-    if missing.any():
-        interior_valid, edge_valid = _stats(errors[~(near | missing)]), _stats(errors[near & ~missing])
-        interior = combine(interior_valid, _stats(errors[missing & ~near]))
-        edge = combine(edge_valid, _stats(errors[missing & near]))
-    else:
-        interior, edge = interior_valid, edge_valid = _stats(errors[~near]), _stats(errors[near])
-    return SampleScores(
-        object=combine(interior, edge),
-        background=_background_stats(prediction, target, index),
-        interior=interior,
-        edge=edge,
-        interior_valid=interior_valid,
-        edge_valid=edge_valid,
+    found = object_errors(prediction_mm, target_mm, compiled)
+    if not found.index.size:
+        return SampleScores(found.background, {}, Distribution())
+    zone = object_near_edge(target_mm, edge_band_px).ravel().take(found.index).view(np.uint8) * np.uint8(_EDGE)
+    zone |= object_near_edge(target_mm, WIDE_BAND_PX).ravel().take(found.index).view(np.uint8) * np.uint8(_WIDE)
+    zone |= found.missing.view(np.uint8) * np.uint8(_MISSING)
+    present = np.flatnonzero(np.bincount(zone)).tolist()
+    zones = {code: stats_of(found.errors[zone == code]) for code in present}
+    return SampleScores(found.background, zones, _distribution(found))
+
+
+def headline_scores(
+    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
+) -> tuple[ErrorStats, ErrorStats, ErrorStats]:
+    """Overall, object and background of one sample alone: the six headline numbers, without zones and distribution.
+
+    Arguments and errors as `score_sample`.
+    """
+    found = object_errors(prediction_mm, target_mm, compiled)
+    inside = stats_of(found.errors)
+    return combine(inside, found.background), inside, found.background
+
+
+def _distribution(found: ObjectErrors) -> Distribution:
+    errors = found.errors
+    magnitude = np.abs(errors)
+    within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
+    largest = float(magnitude.max())
+    median, p95 = _quantiles(magnitude, 0.5, 0.95)
+    signed = errors.copy()
+    offset = _quantiles(signed, 0.5)[0]
+    np.subtract(errors, offset, out=signed)
+    np.abs(signed, out=signed)
+    return Distribution(
+        median_mm=median,
+        p95_mm=p95,
+        max_mm=largest,
+        within=within,
+        bias_mm=mean_of(errors),
+        valid_bias_mm=mean_of(errors[~found.missing] if found.missing.any() else errors),
+        shift_free_mae_mm=mean_of(signed),
     )
 
 
-def _stats(errors: NDArray[np.float64]) -> ErrorStats:
-    """Statistics of float64 errors (n,), in blocks; overwrites them by their magnitudes."""
-    absolute, squares = [], []
-    for start in range(0, errors.size, BLOCK):
-        block = errors[start : start + BLOCK]
-        squares.append(float(block.dot(block)))
-        np.abs(block, out=block)
-        absolute.append(float(block.sum()))
-    return _finish(errors.size, absolute, squares)
+def _quantiles(values: NDArray[np.float64], *levels: float) -> list[float]:
+    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``.
 
-
-def _background_stats(
-    prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]], index: NDArray[np.intp]
-) -> ErrorStats:
-    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
-
-    Not overall minus object: that would leave rounding dust where the background is perfect.
+    One place at a time: NumPy's partition for a single place is vectorised, for several it is seven times slower.
     """
-    pixels = prediction.size - index.size
-    if pixels == 0:
-        return EMPTY
-    # A target without negative values is exactly 0 on the background: there the prediction is the error.
-    target_is_zero = bool(target.min() >= 0)
-    signed = not (target_is_zero and bool(prediction.min() >= 0))
-    buffer = np.empty(min(BLOCK, prediction.size))
-    absolute, squares = [], []
-    starts = range(0, prediction.size, BLOCK)
-    cuts = [*np.searchsorted(index, list(starts)).tolist(), index.size]
-    for number, start in enumerate(starts):
-        block = buffer[: min(BLOCK, prediction.size - start)]
-        np.copyto(block, prediction[start : start + BLOCK])
-        if not target_is_zero:
-            block -= target[start : start + BLOCK]
-        block[index[cuts[number] : cuts[number + 1]] - start] = 0.0
-        squares.append(float(block.dot(block)))
-        if signed:
-            np.abs(block, out=block)
-        absolute.append(float(block.sum()))
-    return _finish(pixels, absolute, squares)
-
-
-def _finish(pixels: int, absolute: list[float], squares: list[float]) -> ErrorStats:
-    if pixels == 0:
-        return EMPTY
-    try:
-        mae, mean_square = math.fsum(absolute) / pixels, math.fsum(squares) / pixels
-    except (OverflowError, ValueError):  # fsum of huge values, or of inf and -inf
-        mae = mean_square = math.inf
-    if not math.isfinite(mae) or not math.isfinite(mean_square):
-        raise PredictionError(_NOT_FINITE)
-    return ErrorStats(pixels, mae, math.sqrt(mean_square))
+    found, first = [], 0
+    for level in levels:
+        place = level * (values.size - 1)
+        low = int(place)
+        rest = values[first:]
+        rest.partition(low - first)
+        below = float(values[low])
+        above = float(values[low + 1 :].min()) if low + 1 < values.size else below
+        found.append(below + (above - below) * (place - low))
+        first = low
+    return found

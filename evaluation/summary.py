@@ -1,10 +1,13 @@
-"""From scores of samples to scores of a split: plain mean over samples (the headline), median, and pixel-pooled."""
+"""From scores of samples to scores of a split: mean over samples (the headline), median, pixel-pooled, objects."""
 
+import math
 import statistics
 from collections.abc import Iterable, Sequence
+from typing import Any
 
+from fpp_ml_bench.evaluation.error_stats import ErrorStats, combine
 from fpp_ml_bench.evaluation.protocol import METRICS
-from fpp_ml_bench.evaluation.scores import ErrorStats, SampleScores, combine
+from fpp_ml_bench.evaluation.scores import SampleScores
 
 Scores = dict[str, float | None]
 
@@ -17,6 +20,34 @@ def mean_over_samples(rows: Sequence[Scores]) -> Scores:
 def median_over_samples(rows: Sequence[Scores]) -> Scores:
     """Median of each metric over the samples that have it; None where no sample has."""
     return {key: statistics.median(values) if (values := _present(rows, key)) else None for key in METRICS}
+
+
+def spread_over_samples(rows: Sequence[Scores]) -> Scores:
+    """Sample standard deviation (n - 1) of each metric over the samples that have it; None for fewer than two."""
+    return {key: _deviation(_present(rows, key)) for key in METRICS}
+
+
+def _deviation(values: list[float]) -> float | None:
+    if len(values) < 2:
+        return None
+    mean = statistics.fmean(values)
+    largest = max(abs(value - mean) for value in values)
+    if largest == 0:
+        return 0.0
+    # Scaled, so that deviations of 1e-200 or 1e200 mm can be squared.
+    squares = math.fsum(((value - mean) / largest) ** 2 for value in values)
+    return largest * math.sqrt(squares / (len(values) - 1))
+
+
+def per_object(rows: Sequence[Scores], objects: Sequence[str]) -> list[dict[str, Any]]:
+    """Each object's number of samples, mean and spread of every metric over its views, in order of appearance."""
+    found = []
+    for name in dict.fromkeys(objects):
+        own = [row for row, owner in zip(rows, objects, strict=True) if owner == name]
+        found.append(
+            {"object": name, "samples": len(own), "metrics": mean_over_samples(own), "spread": spread_over_samples(own)}
+        )
+    return found
 
 
 def pooled(samples: Iterable[SampleScores]) -> Scores:

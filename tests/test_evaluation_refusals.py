@@ -199,7 +199,7 @@ DESCRIPTIONS = {
     "escape in name": ({"name": "a\x1b[2J"}, r"name: .*U\+001B"),
     "line break in name": ({"name": "a\nb"}, r"name: .*U\+000A"),
     "reversed text in name": ({"name": "a\u202eb"}, r"name: .*U\+202E"),
-    "metres": ({"units": "m"}, "units: expected mm, got 'm'"),
+    "inches": ({"units": "inch"}, "units: Input should be 'mm', 'm' or 'normalised' .got 'inch'"),
     "no units": ({"units": ...}, "units: is missing"),
     "range as text": ({"uses_ground_truth_range": "yes"}, "uses_ground_truth_range: .*boolean"),
     "range as number": ({"uses_ground_truth_range": 0}, "uses_ground_truth_range: .*boolean"),

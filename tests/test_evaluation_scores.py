@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation import scores
+from fpp_ml_bench.evaluation import error_stats
+from fpp_ml_bench.evaluation.protocol import WITHIN
 from fpp_ml_bench.evaluation.scores import EMPTY, ErrorStats, combine, score_sample
 from fpp_ml_bench.evaluation.summary import mean_over_samples, median_over_samples, pooled
 from fpp_ml_bench.pixel_sets import depth_edges, edge_distance_px, object_near_edge
@@ -93,24 +94,28 @@ def test_block_borders_and_empty_blocks(monkeypatch):
     prediction = target + np.random.default_rng(0).normal(0, 2, target.shape)
     whole = score_sample(prediction, target).metrics()
     for block in (1, 7, 52, 1000):
-        monkeypatch.setattr(scores, "BLOCK", block)
+        monkeypatch.setattr(error_stats, "BLOCK", block)
         blocked = score_sample(prediction, target).metrics()
-        assert all(blocked[key] == pytest.approx(whole[key], rel=1e-13) for key in whole)
+        for key, value in whole.items():
+            assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
 def test_ground_truth_scores_exactly_zero(kind):
-    target = disk_depth((60, 80), 1).astype(kind)
+    target = disk_depth((120, 140), 1).astype(kind)
     computed = score_sample(target.copy(), target).metrics()
     errors = [value for key, value in computed.items() if key.endswith("_mm")]
     assert errors == [0.0] * len(errors)
     assert computed["object_missing_share"] == 0.0
+    assert {computed[key] for key in WITHIN} == {1.0}
 
 
 def test_closed_forms_of_a_shift_and_of_nothing():
-    target = disk_depth((60, 80), 2)
+    target = disk_depth((120, 140), 2)
     shifted = score_sample(target.astype(np.float64) + 2.5, target).metrics()
+    assert shifted.pop("object_shift_free_mae_mm") == 0.0
     assert {value for key, value in shifted.items() if key.endswith("_mm")} == {2.5}
+    assert [shifted[key] for key in WITHIN] == [0.0, 0.0, 1.0, 1.0]
     nothing = score_sample(np.zeros_like(target), target)
     inside = target[target > 0].astype(np.float64)
     assert nothing.object.mae_mm == pytest.approx(inside.mean(), rel=1e-14)

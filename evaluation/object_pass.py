@@ -1,0 +1,101 @@
+"""The first pass over a sample: the object's errors picked out, the background's summed. NumPy, or compiled.
+
+Both give the same numbers to a few units in the last place; which one runs is the caller's choice, because importing
+numba takes as long as scoring a hundred samples with NumPy.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation import error_stats
+from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish
+from fpp_ml_bench.pixel_sets import object_mask
+
+COMPILED_FROM_SAMPLES = 400
+"""From this many samples on the compiled pass earns its import back (960 px, `benchmarks/eval_speed.py`)."""
+_COMPILED_DTYPES = (np.dtype(np.float32), np.dtype(np.float64))
+
+
+class ObjectErrors(NamedTuple):
+    """``index`` of the object's n pixels in the flat image, their errors in mm float64 (n,), which of them were not
+    measured (n,), and the statistics of all other pixels."""
+
+    index: NDArray[np.intp]
+    errors: NDArray[np.float64]
+    missing: NDArray[np.bool_]
+    background: ErrorStats
+
+
+@np.errstate(over="ignore")  # an overflow is no warning here: `finish` refuses it
+def object_errors(
+    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
+) -> ObjectErrors:
+    """Split a sample into its object and its background (paper Section 5.3.2).
+
+    ``prediction_mm`` and ``target_mm`` (H, W) real floats in mm. Raises PredictionError for shapes that differ, dtypes
+    that are not real floats, and errors that are not finite.
+    """
+    if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
+        raise PredictionError(
+            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
+        )
+    if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
+        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+    prediction, target = prediction_mm.ravel(), target_mm.ravel()
+    if compiled and prediction.dtype in _COMPILED_DTYPES and target.dtype in _COMPILED_DTYPES:
+        return _compiled(prediction, target)
+    index = np.flatnonzero(object_mask(target))
+    measured = prediction.take(index)
+    errors = measured.astype(np.float64)
+    errors -= target.take(index)
+    if not np.isfinite(errors).all():
+        raise PredictionError(NOT_FINITE)
+    return ObjectErrors(index, errors, measured <= 0, _background_stats(prediction, target, index))
+
+
+def _compiled(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> ObjectErrors:
+    from fpp_ml_bench.evaluation.object_kernel import object_pass
+
+    size, block = prediction.size, error_stats.BLOCK
+    index, errors, missing = np.empty(size, np.intp), np.empty(size), np.empty(size, np.bool_)
+    blocks = -(-size // block)
+    absolute, squares = np.zeros(blocks), np.zeros(blocks)
+    found = object_pass(prediction, target, block, index, errors, missing, absolute, squares)
+    errors = errors[:found]
+    if not np.isfinite(errors).all():
+        raise PredictionError(NOT_FINITE)
+    background = finish(size - found, absolute.tolist(), squares.tolist())
+    return ObjectErrors(index[:found], errors, missing[:found], background)
+
+
+def _background_stats(
+    prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]], index: NDArray[np.intp]
+) -> ErrorStats:
+    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
+
+    Not overall minus object: that would leave rounding dust where the background is perfect.
+    """
+    pixels, step = prediction.size - index.size, error_stats.BLOCK
+    if pixels == 0:
+        return EMPTY
+    # A target without negative values is exactly 0 on the background: there the prediction is the error.
+    target_is_zero = bool(target.min() >= 0)
+    signed = not (target_is_zero and bool(prediction.min() >= 0))
+    buffer = np.empty(min(step, prediction.size))
+    absolute, squares = [], []
+    starts = range(0, prediction.size, step)
+    cuts = [*np.searchsorted(index, list(starts)).tolist(), index.size]
+    for number, start in enumerate(starts):
+        block = buffer[: min(step, prediction.size - start)]
+        np.copyto(block, prediction[start : start + step])
+        if not target_is_zero:
+            block -= target[start : start + step]
+        block[index[cuts[number] : cuts[number + 1]] - start] = 0.0
+        squares.append(float(block.dot(block)))
+        if signed:
+            np.abs(block, out=block)
+        absolute.append(float(block.sum()))
+    return finish(pixels, absolute, squares)

@@ -1,0 +1,76 @@
+"""What a result was computed with: versions, the checkout's commit, a hash of the scoring's own source, the machine."""
+
+import hashlib
+import platform
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from fpp_ml_bench import __version__, pixel_sets
+from fpp_ml_bench.evaluation.result_models import Environment
+from fpp_ml_bench.evaluation.timing import HardwareInfo
+from fpp_ml_bench.hardware import describe_hardware
+
+_HERE = Path(__file__).resolve().parent
+_SCORING = (
+    "error_stats.py", "object_pass.py", "object_kernel.py", "predictions.py", "protocol.py", "scores.py", "scoring.py",
+    "summary.py", "uncertainty.py", "units.py",
+)  # fmt: skip
+_COMMIT = re.compile(r"[0-9a-f]{40,64}")
+
+
+def environment() -> Environment:
+    """This machine and this code, for a result."""
+    import pyarrow
+    from pydantic import VERSION
+
+    packages = {"fpp_ml_bench": __version__, "numpy": np.__version__, "pyarrow": pyarrow.__version__,
+                "pydantic": VERSION}  # fmt: skip
+    return Environment(
+        python=platform.python_version(),
+        packages=packages,
+        git=checkout_commit(_HERE.parent),
+        code_sha256=scoring_code(),
+        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+    )
+
+
+def checkout_commit(folder: Path) -> str | None:
+    """The commit that the checkout in ``folder`` stands on, read from its ``.git``; None where there is none.
+
+    No ``git`` is run: starting it would take as long as scoring several samples, and it need not be installed.
+    """
+    place = folder / ".git"
+    try:
+        if place.is_file():  # a worktree: the file says where its own HEAD lies
+            place = folder / place.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
+        head = (place / "HEAD").read_text(encoding="utf-8").strip()
+        if not head.startswith("ref:"):
+            return head if _COMMIT.fullmatch(head) else None
+        name = head.removeprefix("ref:").strip()
+        common = place / "commondir"
+        homes = [place] + ([place / common.read_text(encoding="utf-8").strip()] if common.is_file() else [])
+        for home in homes:
+            if (home / name).is_file():
+                found = (home / name).read_text(encoding="utf-8").strip()
+                return found if _COMMIT.fullmatch(found) else None
+        for home in homes:
+            if (home / "packed-refs").is_file():
+                for line in (home / "packed-refs").read_text(encoding="utf-8").splitlines():
+                    commit, _, ref = line.partition(" ")
+                    if ref == name and _COMMIT.fullmatch(commit):
+                        return commit
+    except (OSError, UnicodeDecodeError):
+        return None
+    return None
+
+
+@cache
+def scoring_code() -> str:
+    """SHA-256 over the files that numbers come from, 64 hex digits."""
+    digest = hashlib.sha256()
+    for path in (*(_HERE / name for name in _SCORING), Path(pixel_sets.__file__)):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()

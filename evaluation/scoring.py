@@ -1,0 +1,87 @@
+"""Scoring every prediction of a folder: read, checked, scored, a few files at a time. Needs neither pydantic nor torch.
+
+Memory does not grow with the number of samples, and nothing depends on the number of cores.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from threading import local
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import DatasetError, PredictionError
+from fpp_ml_bench.evaluation.listing import Listing
+from fpp_ml_bench.evaluation.object_pass import COMPILED_FROM_SAMPLES
+from fpp_ml_bench.evaluation.predictions import value_problems
+from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.reading import reader_for
+from fpp_ml_bench.evaluation.scores import score_sample
+from fpp_ml_bench.evaluation.units import scored_pair
+from fpp_ml_bench.hardware import usable_cores
+
+WORKERS = 4
+Found = tuple[list[str], list[dict[str, Any]]]
+
+
+class Rules(NamedTuple):
+    """How predictions are read and scored."""
+
+    size: tuple[int, int]
+    units: Units
+    png_mm_per_level: float | None
+    mode: Mode
+    edge_band_px: int
+
+
+def scored(
+    folder: Path, listing: Listing, rules: Rules, target_mm: Callable[[str], NDArray[np.float32]]
+) -> Iterator[Found]:
+    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W)."""
+    compiled = _compiled(len(listing.present))
+    read = reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
+    memory = local()
+
+    def work(sample: str, target: NDArray[np.float32]) -> Found:
+        low, high = float(target.min()), float(target.max())
+        if not (low >= 0 and np.isfinite(high)):
+            raise DatasetError(
+                f"{sample}: the target depth holds NaN, infinite or negative values; run: fpp-bench verify"
+            )
+        try:
+            values, digest = read(sample, memory)
+            problems = value_problems(values, target, high, rules.units)
+            if not problems:
+                pair = scored_pair(values, target, rules.units, rules.mode, sample)
+                scores = score_sample(*pair, rules.edge_band_px, compiled)
+        except PredictionError as error:
+            problems = [str(error)]
+        if problems:
+            return [f"{read.named(sample)}: {problem}" for problem in problems], []
+        return [], [
+            {
+                "sample": sample,
+                "prediction_sha256": digest,
+                "object_pixels": scores.object.pixels,
+                "background_pixels": scores.background.pixels,
+                **scores.metrics(),
+            }
+        ]
+
+    with ThreadPoolExecutor(min(WORKERS, usable_cores())) as pool:
+        waiting: deque[Future[Found]] = deque()
+        for sample in listing.present:
+            waiting.append(pool.submit(work, sample, target_mm(sample)))
+            if len(waiting) > 2 * WORKERS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _compiled(samples: int) -> bool:
+    from fpp_ml_bench.acceleration import numba_enabled
+
+    return samples >= COMPILED_FROM_SAMPLES and numba_enabled()

@@ -1,0 +1,73 @@
+"""``submission.yaml`` as plain keys and values, read from a stranger; what they mean is `submission`'s to check.
+
+The file is bounded in size, aliases (and with them "billion laughs") are refused, a key given twice is refused, and
+only plain YAML values are built.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.text import printable
+
+SUBMISSION_FILE = "submission.yaml"
+MAX_BYTES = 65536
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """SafeLoader without aliases, without duplicate keys, and with 1e-3 read as the number it is."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.YAMLError(f"line {mark.line + 1} uses an alias (*); write the value out")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: a key must be plain text")
+            if key.value in seen:
+                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} stands twice")
+            seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def read_plain(folder: Path) -> dict[Any, Any]:
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked.
+
+    SubmissionError names the file, what is wrong with it and the cure.
+    """
+    path = folder / SUBMISSION_FILE
+    shown = printable(str(path), 500)
+    if path.is_symlink() or not path.is_file():
+        raise SubmissionError(
+            f"expected a file {shown} that describes the predictions, found "
+            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
+            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
+        )
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise SubmissionError(f"{shown}: expected at most {MAX_BYTES} bytes; shorten names and settings")
+        content = yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
+    except OSError as error:
+        raise SubmissionError(f"{shown} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{shown}: expected UTF-8 text") from None
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
+        raise SubmissionError(f"{shown} is no plain YAML: {reason}") from None
+    if not isinstance(content, dict):
+        raise SubmissionError(f"{shown}: expected keys and values like 'name: My method', got {type(content).__name__}")
+    return content

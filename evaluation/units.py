@@ -1,0 +1,93 @@
+"""From what a submission declares (mm, m, normalised) to what is scored, and whether the declaration can be true."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.evaluation.protocol import (
+    METRES_AT_MOST,
+    METRES_BELOW,
+    MILLIMETRES_ABOVE,
+    NORMALISED_AT_MOST,
+    Mode,
+    Units,
+)
+from fpp_ml_bench.pixel_sets import object_mask
+
+Depth = NDArray[np.floating[Any]]
+
+
+def unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
+    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can.
+
+    Metres or a share of the range where mm are declared show in the largest value. Where the declared unit is the
+    larger one, a single stray pixel must not decide, so the median over the object does.
+    """
+    if units == "mm":
+        if 0 < high < METRES_BELOW and target_max_mm > MILLIMETRES_ABOVE:
+            return (
+                f"looks like metres or normalised depth: its largest value is {high:.4g}, the target reaches "
+                f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
+            )
+        return None
+    found = values[object_mask(target_mm)]
+    found = found[found > 0]
+    if not found.size:
+        return None
+    typical = float(np.median(found))
+    if units == "m" and typical > METRES_AT_MOST:
+        return (
+            f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
+            "mm in submission.yaml"
+        )
+    if units == "m" and high < 1 and target_max_mm > MILLIMETRES_ABOVE:
+        return (
+            f"does not look like metres: its largest value is {high:.4g}, the target reaches "
+            f"{target_max_mm / MM_PER_M:.2f} m; if it is normalised, declare units: normalised in submission.yaml"
+        )
+    if units == "normalised" and typical > NORMALISED_AT_MOST:
+        return (
+            f"does not look like normalised depth: its median over the object is {typical:.4g}, the target's is at "
+            "most 1; if it is in m or mm, declare that in submission.yaml"
+        )
+    return None
+
+
+def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str) -> tuple[Depth, Depth]:
+    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
+
+    ``standard``: depth in mm, 0 = background. Normalised values above 0 go back through the sample's own range,
+    D = v (D_max - D_min) + D_min; 0 and below stays 0, background.
+
+    ``paper-individual`` (paper Section 5.3.2, individual normalisation): the target is normalised first, its mask is
+    D_norm > 0, and prediction and target go through that one affine map everywhere. D_min cancels in every difference,
+    so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and taking away
+    1.7 m. Only for normalised values.
+
+    Raises DatasetError where the target has no range to normalise by.
+    """
+    if units == "mm":
+        return values, target_mm
+    if units == "m":
+        return values.astype(np.float64) * MM_PER_M, target_mm
+    inside = object_mask(target_mm)
+    if not inside.any():
+        if mode == "standard" and not (values > 0).any():
+            return np.minimum(values, 0), target_mm
+        raise DatasetError(
+            f"{sample}: the target holds no object, so normalised depth has no range to go back through; submit mm"
+        )
+    low, high = (float(edge(target_mm[inside])) for edge in (np.min, np.max))
+    if mode == "standard":
+        depth = values.astype(np.float64) * (high - low) + low
+        depth[values <= 0] = 0.0
+        return depth, target_mm
+    if high == low:
+        raise DatasetError(
+            f"{sample}: the target is one flat plane, and individual normalisation divides by its range, 0; score it "
+            "with --mode standard"
+        )
+    return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)
