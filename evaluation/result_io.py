@@ -14,11 +14,16 @@ from fpp_ml_bench.loaders.manifest import write_atomically
 MAX_BYTES = 64 * 1024 * 1024
 
 
+def result_content(result: Result) -> dict[str, Any]:
+    """The file's content as plain values, keys in the model's order, each sample's name first."""
+    content = result.model_dump(mode="json")
+    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]
+    return content
+
+
 def result_json(result: Result) -> bytes:
     """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
-    content = result.model_dump(mode="json")
-    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]  # the name first
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(result_content(result), indent=1, allow_nan=False, ensure_ascii=False)
     return text.encode("utf-8") + b"\n"
 
 
@@ -32,6 +37,11 @@ def write_result(result: Result, path: Path) -> None:
 
 def read_result(path: Path) -> Result:
     """The result in ``path``; SubmissionError names the file and what is wrong with it."""
+    return parse_result(read_json(path), path)
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file from a stranger holds: bounded, no key twice, no NaN. SubmissionError names file and fault."""
     shown = printable(str(path), 500)
     try:
         if not path.is_file():
@@ -43,12 +53,17 @@ def read_result(path: Path) -> Result:
     if len(data) > MAX_BYTES:
         raise SubmissionError(f"{shown}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
     try:
-        content = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+        return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
     except UnicodeDecodeError:
         raise SubmissionError(f"{shown}: expected UTF-8 text; write it again with fpp-eval --json") from None
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
         raise SubmissionError(f"{shown} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+
+
+def parse_result(content: Any, path: Path) -> Result:
+    """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
+    shown = printable(str(path), 500)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != RESULT_SCHEMA_VERSION:
         came = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"

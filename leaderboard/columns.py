@@ -4,14 +4,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
+from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.text import printable
 from fpp_ml_bench.leaderboard.paper import PaperRow
-from fpp_ml_bench.leaderboard.ranking import Entry, Ranked
+from fpp_ml_bench.leaderboard.ranking import Ranked
+from fpp_ml_bench.leaderboard.rows import Entry
 
 NAME_WIDTH = 60
 DEVICE_WIDTH = 40
 SELF_REPORTED = "*"
-NOTE = f"Errors in mm, mean over samples. {SELF_REPORTED} time as reported by its author, not measured here."
+NOTE = (
+    "Errors in mm, mean over samples; 95% interval from a bootstrap over objects. Rank: 1 and the number of methods "
+    f"whose whole interval is better. {SELF_REPORTED} time as reported by its author, not measured here."
+)
 
 
 @dataclass(frozen=True)
@@ -29,29 +34,38 @@ def _metric(key: str) -> Callable[[Ranked], str]:
 
 
 def _time(row: Ranked) -> str:
-    submission = row.entry.result.submission
-    mark = SELF_REPORTED if submission.seconds_source == "self-reported" else ""
-    return seconds(submission.seconds_per_sample) + (mark if submission.seconds_per_sample is not None else "")
+    value = row.entry.value("seconds_per_sample")
+    return seconds(value) + (SELF_REPORTED if value is not None and not row.entry.time_measured else "")
+
+
+def _interval(key: str) -> Callable[[Ranked], str]:
+    def text(row: Ranked) -> str:
+        found = row.entry.interval(key)
+        return "-" if found is None else "-".join(millimetres(end) for end in found)
+
+    return text
 
 
 def device(entry: Entry) -> str:
     """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
-    hardware = entry.result.submission.hardware
+    timing = entry.result.timing
+    hardware = timing.hardware if timing is not None else entry.result.submission.hardware
     if hardware is None:
         return "-"
     cores = "1 core" if hardware.cores == 1 else f"{hardware.cores} cores"
     return printable(hardware.gpu or f"{hardware.cpu}, {cores}", DEVICE_WIDTH)
 
 
-WIDE = 120
+MIDDLE, WIDE, WIDEST = 100, 140, 170
+"""Characters from which on more columns fit."""
 _TITLES = {
     "object_mae_mm": ("Object MAE", 0),
     "object_rmse_mm": ("Object RMSE", 0),
     "overall_mae_mm": ("Overall MAE", 0),
     "background_mae_mm": ("Backgr. MAE", WIDE),
-    "object_interior_mae_mm": ("Interior MAE", WIDE),
-    "object_edge_mae_mm": ("Edge MAE", WIDE),
     "object_missing_share": ("Missing", WIDE),
+    "object_interior_mae_mm": ("Interior MAE", WIDEST),
+    "object_edge_mae_mm": ("Edge MAE", WIDEST),
 }
 _ALWAYS_SORTABLE = ("seconds_per_sample", "frames_used")
 
@@ -66,13 +80,21 @@ def columns(sort: str) -> list[Column]:
         Column("#", lambda row: str(row.rank)),
         Column("Method", lambda row: printable(row.entry.name, NAME_WIDTH), right=False),
         *(
-            Column(title, _metric(key), from_width=0 if key == sort else from_width)
+            column
             for key, (title, from_width) in titled.items()
+            for column in _with_interval(key, title, sort, from_width)
         ),
         Column("s/sample", _time),
-        Column("Frames", lambda row: str(len(row.entry.result.submission.frames_used))),
-        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDE + 12),
+        Column("Frames", lambda row: str(row.entry.frames)),
+        Column("Provenance", lambda row: row.entry.provenance, right=False, from_width=MIDDLE),
+        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
     ]
+
+
+def _with_interval(key: str, title: str, sort: str, from_width: int) -> list[Column]:
+    """The column of ``key``, and that of its interval beside the one that is ranked by."""
+    column = Column(title, _metric(key), from_width=0 if key == sort else from_width)
+    return [column, Column("95% interval", _interval(key), from_width=MIDDLE)] if key == sort in HEADLINE else [column]
 
 
 PAPER_TITLES = (

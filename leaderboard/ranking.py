@@ -5,35 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import METRICS
+from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS, SIGNED
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.result_io import read_result
 from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.evaluation.uncertainty import ranks_with_ties
+from fpp_ml_bench.leaderboard import rows
+from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 
-SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 DEFAULT_SORT = "object_mae_mm"
 SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One result file."""
-
-    path: Path
-    result: Result
-
-    @property
-    def name(self) -> str:
-        return self.result.submission.name
-
-    def value(self, key: str) -> float | None:
-        """What ``key`` of `SORT_KEYS` sorts by; None for an empty pixel set or an unknown time."""
-        if key == "seconds_per_sample":
-            return self.result.submission.seconds_per_sample
-        if key == "frames_used":
-            return float(len(self.result.submission.frames_used))
-        value: float | None = getattr(self.result.metrics, key)
-        return value
 
 
 @dataclass(frozen=True, order=True)
@@ -41,6 +21,7 @@ class GroupKey:
     """What two results must share to be compared. ``fingerprint`` stands for the dataset, not its folder's name."""
 
     track: str
+    mode: str
     split: str
     target: str
     fingerprint: str
@@ -51,7 +32,11 @@ class GroupKey:
 
 @dataclass(frozen=True)
 class Ranked:
-    """An entry and its rank in its group; equal values share a rank, and the next rank counts them all."""
+    """An entry and its rank in its group: 1 and the number of entries that are surely better, so that ties share one.
+
+    Where both have an interval, surely better means that the other's ends before this one's begins; see
+    `fpp_ml_bench.evaluation.uncertainty.ranks_with_ties`.
+    """
 
     rank: int
     entry: Entry
@@ -70,17 +55,23 @@ class Group:
         height, width = self.key.size
         key, name = self.key, printable(self.dataset_name)
         data = f"{key.split} split of {name} ({key.fingerprint[:8]}), {width}x{height} px"
-        return f"{data}, against {key.target}, {key.track} track"
+        mode = "" if key.mode == "standard" else f", mode {key.mode}"
+        return f"{data}, against {key.target}, {key.track} track{mode}"
 
 
 def discover(here: Path) -> list[Path]:
     """Result files where nobody named any: the rows shipped with the package, then ``result*.json`` and
     ``results/*.json`` of the folder ``here``."""
     return [
-        *sorted(SHIPPED_ROWS.glob("*.json")),
+        *shipped_rows(),
         *sorted(here.glob("result*.json")),
         *sorted(here.glob("results/*.json")),
     ]
+
+
+def shipped_rows() -> list[Path]:
+    """The row files that ship with the package."""
+    return sorted(rows.SHIPPED_ROWS.glob("*.json"))
 
 
 def expand(paths: Iterable[Path]) -> list[Path]:
@@ -103,11 +94,11 @@ def expand(paths: Iterable[Path]) -> list[Path]:
 
 def read_entries(files: Sequence[Path]) -> list[Entry]:
     """Read every file strictly; SubmissionError names the first that is no sound result."""
-    return [Entry(path, read_result(path)) for path in files]
+    return [read_entry(path) for path in files]
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in a fixed order (metric track first), each ranked by ``sort``, the smallest value first, unknown last.
+    """Groups in a fixed order (metric track first), each ranked by ``sort``, the best value first, unknown last.
 
     The order of the files changes nothing. Raises SubmissionError where one group holds one name twice.
     """
@@ -123,6 +114,7 @@ def _key(result: Result) -> GroupKey:
     data = result.dataset
     return GroupKey(
         track=result.track,
+        mode=result.mode,
         split=data.split,
         target=result.target,
         fingerprint=data.fingerprint,
@@ -141,13 +133,24 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
                 f"{printable(entry.name)!r} on the same data; leave one out, or give one another name"
             )
         named[entry.name] = entry
-    ordered = sorted(entries, key=lambda entry: (*_sortable(entry.value(sort)), entry.name))
-    rows: list[Ranked] = []
-    for place, entry in enumerate(ordered, start=1):
-        tied = rows and rows[-1].entry.value(sort) == entry.value(sort)
-        rows.append(Ranked(rows[-1].rank if tied else place, entry))
-    return Group(key, min(entry.result.dataset.name for entry in entries), tuple(rows))
+    ordered = sorted(entries, key=lambda entry: (*_sortable(entry.value(sort), sort), entry.name))
+    places = ranks_with_ties(
+        [_badness(entry.value(sort), sort) for entry in ordered],
+        [None if sort in HIGHER_IS_BETTER or sort in SIGNED else entry.interval(sort) for entry in ordered],
+    )
+    ranked = tuple(
+        Ranked(len(ordered) if place is None else place, entry) for place, entry in zip(places, ordered, strict=True)
+    )
+    return Group(key, min(entry.result.dataset.name for entry in entries), ranked)
 
 
-def _sortable(value: float | None) -> tuple[bool, float]:
-    return value is None, 0.0 if value is None else value
+def _badness(value: float | None, sort: str) -> float | None:
+    """``value`` such that smaller is better: a tolerance share turned round, a bias without its sign."""
+    if value is None:
+        return None
+    return -value if sort in HIGHER_IS_BETTER else abs(value)
+
+
+def _sortable(value: float | None, sort: str) -> tuple[bool, float]:
+    found = _badness(value, sort)
+    return found is None, 0.0 if found is None else found

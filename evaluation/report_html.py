@@ -1,0 +1,85 @@
+"""Writing HTML in which text from a submission can only be text: escaping, and pages that load nothing.
+
+A page carries its style, its script and its pictures in itself. Its Content-Security-Policy names the hash of that
+style and that script and allows nothing else: no request leaves the page, and no injected script could run.
+"""
+
+import hashlib
+import html
+import json
+import struct
+import zlib
+from base64 import b64encode
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.evaluation.text import NAME_LIMIT, printable
+
+_HERE = Path(__file__).resolve().parent
+
+
+def escaped(value: object, limit: int = NAME_LIMIT) -> str:
+    """``value`` as HTML text or attribute value that shows exactly it: at most ``limit`` characters, none special."""
+    return html.escape(printable(value, limit), quote=True)
+
+
+def json_in_script(value: Any) -> str:
+    """``value`` as JSON for a script element, which nothing in it can end: no ``<``, ``>``, ``&`` or line separator."""
+    text = json.dumps(value, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+@cache
+def base_style() -> str:
+    """The style that every page shares: colours for light and dark, type, tables, focus."""
+    return (_HERE / "page.css").read_text(encoding="utf-8")
+
+
+def page(title: str, body: str, style: str = "", script: str = "", description: str = "") -> str:
+    """A whole HTML page. ``title`` and ``description`` are text; ``body`` is HTML, ``style`` and ``script`` our own."""
+    style = base_style() + style
+    allowed = ["default-src 'none'", "img-src data:", f"style-src {_source(style)}", "base-uri 'none'"]
+    allowed += ["form-action 'none'", *([f"script-src {_source(script)}"] if script else [])]
+    about = f'<meta name="description" content="{escaped(description, 300)}">\n' if description else ""
+    code = f"<script>{script}</script>\n" if script else ""
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(allowed)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f'<title>{escaped(title)}</title>\n{about}<link rel="icon" href="data:,">\n<style>{style}</style>\n</head>\n'
+        f'<body>\n<a class="skip" href="#main">Skip to the content</a>\n{body}\n{code}</body>\n</html>\n'
+    )
+
+
+def _source(text: str) -> str:
+    return f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
+
+
+def data_uri(png: bytes) -> str:
+    """A PNG as an address that an ``img`` shows without a request."""
+    return "data:image/png;base64," + b64encode(png).decode("ascii")
+
+
+def palette_png(indices: NDArray[np.uint8], colours: NDArray[np.uint8]) -> bytes:
+    """A PNG of ``indices`` (H, W) into ``colours`` (256, 3); index 0 is transparent. The same bytes every time."""
+    height, width = indices.shape
+    lines = np.zeros((height, width + 1), np.uint8)
+    lines[:, 1:] = indices
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", colours.astype(np.uint8).tobytes()),
+        (b"tRNS", b"\0"),
+        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
+        (b"IEND", b""),
+    )
+    chunks = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)

@@ -1,0 +1,119 @@
+"""The paper's four panels of a sample (fringe, truth, prediction, absolute error), and the signed error beside them.
+
+Pictures are thinned to `PANEL_PX` by leaving pixels out, never by averaging: a mean across a depth edge is no depth.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.evaluation.numbers import millimetres
+from fpp_ml_bench.evaluation.report_html import data_uri, escaped, palette_png
+from fpp_ml_bench.pixel_sets import object_mask
+
+PANEL_PX = 320
+CLIP_PERCENTILE = 95
+"""Where the paper clips its error maps (figures of Section 6). Own choice: of the object pixels' errors."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture as PNG, what it shows in words, and its scale: the colour bar as PNG and the values at its ends."""
+
+    title: str
+    png: bytes
+    description: str
+    scale_png: bytes | None = None
+    low: str = ""
+    high: str = ""
+
+
+def sample_panels(
+    fringe: NDArray[np.uint8], target_mm: NDArray[np.floating], prediction_mm: NDArray[np.floating], sample: str
+) -> list[Panel]:
+    """The five panels of a sample; all maps (H, W), depth in mm with 0 = background."""
+    inside = object_mask(np.asarray(target_mm))
+    error_mm = np.asarray(prediction_mm, np.float64) - target_mm
+    shown_depth = target_mm[inside] if inside.any() else np.zeros(1)
+    low, high = float(shown_depth.min()), float(shown_depth.max())
+    clip = float(np.percentile(np.abs(error_mm[inside if inside.any() else ...]), CLIP_PERCENTILE))
+    predicted = np.asarray(prediction_mm) > 0
+    ends = f"{low:.0f}", f"{high:.0f} mm"
+    limit = f"{millimetres(clip)} mm"
+    return [
+        Panel("Fringe", _grey(fringe), f"{sample}: the captured fringe image"),
+        _coloured(
+            "Truth", target_mm, inside, "viridis", low, high, ends,
+            f"{sample}: true depth, {ends[0]} to {ends[1]}",
+        ),
+        _coloured(
+            "Prediction", prediction_mm, predicted, "viridis", low, high, ends,
+            f"{sample}: predicted depth on the same scale; {predicted.mean():.1%} of the image is predicted as object",
+        ),
+        _coloured(
+            "Absolute error", np.abs(error_mm), inside | predicted, "magma", 0.0, clip, ("0", limit),
+            f"{sample}: absolute error, clipped at its 95th percentile over the object, {limit}",
+        ),
+        _coloured(
+            "Signed error", error_mm, inside | predicted, "coolwarm", -clip, clip, (f"-{limit}", f"+{limit}"),
+            f"{sample}: prediction minus truth, blue too near, red too far, clipped at {limit}",
+        ),
+    ]  # fmt: skip
+
+
+def panels_html(panels: list[Panel]) -> str:
+    """The panels side by side; each picture says in words what it shows."""
+    figures = []
+    for panel in panels:
+        scale = ""
+        if panel.scale_png is not None:
+            bar = f'<img src="{data_uri(panel.scale_png)}" alt="" width="128" height="8">'
+            scale = (
+                f'<span class="scale"><span>{escaped(panel.low)}</span>{bar}<span>{escaped(panel.high)}</span></span>'
+            )
+        figures.append(
+            f'<figure><img src="{data_uri(panel.png)}" alt="{escaped(panel.description, 400)}">'
+            f"<figcaption>{escaped(panel.title)}{scale}</figcaption></figure>"
+        )
+    return f'<div class="panels">{"".join(figures)}</div>'
+
+
+@cache
+def _colours(name: str) -> NDArray[np.uint8]:
+    """256 RGB colours of a matplotlib map; the first stands for index 0, which is transparent."""
+    import matplotlib
+
+    table = matplotlib.colormaps[name](np.linspace(0, 1, 255))[:, :3]
+    return np.vstack([np.zeros((1, 3)), 255 * table]).round().astype(np.uint8)
+
+
+def _thinned(image: NDArray) -> NDArray:
+    step = max(1, -(-max(image.shape) // PANEL_PX))
+    return image[::step, ::step]
+
+
+def _grey(image: NDArray[np.uint8]) -> bytes:
+    ramp = np.repeat(np.linspace(0, 255, 255).round()[:, None], 3, axis=1)
+    table = np.vstack([np.zeros((1, 3)), ramp]).astype(np.uint8)
+    return palette_png(np.maximum(_thinned(image), 1).astype(np.uint8), table)
+
+
+def _coloured(
+    title: str,
+    values: NDArray,
+    shown: NDArray[np.bool_],
+    colours: str,
+    low: float,
+    high: float,
+    ends: tuple[str, str],
+    description: str,
+) -> Panel:
+    """Values from ``low`` to ``high`` in colours, the ends' beyond them, transparent where not ``shown``."""
+    values, shown = _thinned(np.asarray(values, np.float64)), _thinned(shown)
+    share = np.clip((values - low) / (high - low), 0, 1) if high > low else np.zeros_like(values)
+    indices = np.where(shown, 1 + np.round(254 * share), 0).astype(np.uint8)
+    table = _colours(colours)
+    ramp = np.linspace(1, 255, 128).round().astype(np.uint8)[None].repeat(2, axis=0)
+    return Panel(title, palette_png(indices, table), description, palette_png(ramp, table), *ends)

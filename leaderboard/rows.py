@@ -1,0 +1,142 @@
+"""The leaderboard's rows as files: a result of ``fpp-eval``, and who stands for its numbers.
+
+A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which then counts as
+self-reported, or a row file: that result and a ``provenance``, which the maintainers set when they take it in. A PNG of
+the same name beside it is shown on the submission's page.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.result_io import parse_result, read_json, result_content
+from fpp_ml_bench.evaluation.schema import StrictModel, validate
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.loaders.manifest import write_atomically
+
+SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
+ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
+
+Provenance = Literal["measured here", "verified", "self-reported"]
+PROVENANCES: tuple[str, ...] = get_args(Provenance)
+LOCAL = "local file"
+"""Of a result that lies on this machine and in no leaderboard."""
+BY_THE_PAPER = "reported by the paper"
+
+MEANING = {
+    "measured here": "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
+    "verified": "The author sent the predictions, and fpp-eval verify gave the same scores. Run time is the author's.",
+    "self-reported": "The author ran fpp-eval and sent the result. It agrees with itself; nobody else computed it.",
+    LOCAL: "A result on this machine that is in no leaderboard.",
+    BY_THE_PAPER: "Typed in from the paper's tables, measured by its authors on other data with other code.",
+}
+
+LARGEST_PICTURE_BYTES = 2_000_000
+LARGEST_PICTURE_PX = 4096
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class _RowFile(StrictModel):
+    row_schema_version: Literal["1.0.0"]
+    provenance: Provenance
+    result: Result
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row: a result, and its ``provenance`` (one of `MEANING`)."""
+
+    path: Path
+    result: Result
+    provenance: str = LOCAL
+
+    @property
+    def name(self) -> str:
+        return self.result.submission.name
+
+    @property
+    def frames(self) -> int:
+        """Captures that one depth map costs."""
+        return len(self.result.submission.frames_used)
+
+    @property
+    def latency_ms(self) -> float | None:
+        """Median time an image in ms; None when unknown."""
+        if self.result.timing is not None:
+            return self.result.timing.latency_median_ms
+        taken = self.result.submission.seconds_per_sample
+        return None if taken is None else 1000 * taken
+
+    @property
+    def time_measured(self) -> bool:
+        """Whether the time was measured by this package where the row says so: a stranger's word is self-reported."""
+        timing, submission = self.result.timing, self.result.submission
+        source = timing.provenance if timing is not None else submission.seconds_source
+        return source == "measured" and self.provenance in ("measured here", LOCAL)
+
+    def value(self, key: str) -> float | None:
+        """What ``key`` of the sort keys sorts by; None for an empty pixel set or an unknown time."""
+        if key == "seconds_per_sample":
+            return None if self.latency_ms is None else self.latency_ms / 1000
+        if key == "frames_used":
+            return float(self.frames)
+        value: float | None = getattr(self.result.metrics, key)
+        return value
+
+    def interval(self, key: str) -> tuple[float, float] | None:
+        """The 95% interval of ``key``, None where there is none."""
+        return self.result.intervals.of(key)
+
+
+def read_entry(path: Path) -> Entry:
+    """A row file or a result file, read strictly. SubmissionError names the file and what is wrong with it."""
+    content = read_json(path)
+    if isinstance(content, dict) and "row_schema_version" in content:
+        if content["row_schema_version"] != ROW_SCHEMA_VERSION:
+            raise SubmissionError(
+                f"{printable(str(path), 500)}: expected row_schema_version {ROW_SCHEMA_VERSION}, got "
+                f"{printable(content['row_schema_version'], 40)}; write the row again from its result"
+            )
+        parse_result(content.get("result"), path)
+        row: _RowFile = validate(_RowFile, content, path, "leaderboard row")
+        return Entry(path, row.result, row.provenance)
+    shipped = path.resolve().parent == SHIPPED_ROWS.resolve()
+    return Entry(path, parse_result(content, path), "self-reported" if shipped else LOCAL)
+
+
+def write_row(entry: Entry, provenance: str, path: Path) -> None:
+    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or no place."""
+    if provenance not in PROVENANCES:
+        raise SubmissionError(f"expected a provenance out of {', '.join(PROVENANCES)}, got {printable(provenance)!r}")
+    content = {
+        "row_schema_version": ROW_SCHEMA_VERSION,
+        "provenance": provenance,
+        "result": result_content(entry.result),
+    }
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    try:
+        write_atomically(path, text.encode("utf-8"))
+    except OSError as error:
+        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+
+
+def picture_of(entry: Entry) -> bytes | None:
+    """The PNG beside a row file, None without one. SubmissionError for what is no PNG of a sensible size.
+
+    Its pixels are never decoded here; a browser shows it as a PNG or not at all.
+    """
+    path = entry.path.with_suffix(".png")
+    if path.is_symlink() or not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        data = stream.read(LARGEST_PICTURE_BYTES + 1)
+    shown = printable(str(path), 500)
+    if len(data) > LARGEST_PICTURE_BYTES:
+        raise SubmissionError(f"{shown}: expected a picture of at most {LARGEST_PICTURE_BYTES:,} bytes")
+    sides = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    if data[:8] != _PNG or data[12:16] != b"IHDR" or not all(0 < side <= LARGEST_PICTURE_PX for side in sides):
+        raise SubmissionError(f"{shown}: expected a PNG of at most {LARGEST_PICTURE_PX} px a side")
+    return data
