@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 BLOCK_BYTES = 1 << 22
-_BLOCKS = 2
+_BLOCKS = 4
 
 
 class DirectFile:

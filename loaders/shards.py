@@ -21,6 +21,7 @@ from fpp_ml_bench.loaders.schema import (
     DEPTH_EXACT,
     LABELS,
     RANGE,
+    SINGLE_SHOT_FRAME,
     arrow_schema,
     group_columns,
     stored_groups,
@@ -38,7 +39,7 @@ OBJECTS_PER_SHARD = 4
 class Row:
     """One sample on its way to disk: frames by index uint8 (H, W), depths float32 (H, W) in mm, what was measured.
 
-    Frames are held until the last row of their object has come: the rows of one object must not share their memory.
+    The memory of its images is free again as soon as the writer asks for the next row.
     """
 
     sample: str
@@ -148,10 +149,8 @@ class ShardWriter:
                 group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schemas[group]) for group, sink in sinks.items()
             }
             described = []
-            data = _Batch(self._size)
-            data.restart(len(self._plan.samples))
-            extra = {group: _Batch(self._size) for group in self._groups if group != DATA_GROUP}
-            for place, row in enumerate(self._checked(rows)):
+            data = _DataBatch(len(self._plan.samples), self._size)
+            for row in self._checked(rows):
                 least, greatest = depth_range_mm(row.depth_mm, row.sample)
                 described.append(
                     {
@@ -164,15 +163,12 @@ class ShardWriter:
                         **row.measured,
                     }
                 )
-                data.add_row(row, (least, greatest), self._plan.split, self._groups[DATA_GROUP], self._sequence)
-                # Frames beyond the first leave by object: six rows of them are all that is ever held.
-                object_rows, first, last = self._object_rows(place)
-                for group, batch in extra.items():
-                    if first:
-                        batch.restart(object_rows)
-                    batch.hold_frames(row, self._groups[group], self._sequence)
-                    if last:
-                        writers[group].write_batch(batch.record_batch(schemas[group]))
+                data.add(row, (least, greatest), self._plan.split, self._sequence)
+                # Frames beyond the first leave at once, one row a batch: nothing of them is held.
+                for group, frames in self._groups.items():
+                    if group != DATA_GROUP:
+                        images = [self._image(row, index)[None] for index in frames]
+                        writers[group].write_batch(_record_batch(images, schemas[group]))
                 row_done()
             writers[DATA_GROUP].write_batch(data.record_batch(schemas[DATA_GROUP]))
             for writer in writers.values():
@@ -188,92 +184,61 @@ class ShardWriter:
                 raise BuildError(f"shard {self._plan.name}: expected sample {planned!r}, got {came}")
             yield row
 
-    def _object_rows(self, place: int) -> tuple[int, bool, bool]:
-        """Rows of the object that row ``place`` shows, and whether it is the first and the last of them."""
-        names = [name for _, name, _ in self._plan.samples]
-        first, count = names.index(names[place]), names.count(names[place])
-        return count, place == first, place == first + count - 1
+    def _image(self, row: Row, index: int) -> NDArray[np.uint8]:
+        return _of_size(row.frames[index], self._size, self._sequence.frames[index].column)
 
 
-class _Batch:
-    """Columns of one record batch, each on memory that Arrow takes without a copy.
+_buffers: dict[tuple[str, tuple[int, int]], NDArray] = {}
+"""Memory of `_DataBatch`, kept from shard to shard: touching 200 MB of new pages costs more than filling them."""
 
-    Images of a *held* batch stay where the source has them until the batch is written; a column whose images lie one
-    after another in memory is not copied at all. The others are gathered in a buffer that the next batch reuses.
-    """
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
-        self._buffers: dict[str, NDArray] = {}
-        self.restart(0)
+class _DataBatch:
+    """The one batch of the ``data`` group: labels and copies of frame 0 and the depth maps of all rows of a shard."""
 
-    def restart(self, rows: int) -> None:
-        """Begin a batch of ``rows`` rows."""
-        self._rows, self._filled = rows, 0
-        self._held: dict[str, list[NDArray]] = {}
+    def __init__(self, rows: int, size: tuple[int, int]) -> None:
+        self._rows, self._size, self._filled = rows, size, 0
         self._values: dict[str, list[Any]] = {}
 
-    def _checked(self, column: str, image: NDArray) -> NDArray:
-        if image.shape != self._size:
-            raise BuildError(f"column {column}: expected an image {self._size}, got {image.shape}")
-        return image
+    def _buffer(self, column: str, dtype: np.dtype) -> NDArray:
+        buffer = _buffers.get((column, self._size))
+        if buffer is None or len(buffer) < self._rows or buffer.dtype != dtype:
+            buffer = _buffers[column, self._size] = np.empty((self._rows, *self._size), dtype=dtype)
+        return buffer[: self._rows]
 
-    def _copy(self, column: str, image: NDArray) -> None:
-        image = self._checked(column, image)
-        buffer = self._buffers.get(column)
-        if buffer is None or len(buffer) < self._rows:
-            buffer = self._buffers[column] = np.empty((self._rows, *self._size), dtype=image.dtype)
-        buffer[self._filled] = image
-
-    def hold_frames(self, row: Row, frames: tuple[int, ...], sequence: Sequence) -> None:
-        """Take the frames of a row as they are; they must not change before `record_batch` has been written."""
-        for index in frames:
-            column = sequence.frames[index].column
-            self._held.setdefault(column, []).append(self._checked(column, row.frames[index]))
-
-    def add_row(
-        self, row: Row, range_mm: tuple[float, float], split: str, frames: tuple[int, ...], sequence: Sequence
-    ) -> None:
-        """Copy labels, depths and ``frames`` of a row."""
+    def add(self, row: Row, range_mm: tuple[float, float], split: str, sequence: Sequence) -> None:
+        """Copy what the group holds of a row."""
         values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
         values.update(zip(RANGE, range_mm, strict=True))
         for name, value in values.items():
             self._values.setdefault(name, []).append(value)
-        self._copy(DEPTH, row.depth_mm)
+        images = {sequence.frames[SINGLE_SHOT_FRAME].column: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
         if row.depth_exact_mm is not None:
-            self._copy(DEPTH_EXACT, row.depth_exact_mm)
-        for index in frames:
-            self._copy(sequence.frames[index].column, row.frames[index])
+            images[DEPTH_EXACT] = row.depth_exact_mm
+        for column, image in images.items():
+            self._buffer(column, image.dtype)[self._filled] = _of_size(image, self._size, column)
         self._filled += 1
 
-    def _images(self, column: str) -> NDArray:
-        if column not in self._held:
-            return self._buffers[column][: self._rows]
-        images = self._held[column]
-        first, step = images[0], images[0].nbytes
-        addresses = [image.__array_interface__["data"][0] for image in images]
-        if all(image.flags.c_contiguous for image in images) and addresses == [
-            addresses[0] + i * step for i in range(len(images))
-        ]:
-            return np.lib.stride_tricks.as_strided(
-                first, (len(images), *first.shape), (step, *first.strides), writeable=False
-            )
-        buffer = self._buffers.get(column)
-        if buffer is None or len(buffer) < len(images):
-            buffer = self._buffers[column] = np.empty((len(images), *self._size), dtype=first.dtype)
-        return np.stack(images, out=buffer[: len(images)])
-
     def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
-        """The batch; its columns live on the held images and the buffers."""
-        import pyarrow as pa
+        """The batch; its images live in the shared buffers until the next shard."""
+        columns = [self._values.get(name, _buffers.get((name, self._size))) for name in schema.names]
+        return _record_batch([c if isinstance(c, list) else c[: self._rows] for c in columns], schema)
 
-        columns = [
-            pa.array(self._values[field.name], field.type)
-            if field.name in self._values
-            else _image_column(self._images(field.name), field.type)
-            for field in schema
-        ]
-        return pa.record_batch(columns, schema=schema)
+
+def _of_size(image: NDArray, size: tuple[int, int], column: str) -> NDArray:
+    if image.shape != size:
+        raise BuildError(f"column {column}: expected an image {size}, got {image.shape}")
+    return image
+
+
+def _record_batch(columns: list[Any], schema: "pa.Schema") -> "pa.RecordBatch":
+    """Columns in the schema's order: images as arrays (rows, H, W), taken without a copy; anything else as lists."""
+    import pyarrow as pa
+
+    arrays = [
+        pa.array(column, field.type) if isinstance(column, list) else _image_column(column, field.type)
+        for column, field in zip(columns, schema, strict=True)
+    ]
+    return pa.record_batch(arrays, schema=schema)
 
 
 def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
@@ -281,6 +246,7 @@ def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
     import pyarrow as pa
 
     rows, height, width = images.shape
+    images = np.ascontiguousarray(images)
     values = pa.Array.from_buffers(kind.value_type.value_type, images.size, [None, pa.py_buffer(images)])
     lines = np.arange(rows * height + 1, dtype=np.int64) * width
     if lines[-1] > np.iinfo(np.int32).max:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, VIEWS, sample_name
+from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import (
@@ -33,8 +33,7 @@ INTERIOR_PX = 3
 class Studio:
     """A rig with its light and background, ready to photograph objects.
 
-    The frames of one object's views lie one after another, so that the shard writer need not copy them; the next
-    object's take their place.
+    One view's frames are held, and overwritten by the next.
     """
 
     settings: BuildSettings
@@ -46,12 +45,10 @@ class Studio:
         self._background = background_plane(rig, self.lighting)
         self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
         self._stored = stored_frames(rig.sequence, settings.stored)
-        slots = len(VIEWS) if len(self._stored) > 1 else 1
-        self._slots = np.zeros((len(rig.sequence), slots, rig.camera.height, rig.camera.width), dtype=np.uint8)
-        self._taken = 0
+        self._frames = np.zeros((len(rig.sequence), rig.camera.height, rig.camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
-        """Sample of ``mesh`` in ``view``; six calls later its frames are overwritten (one, if only frame 0 is kept).
+        """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
 
         Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
         pixels alone: the bytes there, and so the decoded depth, are the same either way.
@@ -64,25 +61,21 @@ class Studio:
         stream = (settings.seed, mesh.name, view)
         background = self._shadowed_background(traced) if self.lighting.shadows else self._background
         whole = background.patched(hits.pixels, lit)
-        frames = self._slots[:, self._taken % self._slots.shape[1]]
-        self._taken += 1
-        self._expose(frames, hits, lit, whole, stream)
-        exact_mm = np.zeros(frames.shape[1:], dtype=np.float32)
+        self._expose(hits, lit, whole, stream)
+        exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
         seen = object_mask(exact_mm)
-        depth_mm = decode_stack(frames, rig, direction="both", mask=seen).depth_mm
+        depth_mm = decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         measured = {
             "distance_mm": distance_m * MM_PER_M,
             "rays": hits.rays + whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
-        kept = {index: frames[index] for index in self._stored}
-        return Row(sample_name(mesh.name, view), mesh.name, view, kept, depth_mm, exact_mm, measured)
+        frames = {index: self._frames[index] for index in self._stored}
+        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 
-    def _expose(
-        self, frames: NDArray[np.uint8], hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]
-    ) -> None:
-        images = frames.reshape(len(frames), -1)
+    def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
+        images = self._frames.reshape(len(self._frames), -1)
         for run in _runs(self._stored):
             self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
         others = [index for index in range(len(images)) if index not in self._stored]
