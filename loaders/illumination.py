@@ -88,18 +88,24 @@ def light_surface(
 ) -> LitPixels:  # fmt: skip
     """Illumination of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera; NaN points stay dark."""
     centre_m = projector_centre_m(rig)
-    toward = centre_m - points_m
-    distance_m = _lengths(toward)
-    toward /= distance_m[:, None]
-    cosine = np.einsum("ij,ij->i", normals, toward)
-    halfway = toward - points_m / _lengths(points_m)[:, None]
-    halfway /= _lengths(halfway)[:, None]
+    # Component by component: operations on (n, 3) arrays run three numbers at a time, on (n,) arrays n.
+    x, y, z = (np.ascontiguousarray(axis) for axis in points_m.T)
+    nx, ny, nz = (np.ascontiguousarray(axis) for axis in normals.T)
+    to_x, to_y, to_z = centre_m[0] - x, centre_m[1] - y, centre_m[2] - z
+    squared_m = to_x * to_x + to_y * to_y + to_z * to_z
+    to_projector, to_camera = 1.0 / np.sqrt(squared_m), 1.0 / np.sqrt(x * x + y * y + z * z)
+    cosine = (nx * to_x + ny * to_y + nz * to_z) * to_projector
+    half_x = to_x * to_projector - x * to_camera
+    half_y = to_y * to_projector - y * to_camera
+    half_z = to_z * to_projector - z * to_camera
+    along = nx * half_x + ny * half_y + nz * half_z
+    along /= np.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
     # Blinn-Phong with the exponent that a microfacet roughness of this size has (2 / roughness^4 - 2).
     exponent = max(2.0 / lighting.roughness**4 - 2.0, 0.0)
-    gloss = np.clip(np.einsum("ij,ij->i", normals, halfway), 0.0, None) ** exponent
-    reflected = (1.0 - lighting.specular) * cosine + lighting.specular * gloss * cosine
+    gloss = np.maximum(along, 0.0) ** exponent
     reference_m = rig.working_range_mm[0] / MM_PER_M
-    gain = lighting.white_grey * (reference_m / distance_m) ** 2 * reflected
+    gain = (1.0 - lighting.specular + lighting.specular * gloss) * cosine
+    gain *= lighting.white_grey * reference_m**2 / squared_m
     u, v = rig.project(points_m)
     lit = (cosine > 0) & in_pattern(u, v, rig)
     shadow_rays = 0
@@ -118,11 +124,6 @@ def light_surface(
         np.where(seen, lighting.ambient_grey, 0.0).astype(np.float32),
         shadow_rays,
     )
-
-
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths of vectors (n, 3); several times faster than ``np.linalg.norm`` along an axis."""
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _by_direction(u: NDArray, v: NDArray) -> tuple[tuple[Direction, NDArray], tuple[Direction, NDArray]]:
