@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import scoring
 from fpp_ml_bench.evaluation.listing import list_folder
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, PROTOCOL_VERSION, TARGETS
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, PROTOCOL_VERSION, TARGETS, Units
 from fpp_ml_bench.evaluation.submission_file import SUBMISSION_FILE, read_plain
 from fpp_ml_bench.evaluation.text import printable
 from fpp_ml_bench.frames import Sequence
@@ -71,15 +71,14 @@ def evaluate(
     rules = scoring.Rules(dataset.size, units, level, mode, edge_band_px)  # type: ignore[arg-type]
     problems, rows = list(listing.problems), []
     # The description is checked while the first files are scored: pydantic takes long to import.
-    found = scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target))
+    known = units in get_args(Units)
+    found = scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target)) if known else ()
     submission: Submission | None = None
     if content is not None:
         try:
             submission = _described(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
             refused = error
-    if refused is not None and units not in ("mm", "m", "normalised"):
-        found = iter(())
     for offences, row in found:
         problems += offences
         rows += row

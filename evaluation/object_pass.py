@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import error_stats
-from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish
+from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish, stats_of
 from fpp_ml_bench.pixel_sets import object_mask
 
 COMPILED_FROM_SAMPLES = 400
@@ -38,14 +38,8 @@ def object_errors(
     ``prediction_mm`` and ``target_mm`` (H, W) real floats in mm. Raises PredictionError for shapes that differ, dtypes
     that are not real floats, and errors that are not finite.
     """
-    if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
-        )
-    if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
-        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
-    prediction, target = prediction_mm.ravel(), target_mm.ravel()
-    if compiled and prediction.dtype in _COMPILED_DTYPES and target.dtype in _COMPILED_DTYPES:
+    prediction, target = _flat(prediction_mm, target_mm)
+    if compiled and compilable(prediction, target):
         return _compiled(prediction, target)
     index = np.flatnonzero(object_mask(target))
     measured = prediction.take(index)
@@ -54,6 +48,40 @@ def object_errors(
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
     return ObjectErrors(index, errors, measured <= 0, _background_stats(prediction, target, index))
+
+
+@np.errstate(over="ignore")
+def headline_stats(
+    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
+) -> tuple[ErrorStats, ErrorStats]:
+    """Statistics of the object and of the background alone. Arguments and errors as `object_errors`."""
+    prediction, target = _flat(prediction_mm, target_mm)
+    if not (compiled and compilable(prediction, target)):
+        found = object_errors(prediction_mm, target_mm)
+        return stats_of(found.errors), found.background
+    from fpp_ml_bench.evaluation.object_kernel import headline_pass
+
+    sums = np.empty((-(-prediction.size // error_stats.BLOCK), 4))
+    inside = headline_pass(prediction, target, error_stats.BLOCK, sums)
+    absolute, squares, outside, outside_squares = sums.T.tolist()
+    return finish(inside, absolute, squares), finish(prediction.size - inside, outside, outside_squares)
+
+
+def compilable(*images: NDArray[np.floating[Any]]) -> bool:
+    """Whether the compiled passes take these dtypes: not float16, and not another byte order."""
+    return all(image.dtype in _COMPILED_DTYPES for image in images)
+
+
+def _flat(
+    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]]
+) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
+        raise PredictionError(
+            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
+        )
+    if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
+        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+    return prediction_mm.ravel(), target_mm.ravel()
 
 
 def _compiled(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> ObjectErrors:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.evaluation.error_stats import EMPTY as EMPTY
 from fpp_ml_bench.evaluation.error_stats import ErrorStats, combine, mean_of, stats_of
-from fpp_ml_bench.evaluation.object_pass import ObjectErrors, object_errors
+from fpp_ml_bench.evaluation.object_pass import ObjectErrors, headline_stats, object_errors
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN, WITHIN_MM
-from fpp_ml_bench.pixel_sets import object_near_edge
+from fpp_ml_bench.pixel_sets import object_near_edges
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
 
@@ -152,8 +152,9 @@ def score_sample(
     found = object_errors(prediction_mm, target_mm, compiled)
     if not found.index.size:
         return SampleScores(found.background, {}, Distribution())
-    zone = object_near_edge(target_mm, edge_band_px).ravel().take(found.index).view(np.uint8) * np.uint8(_EDGE)
-    zone |= object_near_edge(target_mm, WIDE_BAND_PX).ravel().take(found.index).view(np.uint8) * np.uint8(_WIDE)
+    near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
+    zone = near.ravel().take(found.index).view(np.uint8) * np.uint8(_EDGE)
+    zone |= wide.ravel().take(found.index).view(np.uint8) * np.uint8(_WIDE)
     zone |= found.missing.view(np.uint8) * np.uint8(_MISSING)
     present = np.flatnonzero(np.bincount(zone)).tolist()
     zones = {code: stats_of(found.errors[zone == code]) for code in present}
@@ -167,9 +168,8 @@ def headline_scores(
 
     Arguments and errors as `score_sample`.
     """
-    found = object_errors(prediction_mm, target_mm, compiled)
-    inside = stats_of(found.errors)
-    return combine(inside, found.background), inside, found.background
+    inside, outside = headline_stats(prediction_mm, target_mm, compiled)
+    return combine(inside, outside), inside, outside
 
 
 def _distribution(found: ObjectErrors) -> Distribution:

@@ -3,11 +3,10 @@
 Memory does not grow with the number of samples, and nothing depends on the number of cores.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from threading import local
+from threading import Lock, local
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,12 +39,17 @@ class Rules(NamedTuple):
 def scored(
     folder: Path, listing: Listing, rules: Rules, target_mm: Callable[[str], NDArray[np.float32]]
 ) -> Iterator[Found]:
-    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W)."""
+    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W).
+
+    Work begins with this call, in threads, and not only when the first result is asked for.
+    """
     compiled = _compiled(len(listing.present))
     read = reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
-    memory = local()
+    memory, looking_up = local(), Lock()
 
-    def work(sample: str, target: NDArray[np.float32]) -> Found:
+    def work(sample: str) -> Found:
+        with looking_up:  # what opens the dataset's files need not be ready for several threads
+            target = target_mm(sample)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             raise DatasetError(
@@ -71,14 +75,16 @@ def scored(
             }
         ]
 
-    with ThreadPoolExecutor(min(WORKERS, usable_cores())) as pool:
-        waiting: deque[Future[Found]] = deque()
-        for sample in listing.present:
-            waiting.append(pool.submit(work, sample, target_mm(sample)))
-            if len(waiting) > 2 * WORKERS:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+    pool = ThreadPoolExecutor(min(WORKERS, usable_cores()))
+    return _results(pool, [pool.submit(work, sample) for sample in listing.present])
+
+
+def _results(pool: ThreadPoolExecutor, waiting: list[Future[Found]]) -> Iterator[Found]:
+    try:
+        for future in waiting:
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _compiled(samples: int) -> bool:

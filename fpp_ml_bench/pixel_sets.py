@@ -5,6 +5,7 @@ to the object where the target depth is above 0 mm, else to the background.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,16 +72,31 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
     For the few pixels of a score's edge band this is several times faster than a distance transform, and needs no
     OpenCV (whose import alone takes longer than scoring ten samples).
     """
-    near = np.zeros(depth_mm.shape, dtype=bool)
+    return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
+
+
+def object_near_edges(
+    depth_mm: NDArray[np.floating], bands_px: Sequence[int], jump_mm: float | None = None
+) -> list[NDArray[np.bool_]]:
+    """`object_near_edge` for several bands, whose edges are then looked for once."""
+    found = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-    if band_px < 1 or not rows.size:
-        return near
+    if not rows.size:
+        return found
     # Every edge touches the object, so the object's box and one pixel around it hold all of them.
     box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
     edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
+    for near, band_px in zip(found, bands_px, strict=True):
+        if band_px > 0:
+            _dilate(edge, band_px, near[box])
+            near[box] &= inside[box]
+    return found
+
+
+def _dilate(edge: NDArray[np.bool_], band_px: int, band: NDArray[np.bool_]) -> None:
+    """Mark in ``band`` what lies nearer than ``band_px`` to a pixel of ``edge``; both (h, w)."""
     height, width = edge.shape
-    band = near[box]
     run, half = edge.copy(), 0  # edge, dilated sideways by half
     reach = min(band_px - 1, height - 1)
     for dy in range(band_px - 1, -1, -1):
@@ -93,5 +109,3 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
         if dy <= reach:
             band[: height - dy] |= run[dy:]
             band[dy:] |= run[: height - dy]
-    band &= inside[box]
-    return near

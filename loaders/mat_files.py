@@ -44,11 +44,22 @@ def read_matrix(path: Path, variable: str) -> NDArray:
     except OSError as error:
         raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
     try:
-        if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
-            return _read_hdf5(content, variable)
-        return _read_v5(content, variable)
-    except (_Damaged, zlib.error, struct.error) as error:
+        return parse_matrix(content, variable)
+    except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
+
+
+def parse_matrix(content: bytes, variable: str, largest_bytes: int = _LARGEST_BYTES) -> NDArray:
+    """`read_matrix` of the bytes of a file; its `LayoutError` names no file.
+
+    No variable is unpacked to more than ``largest_bytes``, and nothing outside of ``content`` is read.
+    """
+    try:
+        if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
+            return _read_hdf5(content, variable, largest_bytes)
+        return _read_v5(content, variable, largest_bytes)
+    except (_Damaged, zlib.error, struct.error) as error:
+        raise LayoutError(str(error)) from error
 
 
 def read_scalar(path: Path, variable: str) -> float:
@@ -98,7 +109,7 @@ class _Matrix:
         return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[self.kind]))
 
 
-def _read_v5(content: bytes, variable: str) -> NDArray:
+def _read_v5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
     if len(content) < _HEADER_BYTES:
         raise _Damaged(f"expected a MATLAB v5 or v7.3 file, got {len(content)} bytes; the file is cut off")
     mark = content[126:128]
@@ -106,18 +117,18 @@ def _read_v5(content: bytes, variable: str) -> NDArray:
     if order is None or struct.unpack(order + "H", content[124:126])[0] != 0x0100:
         raise _Damaged("expected a MATLAB v5 or v7.3 file; this is neither")
     names = []
-    for matrix in _matrices(memoryview(content)[_HEADER_BYTES:], order):
+    for matrix in _matrices(memoryview(content)[_HEADER_BYTES:], order, largest_bytes):
         if matrix.name == variable:
             return matrix.real()
         names.append(matrix.name or "(unnamed)")
     raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
 
 
-def _matrices(content: memoryview, order: str) -> Iterator[_Matrix]:
+def _matrices(content: memoryview, order: str, largest_bytes: int) -> Iterator[_Matrix]:
     while len(content):
         kind, data, content = _element(content, order, padded=False)
         if kind == _COMPRESSED:
-            kind, data, rest = _element(memoryview(_decompressed(data)), order)
+            kind, data, rest = _element(memoryview(_decompressed(data, largest_bytes)), order)
             if len(rest):
                 raise _Damaged("a compressed variable holds more than its matrix; the file is damaged")
         if kind != _MATRIX:
@@ -125,9 +136,9 @@ def _matrices(content: memoryview, order: str) -> Iterator[_Matrix]:
         yield _matrix(data, order)
 
 
-def _decompressed(data: memoryview) -> bytes:
+def _decompressed(data: memoryview, largest_bytes: int) -> bytes:
     unpacker = zlib.decompressobj()
-    content = unpacker.decompress(data, _LARGEST_BYTES)
+    content = unpacker.decompress(data, largest_bytes)
     if not unpacker.eof:
         raise _Damaged("a compressed variable is cut off or too large; the file is damaged")
     return content
@@ -166,7 +177,7 @@ def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int,
     return kind, content[8 : 8 + length], content[stop:]
 
 
-def _read_hdf5(content: bytes, variable: str) -> NDArray:
+def _read_hdf5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
     import h5py
 
     try:
@@ -174,10 +185,16 @@ def _read_hdf5(content: bytes, variable: str) -> NDArray:
             if variable not in file:
                 names = [name for name in file if not name.startswith("#")]
                 raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
+            if not isinstance(file.get(variable, getlink=True), h5py.HardLink):
+                raise _Damaged(f"{variable} is a link; expected the matrix itself in this file")
             found = file[variable]
             if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "iuf" or found.ndim != 2:
                 raise _Damaged(f"{variable}: expected a real numeric matrix (rows, columns)")
-            if found.size * found.dtype.itemsize > _LARGEST_BYTES:
+            if found.is_virtual or found.external:
+                raise _Damaged(f"{variable} is stored in other files; expected the matrix itself in this file")
+            # A damaged file may unpack by the chunk, and a chunk may be far larger than the matrix it holds.
+            unpacked = max(found.size, math.prod(found.chunks or (1,))) * found.dtype.itemsize
+            if unpacked > largest_bytes:
                 raise _Damaged(f"{variable}: {found.shape} is too large for a depth map")
             # MATLAB is column-major, HDF5 row-major: the file holds the transpose.
             return np.ascontiguousarray(np.asarray(found).T)

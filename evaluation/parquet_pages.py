@@ -1,0 +1,112 @@
+"""What a Parquet file unpacks to, added up from its page headers before anything is unpacked.
+
+A file's footer says how large it is unpacked, and so does every page, and nothing makes the two agree: memory is taken
+by the page. So the pages' headers (Thrift, compact protocol) are walked first.
+"""
+
+import struct
+from typing import Any
+
+from fpp_ml_bench.errors import PredictionError
+
+_DATA, _INDEX, _DICTIONARY, _DATA_V2 = 0, 1, 2, 3
+_HEADERS = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}
+_MAX_DEPTH = 8
+
+
+def check_pages(metadata: Any, content: bytes, largest_bytes: int, largest_values: int) -> None:
+    """Refuse (PredictionError) a file that says, in its footer or its pages, that it unpacks to more than this.
+
+    ``metadata`` is pyarrow's ``FileMetaData`` of ``content``.
+    """
+    total = values = 0
+    for group in range(metadata.num_row_groups):
+        for column in range(metadata.num_columns):
+            chunk = metadata.row_group(group).column(column)
+            starts = [chunk.data_page_offset, chunk.dictionary_page_offset]
+            start = min(offset for offset in starts if offset is not None)
+            stop = start + chunk.total_compressed_size
+            if not 0 < start <= stop <= len(content):
+                raise PredictionError("is damaged: its columns lie outside of it; write it again with pyarrow")
+            found = _pages(content, start, stop)
+            total += max(chunk.total_uncompressed_size, found[0])
+            values += max(chunk.num_values, found[1])
+    if total > largest_bytes or values > largest_values:
+        raise PredictionError(
+            f"would unpack to {total} bytes and {values} values, expected at most {largest_bytes} and "
+            f"{largest_values} for this split; write one float32 map a sample"
+        )
+
+
+def _pages(content: bytes, start: int, stop: int) -> tuple[int, int]:
+    """Bytes and values that the pages between two places unpack to."""
+    total = values = 0
+    while start < stop:
+        try:
+            header, start = _struct(content, start, 0)
+        except (IndexError, struct.error):
+            raise PredictionError("has a damaged page header; write it again with pyarrow") from None
+        kind, unpacked, packed = header.get(1), header.get(2), header.get(3)
+        if not all(isinstance(value, int) and value >= 0 for value in (kind, unpacked, packed)):
+            raise PredictionError("has a damaged page header; write it again with pyarrow")
+        total += unpacked
+        about = header.get(_HEADERS.get(kind, 0))
+        count = about.get(1) if isinstance(about, dict) else 0
+        if kind in (_DATA, _DATA_V2):
+            values += max(count, 0) if isinstance(count, int) else 0
+        start += packed
+    return total, values
+
+
+def _struct(content: bytes, place: int, depth: int) -> tuple[dict[int, Any], int]:
+    """Fields of a compact-protocol struct by number, and the place after it."""
+    if depth > _MAX_DEPTH:
+        raise IndexError("nested too deeply")
+    fields: dict[int, Any] = {}
+    number = 0
+    while True:
+        byte = content[place]
+        place += 1
+        if byte == 0:
+            return fields, place
+        step, kind = byte >> 4, byte & 0x0F
+        if step:
+            number += step
+        else:
+            number, place = _zigzag(content, place)
+        fields[number], place = _value(content, place, kind, depth)
+
+
+def _value(content: bytes, place: int, kind: int, depth: int) -> tuple[Any, int]:
+    if kind in (1, 2):  # true, false: the type is the value
+        return kind == 1, place
+    if kind == 3:
+        return content[place], place + 1
+    if kind in (4, 5, 6):
+        return _zigzag(content, place)
+    if kind == 7:
+        return None, place + 8
+    if kind == 8:
+        length, place = _varint(content, place)
+        return None, place + length
+    if kind == 12:
+        return _struct(content, place, depth + 1)
+    raise IndexError("a type that no page header has")
+
+
+def _varint(content: bytes, place: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = content[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, place
+        shift += 7
+        if shift > 63:
+            raise IndexError("a number too long")
+
+
+def _zigzag(content: bytes, place: int) -> tuple[int, int]:
+    value, place = _varint(content, place)
+    return (value >> 1) ^ -(value & 1), place

@@ -1,0 +1,34 @@
+"""Predictions as MATLAB ``.mat`` (v5, compressed or not, and v7.3), one variable ``depth``."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import LayoutError, PredictionError
+from fpp_ml_bench.evaluation.open_file import read_bounded
+from fpp_ml_bench.evaluation.read_npy import check_array
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.loaders.mat_files import parse_matrix
+
+VARIABLE = "depth"
+_FILE_BYTES = 1 << 20
+
+
+def read_mat(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
+    """The matrix ``depth`` (H, W) and the SHA-256 of the file; PredictionError as `read_prediction`.
+
+    Nothing is unpacked beyond what a float64 map of ``size`` and a header can take, and nothing outside the file is
+    followed (HDF5 knows links and storage in other files).
+    """
+    largest = size[0] * size[1] * 8 + _FILE_BYTES
+    content = read_bounded(path, largest)
+    try:
+        matrix = parse_matrix(content, VARIABLE, largest)
+    except LayoutError as error:
+        raise PredictionError(
+            f"{printable(str(error), 300)}; write it with save(file, 'depth') from a real single or double matrix"
+        ) from None
+    check_array(matrix.dtype, matrix.shape, size)
+    return matrix, hashlib.sha256(content).hexdigest()
