@@ -142,9 +142,10 @@ class ShardWriter:
             for group, frames in self._groups.items()
         }
         with ThreadPoolExecutor(1) as thread, ExitStack() as files:
-            sinks = {group: DirectFile(path, thread) for group, path in paths.items()}
-            for sink in sinks.values():
-                files.callback(sink.close)
+            sinks: dict[str, DirectFile] = {}
+            for group, path in paths.items():
+                sinks[group] = DirectFile(path, thread)
+                files.callback(sinks[group].close)
             writers = {
                 group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schemas[group]) for group, sink in sinks.items()
             }
@@ -185,7 +186,7 @@ class ShardWriter:
             yield row
 
     def _image(self, row: Row, index: int) -> NDArray[np.uint8]:
-        return _of_size(row.frames[index], self._size, self._sequence.frames[index].column)
+        return _checked_image(row.frames[index], self._size, self._sequence.frames[index].column)
 
 
 _buffers: dict[tuple[str, tuple[int, int]], NDArray] = {}
@@ -215,7 +216,8 @@ class _DataBatch:
         if row.depth_exact_mm is not None:
             images[DEPTH_EXACT] = row.depth_exact_mm
         for column, image in images.items():
-            self._buffer(column, image.dtype)[self._filled] = _of_size(image, self._size, column)
+            image = _checked_image(image, self._size, column)
+            self._buffer(column, image.dtype)[self._filled] = image
         self._filled += 1
 
     def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
@@ -224,9 +226,11 @@ class _DataBatch:
         return _record_batch([c if isinstance(c, list) else c[: self._rows] for c in columns], schema)
 
 
-def _of_size(image: NDArray, size: tuple[int, int], column: str) -> NDArray:
-    if image.shape != size:
-        raise BuildError(f"column {column}: expected an image {size}, got {image.shape}")
+def _checked_image(image: NDArray, size: tuple[int, int], column: str) -> NDArray:
+    """The image, if it is what the column holds: Arrow takes its memory as it is, whatever is in there."""
+    dtype = np.dtype(np.float32 if column in (DEPTH, DEPTH_EXACT) else np.uint8)
+    if image.shape != size or image.dtype != dtype:
+        raise BuildError(f"column {column}: expected {dtype} {size}, got {image.dtype} {image.shape}")
     return image
 
 

@@ -225,7 +225,9 @@ def test_writer_takes_no_bad_depth(tmp_path, value, says):
     [
         ([], "expected sample 'bowl_A0', got nothing"),
         ([row("bowl_A60")], "expected sample 'bowl_A0', got sample 'bowl_A60'"),
-        ([row(frames={0: np.zeros((6, 8), np.uint8)})], r"frame_00: expected an image \(8, 6\), got \(6, 8\)"),
+        ([row(frames={0: np.zeros((6, 8), np.uint8)})], r"frame_00: expected uint8 \(8, 6\), got uint8 \(6, 8\)"),
+        ([row(frames={0: np.zeros((8, 6))})], r"frame_00: expected uint8 \(8, 6\), got float64"),
+        ([row(depth=np.full((8, 6), 1800.0))], r"depth: expected float32 \(8, 6\), got float64"),
     ],
 )
 def test_writer_takes_no_other_rows(tmp_path, rows, says):
