@@ -10,7 +10,8 @@
     │   ├── LayoutError           a published tree that breaks a rule of its layout
     │   └── BuildError            a build that can't start or go on (locked, other settings, disk full)
     ├── PredictionError           predictions that can't be scored: missing, extra, mis-shaped, not finite
-    └── SubmissionError           a submission.yaml or result file that does not say what it must
+    ├── SubmissionError           a submission.yaml or result file that does not say what it must
+    └── PublishError              something that can't be published: no token, no network, refused by the Hub
 
 A message says what was expected, what came, in which file or sample, and what to do.
 """
@@ -54,3 +55,7 @@ class PredictionError(FppBenchError, ValueError):
 
 class SubmissionError(FppBenchError, ValueError):
     """A submission description or result file that does not say what it must."""
+
+
+class PublishError(FppBenchError):
+    """Something that can't be published: no token, no network, refused by the Hub, not fit to be shown."""
