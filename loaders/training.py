@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from fpp_ml_bench.acceleration import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import CONFIGS
@@ -88,13 +90,12 @@ class FringeDepthDataset(Dataset[FringeDepth]):
             depth_mm = self.source.depth_mm(sample)
             measured = self.source.measured(sample)
             low, high = measured["depth_min_mm"], measured["depth_max_mm"]
-            np.copyto(fringes[place, 0], self.source.frame(sample, frame))
+            _unit_range(self.source.frame(sample, frame), fringes[place, 0])
             if self.background_removed:
                 fringes[place, 0] *= object_mask(depth_mm)
             normalise(depth_mm, self.normalisation, low, high, out=depths[place, 0])
             batch.depth_range_mm[place, 0], batch.depth_range_mm[place, 1] = low, high
             batch.row[place], batch.frame[place] = row, frame
-        batch.fringe.div_(GREY_LEVELS)
         return batch
 
     def empty(self, size: int) -> FringeDepth:
@@ -116,3 +117,14 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         for start in range(0, len(order), size):
             indices = order[start : start + size]
             yield self.read(indices, FringeDepth(*(tensor[: len(indices)] for tensor in buffer)))
+
+
+def _unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
+    """Grey levels / 255 into ``out``: one product with the float32 reciprocal, within one unit in the last place."""
+    factor = np.float32(1 / GREY_LEVELS)
+    if numba_enabled():
+        from fpp_ml_bench.loaders.training_kernel import scale_kernel
+
+        scale_kernel(grey.reshape(-1), out.reshape(-1), factor)
+    else:
+        np.multiply(grey, factor, out=out)
