@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of
+from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.manifest import MANIFEST, Manifest, ShardFile, dataset_files, file_hash, read_manifest
@@ -158,6 +158,10 @@ def split_findings(manifest: Manifest) -> list[str]:
         views: dict[str, list[str]] = {}
         for row in rows:
             views.setdefault(row["object"], []).append(row["view"])
+            if row["sample"] != sample_name(row["object"], row["view"]):
+                findings.append(
+                    f"sample {row['sample']!r} in {split}: said to be view {row['view']} of {row['object']!r}"
+                )
         for name, seen in views.items():
             if home.setdefault(name, split) != split:
                 findings.append(f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak")
