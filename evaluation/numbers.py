@@ -18,3 +18,19 @@ def percent(share: float | None) -> str:
 def seconds(value: float | None) -> str:
     """A time in seconds to three significant digits, a dash when unknown."""
     return "-" if value is None else f"{value:.3g}"
+
+
+def signed(value: float | None) -> str:
+    """A signed error in mm: `millimetres` with its sign, a dash where there is none."""
+    if value is None:
+        return "-"
+    return ("-" if value < 0 else "+" if value > 0 else "") + millimetres(abs(value))
+
+
+def interval_text(ends: "tuple[float, float] | None") -> str:
+    """The two ends of an interval in mm, a dash where there is none."""
+    return "-" if ends is None else f"{_end(ends[0])}..{_end(ends[1])}"
+
+
+def _end(value: float) -> str:
+    return ("-" if value < 0 else "") + millimetres(abs(value))

@@ -1,4 +1,4 @@
-"""Predictions as ``.npz``: a zip archive with exactly one array, unpacked no further than a map of the size can need."""
+"""Predictions as ``.npz``: a zip archive with exactly one array, unpacked no further than such a map can need."""
 
 import hashlib
 import io

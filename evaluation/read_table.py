@@ -1,6 +1,6 @@
-"""Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (H x W floats).
+"""Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (floats).
 
-``depth`` is a list of H lists of W values, a flat list of H W values, or fixed-size lists or tensors of them, float16,
+``depth`` holds H lists of W values a row, or one list of H W values, of variable or fixed size, or tensors; float16,
 float32 or float64. What the file unpacks to is checked before it is unpacked: compressed Arrow buffers are refused, and
 a Parquet file's pages are added up first (`fpp_ml_bench.evaluation.parquet_pages`).
 """

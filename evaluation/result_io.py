@@ -29,8 +29,17 @@ def result_json(result: Result) -> bytes:
 
 def write_result(result: Result, path: Path) -> None:
     """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
+    _write(path, result_json(result))
+
+
+def write_json(content: Any, path: Path) -> None:
+    """Write plain ``content`` as JSON to ``path``, as `write_result` does."""
+    _write(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n")
+
+
+def _write(path: Path, data: bytes) -> None:
     try:
-        write_atomically(path, result_json(result))
+        write_atomically(path, data)
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
 

@@ -6,8 +6,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
-from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
+from fpp_ml_bench.evaluation.numbers import interval_text, millimetres, percent, seconds, signed
+from fpp_ml_bench.evaluation.protocol import PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 from fpp_ml_bench.evaluation.result import Result, SampleResult
 from fpp_ml_bench.evaluation.text import printable
 
@@ -24,21 +24,30 @@ def _title(result: Result) -> Text:
     return Text(
         f"\n{printable(result.submission.name)}\n"
         f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
-        f"{about.size[1]}x{about.size[0]} px, against {result.target}, {result.track} track\n"
+        f"{about.size[1]}x{about.size[0]} px, against {result.target}, {result.track} track"
+        f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )
 
 
 def _scores(result: Result) -> Table:
-    table = Table(caption="mm; mean and median over samples, pooled over all pixels", caption_justify="left")
+    objects = len(result.per_object)
+    table = Table(
+        caption="mm; mean and median over samples, pooled over all pixels; 95% intervals of the means from a bootstrap "
+        f"over {objects} {'object' if objects == 1 else 'objects'}",
+        caption_justify="left",
+    )
     table.add_column("Pixel set")
-    for title in ("MAE mean", "MAE median", "MAE pooled", "RMSE mean", "RMSE median", "RMSE pooled"):
-        table.add_column(title.replace(" ", "\n"), justify="right", no_wrap=True)
+    for error in ("MAE", "RMSE"):
+        for title in ("mean", "95% interval", "median", "pooled"):
+            table.add_column(f"{error}\n{title}", justify="right", no_wrap=True)
     for pixels in PIXEL_SETS:
-        cells = [
-            millimetres(getattr(part, f"{pixels}_{error}_mm"))
-            for error in ("mae", "rmse")
-            for part in (result.metrics, result.median, result.pooled)
-        ]
+        cells = []
+        for error in ("mae", "rmse"):
+            key = f"{pixels}_{error}_mm"
+            mean, median, pooled = (
+                millimetres(getattr(part, key)) for part in (result.metrics, result.median, result.pooled)
+            )
+            cells += [mean, interval_text(result.intervals.of(key)), median, pooled]
         table.add_row(pixels, *cells, style="bold" if pixels == "object" else None)
     for pixels, title in (
         ("interior", f"object, {result.edge_band_px} px or more from edges"),
@@ -48,10 +57,9 @@ def _scores(result: Result) -> Table:
             cell
             for error in ("mae", "rmse")
             for cell in (
-                *(
-                    millimetres(getattr(part, f"object_{pixels}_{error}_mm"))
-                    for part in (result.metrics, result.median)
-                ),
+                millimetres(getattr(result.metrics, f"object_{pixels}_{error}_mm")),
+                "",
+                millimetres(getattr(result.median, f"object_{pixels}_{error}_mm")),
                 "",
             )
         ]
@@ -61,7 +69,15 @@ def _scores(result: Result) -> Table:
 
 def _notes(result: Result) -> Text:
     scores = result.metrics
+    shares = ((limit, getattr(scores, f"object_within_{limit}mm_share")) for limit in WITHIN_MM)
+    within = ", ".join(f"{limit} mm {percent(share)}" for limit, share in shares)
     lines = [
+        f"Object: |error| median {millimetres(scores.object_median_mm)}, 95th percentile "
+        f"{millimetres(scores.object_p95_mm)}, maximum {millimetres(scores.object_max_mm)} mm; pixels within {within}.",
+        f"Bias {signed(scores.object_bias_mm)} mm ({signed(scores.object_valid_bias_mm)} mm where measured); MAE "
+        f"{millimetres(scores.object_shift_free_mae_mm)} mm once each sample's best single offset is removed.",
+        f"MAE {millimetres(scores.object_wide_band_mae_mm)} mm within {WIDE_BAND_PX} px of depth edges, "
+        f"{millimetres(scores.object_wide_interior_mae_mm)} mm inside.",
         f"Object pixels near a depth edge: {percent(scores.object_edge_share)}.",
         f"Object pixels not measured: {percent(scores.object_missing_share)} "
         f"({percent(scores.object_interior_missing_share)} of those away from edges), scored with their whole depth. "

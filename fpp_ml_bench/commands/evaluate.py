@@ -1,19 +1,25 @@
-"""``fpp-eval``: score a folder of predictions against one split of a dataset."""
+"""``fpp-eval``: score a folder of predictions against one split of a dataset; and what can be done with its results."""
 
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 
 from fpp_ml_bench.commands import run_command
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, TARGETS
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 
 SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background."
 EXAMPLES = (
     "fpp-eval predictions --dataset data/mini --split test --json result.json",
-    "fpp-eval predictions --dataset data/mini --split test --target depth_exact",
+    "fpp-eval predictions --dataset data/mini --split test --target depth_exact --report report",
+    "fpp-eval compare a.json b.json",
+    "fpp-eval verify result.json predictions --dataset data/mini",
+    "fpp-eval schema",
 )
+SUBCOMMANDS = {"compare": "eval_compare", "verify": "eval_verify", "schema": "eval_schema"}
+"""First words that mean another command. A folder of that name is given as ./compare."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder",
         type=Path,
         metavar="DIR",
-        help="folder of submission.yaml and one {sample}.npy per sample, float (H, W) depth in mm, 0 = background; "
+        help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png a sample, or one "
+        "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
         "whatever is wrong with it is listed file by file, and no JSON is written",
     )
     parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
@@ -45,7 +52,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
     )
+    parser.add_argument(
+        "--mode",
+        choices=MODES,
+        default=MODES[0],
+        help="standard: mm, object where depth is above 0 (default); paper-individual: the paper's rule for its "
+        "individually normalised rows, for units: normalised only, never ranked with the others",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
+    parser.add_argument("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
 
 
 def _band(text: str) -> int:
@@ -56,12 +71,18 @@ def _band(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Score, write the JSON if asked to, print the table. Raises FppBenchError for anything that can't be scored."""
+    from fpp_ml_bench.evaluation.memory import keep_freed_memory
+
+    keep_freed_memory()
     from fpp_ml_bench.evaluation.evaluator import evaluate
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     if args.json is not None:
         _check_output(args.json, args.folder)
-    result = evaluate(args.folder, DatasetFolder(args.dataset), args.split, args.target, args.edge_band)
+    if args.report is not None:
+        _check_report(args.report, args.folder)
+    dataset = DatasetFolder(args.dataset)
+    result = evaluate(args.folder, dataset, args.split, args.target, args.edge_band, args.mode)
     if args.json is not None:
         from fpp_ml_bench.evaluation.result_io import write_result
 
@@ -70,8 +91,13 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.evaluation.table import result_table
 
     show(result_table(result))
-    if args.json is not None:
-        print(f"Written: {args.json}")
+    if args.report is not None:
+        from fpp_ml_bench.evaluation.report import write_report
+
+        write_report(result, dataset, args.folder, args.report)
+    for written in (args.json, args.report):
+        if written is not None:
+            print(f"Written: {written}")
     return 0
 
 
@@ -87,6 +113,17 @@ def _check_output(path: Path, folder: Path) -> None:
         )
 
 
+def _check_report(path: Path, folder: Path) -> None:
+    if path.is_file():
+        raise SubmissionError(f"--report {path}: expected a folder to write into, found a file")
+    if path.resolve().is_relative_to(folder.resolve()):
+        raise SubmissionError(f"--report {path}: lies among the predictions, where it would be an extra file; move it")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-eval``: exit status 0, or 2 with the error on stderr."""
-    return run_command(sys.modules[__name__], "fpp-eval", sys.argv[1:] if argv is None else argv)
+    """Entry point of ``fpp-eval``: exit status 0, 1 where ``verify`` finds a difference, 2 with the error on stderr."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in SUBCOMMANDS:
+        module = import_module(f"fpp_ml_bench.commands.{SUBCOMMANDS[words[0]]}")
+        return run_command(module, f"fpp-eval {words[0]}", words[1:])
+    return run_command(sys.modules[__name__], "fpp-eval", words)

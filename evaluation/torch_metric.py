@@ -1,0 +1,132 @@
+"""The evaluator's scores as a `torchmetrics.Metric`, for validation during training.
+
+Same rules and the same float64 arithmetic as `fpp_ml_bench.evaluation.scores`: every sample is scored on its own, and
+`compute` is the plain mean over samples. The state is a sum and a count for each score, so any split into batches, any
+order, device or number of processes gives the same numbers up to the rounding of adding a few hundred float64 values.
+A sampler that repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes what is
+averaged; give each process its own samples instead.
+
+Not included: the scores of edge bands, which need the depth edges of every target.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.error_stats import NOT_FINITE
+from fpp_ml_bench.evaluation.protocol import HEADLINE, WITHIN, WITHIN_MM
+
+KEYS = (
+    *HEADLINE,
+    "object_valid_mae_mm",
+    "object_missing_share",
+    "object_median_mm",
+    "object_p95_mm",
+    "object_max_mm",
+    *WITHIN,
+    "object_bias_mm",
+    "object_valid_bias_mm",
+    "object_shift_free_mae_mm",
+)
+
+
+class DepthScores(Metric):
+    """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
+
+    ``update(prediction_mm, target_mm)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background, on any one
+    device. ``compute()`` gives a dict of float64 scalars, NaN where no sample had the pixels for a score (as a flag for
+    loggers, which know no null; such samples are left out of the mean and never count as 0).
+
+    The scores do not steer training (``is_differentiable`` is False) and are lower when better, but for shares within
+    a tolerance. ``half()`` and ``float()`` leave the state in float64.
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+
+    sums: Tensor
+    counts: Tensor
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.add_state("sums", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction_mm: Tensor, target_mm: Tensor) -> None:
+        """Add a batch. Raises PredictionError for other shapes or dtypes, and for errors that are not finite."""
+        prediction, target = _maps(prediction_mm, target_mm)
+        for one, truth in zip(prediction, target, strict=True):
+            scores = sample_scores(one, truth)
+            known = torch.tensor([scores[key] is not None for key in KEYS], device=self.sums.device)
+            values = torch.stack([_or_zero(scores[key], one.device) for key in KEYS]).to(self.sums.device)
+            self.sums += values
+            self.counts += known.to(torch.float64)
+
+    def compute(self) -> dict[str, Tensor]:
+        """Mean over the samples so far, of all processes, of every key."""
+        means = self.sums / self.counts  # 0 / 0 is the NaN that says there was none
+        return dict(zip(KEYS, means, strict=True))
+
+
+def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
+    if prediction_mm.shape != target_mm.shape:
+        raise PredictionError(
+            f"expected a prediction of the target's shape {tuple(target_mm.shape)}, got {tuple(prediction_mm.shape)}"
+        )
+    if not (prediction_mm.is_floating_point() and target_mm.is_floating_point()):
+        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+    shape = tuple(target_mm.shape)
+    if target_mm.dim() == 4 and shape[1] == 1:
+        prediction_mm, target_mm = prediction_mm[:, 0], target_mm[:, 0]
+    if target_mm.dim() != 3 or target_mm[:1].numel() == 0:
+        raise PredictionError(f"expected (B, H, W) or (B, 1, H, W), got {shape}")
+    prediction, target = prediction_mm.detach(), target_mm.detach()
+    if prediction.device.type == "mps":  # Apple's GPUs know no float64
+        prediction, target = prediction.cpu(), target.cpu()
+    return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
+
+
+def sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:
+    """Scores of one sample, float64 (H, W) in mm each: the keys of `KEYS`, None for an empty pixel set."""
+    error = prediction - target
+    if not bool(torch.isfinite(error.square().sum())):
+        raise PredictionError(NOT_FINITE)
+    inside = target > 0
+    found: dict[str, Tensor | None] = dict.fromkeys(KEYS)
+    for name, part in (("overall", error.flatten()), ("object", error[inside]), ("background", error[~inside])):
+        if part.numel():
+            found[f"{name}_mae_mm"] = part.abs().mean()
+            found[f"{name}_rmse_mm"] = part.square().mean().sqrt()
+    if not bool(inside.any()):
+        return found
+    errors, measured = error[inside], prediction[inside] > 0
+    valid = errors[measured]
+    ascending = errors.abs().sort().values
+    offset = _quantile(errors.sort().values, 0.5)
+    found["object_missing_share"] = 1.0 - measured.to(torch.float64).mean()
+    if valid.numel():
+        found["object_valid_mae_mm"], found["object_valid_bias_mm"] = valid.abs().mean(), valid.mean()
+    found["object_median_mm"], found["object_p95_mm"] = _quantile(ascending, 0.5), _quantile(ascending, 0.95)
+    found["object_max_mm"] = ascending[-1]
+    for key, limit in zip(WITHIN, WITHIN_MM, strict=True):
+        found[key] = (ascending <= limit).to(torch.float64).mean()
+    found["object_bias_mm"] = errors.mean()
+    found["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
+    return found
+
+
+def _quantile(ascending: Tensor, level: float) -> Tensor:
+    """Linear interpolation between order statistics, as in `scores`."""
+    place = level * (ascending.numel() - 1)
+    low = int(place)
+    below, above = ascending[low], ascending[min(low + 1, ascending.numel() - 1)]
+    return below + (above - below) * (place - low)
+
+
+def _or_zero(value: Tensor | None, device: torch.device) -> Tensor:
+    return torch.zeros((), dtype=torch.float64, device=device) if value is None else value

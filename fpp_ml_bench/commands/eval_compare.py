@@ -1,0 +1,31 @@
+"""``fpp-eval compare``: two results, sample by sample."""
+
+import argparse
+from pathlib import Path
+
+SUMMARY = "Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence."
+EXAMPLES = (
+    "fpp-eval compare a.json b.json",
+    "fpp-eval compare a.json b.json --json difference.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
+    parser.add_argument("second", type=Path, metavar="B.json", help="another: same data, split, target and track")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table and the sentence. Raises SubmissionError for results that can't be compared."""
+    from fpp_ml_bench.evaluation.compare import compare
+    from fpp_ml_bench.evaluation.comparison_table import comparison_table
+    from fpp_ml_bench.evaluation.console import show
+    from fpp_ml_bench.evaluation.result_io import read_result, write_json
+
+    found = compare(read_result(args.first), read_result(args.second))
+    if args.json is not None:
+        write_json(found.model_dump(mode="json"), args.json)
+    show(comparison_table(found))
+    return 0
