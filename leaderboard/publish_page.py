@@ -1,14 +1,17 @@
 """Staging the leaderboard's page as a static Space: its own files as they are, and the README that makes it a Space."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
+from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.publish import MARK, Publication, mark_bytes, staged_files
+from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 
-INDEX = "index.html"
 _README = "README.md"
 _SUFFIXES = frozenset(
     {
@@ -29,6 +32,16 @@ _SUFFIXES = frozenset(
     }
 )
 _LARGEST_BYTES = 1 << 30
+
+
+def write_page_of(results: Sequence[Path], folder: Path) -> None:
+    """Write the page of result and row files, or of the rows shipped with the package where none are named.
+
+    Nothing is looked for in the current folder: what gets published is named. Raises SubmissionError for a file that is
+    no sound result.
+    """
+    rows = expand(results) if results else shipped_rows()
+    write_page(rank(read_entries(rows)), chosen_tables(None), folder)
 
 
 def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
@@ -56,7 +69,7 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
         shutil.copyfile(path, target)
     (folder / _README).write_bytes(_readme(dataset_repo).encode())
     (folder / MARK).write_bytes(mark_bytes("leaderboard"))
-    owned = {f"{Path(name).parts[0]}/" for name in files if "/" in name}
+    owned = {f"{Path(name).parts[0]}/" for name in files if "/" in name} | {f"{SUBMISSIONS}/"}
     return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", tuple(sorted(owned)))
 
 

@@ -75,9 +75,9 @@ def write_shard(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    for part in dataset.manifest.shards:
-        together = (part.split, part.first_row) == (shard.split, shard.first_row)
-        if together and file_hash(dataset.path / part.path) != part.xxh3_128:
+    parts = [s for s in dataset.manifest.shards if (s.split, s.first_row) == (shard.split, shard.first_row)]
+    for part in parts:
+        if file_hash(dataset.path / part.path) != part.xxh3_128:
             raise DatasetError(f"{dataset.path / part.path}: damaged, its checksum does not match; it isn't published")
     schema = _schema(dataset)
     samples = dataset.splits[shard.split][shard.first_row : shard.first_row + shard.rows]
@@ -104,6 +104,8 @@ def write_shard(
         raise OSError(f"{path.name}: {error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+        for part in parts:
+            dataset.forget(part)  # or the maps of all shards would add up
 
 
 def _is_image(name: str) -> bool:

@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.numbers import millimetres, percent
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.result_io import read_result
 from fpp_ml_bench.evaluation.text import printable
 from fpp_ml_bench.leaderboard.publish import Publication
 from fpp_ml_bench.leaderboard.publish_tasks import BENCHMARK, SCORE_TEXT, score, task_of
+from fpp_ml_bench.leaderboard.rows import read_entry
 
 FOLDER = ".eval_results"
 
@@ -35,7 +35,7 @@ def stage_results(
     named: dict[str, Path] = {}
     (folder / FOLDER).mkdir()
     for path in paths:
-        result, shown = read_result(path), printable(str(path), 300)
+        result, shown = read_entry(path).result, printable(str(path), 300)
         if result.dataset.fingerprint != published.get("fingerprint"):
             ours, theirs = result.dataset.fingerprint[:12], printable(published.get("fingerprint"), 12)
             raise PublishError(

@@ -1,7 +1,8 @@
 """A Hugging Face Hub on the loopback interface, standard library only: enough of it for the real client.
 
 Repositories live in memory. Whose name they carry decides what goes wrong: ``forbidden/...`` may not be written (403),
-``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit. The only tokens are `TOKENS`.
+``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit, and to ``raced/...`` somebody else commits
+while files are sent. The only tokens are `TOKENS`.
 """
 
 import base64
@@ -15,7 +16,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 TOKENS = {"hf_good": "alice"}
-ORGANISATIONS = ("forbidden", "broken", "cut")
+ORGANISATIONS = ("forbidden", "broken", "cut", "raced")
 LARGE_SUFFIXES = (".parquet", ".ply", ".png")
 _API = re.compile(r"/api/(datasets|spaces|models)/([^/]+/[^/]+)(?:/(preupload|commit|revision|tree)/([^/]+)(/.*)?)?")
 _RESOLVE = re.compile(r"/(?:(datasets|spaces)/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)")
@@ -144,6 +145,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _api(self, repo: Repo, found: re.Match[str], body: bytes) -> None:
         kind, name, action, _, _ = found.groups()
         if action == "preupload":
+            if name.startswith("raced/"):
+                repo.commits.append(hashlib.sha1(b"somebody else").hexdigest())
             files = [
                 {"path": f["path"], "uploadMode": "lfs" if f["path"].endswith(LARGE_SUFFIXES) else "regular",
                  "shouldIgnore": False, "oid": None}
@@ -191,4 +194,9 @@ class _Handler(BaseHTTPRequestHandler):
             return self._refuse(404, f"{path} does not exist", "EntryNotFound")
         content = repo.files[path]
         etag = self._entry(path, content).get("lfs", {}).get("oid") or git_sha1(content)
-        return self._answer(200, content, ETag=f'"{etag}"', X_Repo_Commit=repo.commits[-1])
+        about = {"ETag": f'"{etag}"', "X_Repo_Commit": repo.commits[-1], "Accept_Ranges": "bytes"}
+        if asked := re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or ""):
+            first, last = int(asked[1]), min(int(asked[2] or len(content)), len(content) - 1)
+            about["Content_Range"] = f"bytes {first}-{last}/{len(content)}"
+            return self._answer(206, content[first : last + 1], **about)
+        return self._answer(200, content, **about)

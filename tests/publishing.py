@@ -58,11 +58,26 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
     return DatasetFolder(folder)
 
 
+_SERVE = """
+import json, sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from fpp_ml_bench.commands import main
+for line in sys.stdin:
+    out, err = StringIO(), StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        status = main(["publish", *json.loads(line)])
+    print(json.dumps([status, out.getvalue(), err.getvalue()]), flush=True)
+"""
+"""Runs one call a line: starting Python and importing the client takes longer than publishing these few kilobytes."""
+
+
 class Client:
-    """``fpp-bench publish`` in a process of its own, as a user runs it, towards one server."""
+    """``fpp-bench publish`` in a process of its own, which alone sees the environment of one server."""
 
     def __init__(self, server: HubServer, home: Path) -> None:
         self.server, self.home = server, home
+        self._process = self._start()
 
     def environment(self, **changes: str | None) -> dict[str, str]:
         plain = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
@@ -72,39 +87,51 @@ class Client:
         }  # fmt: skip
         return {**plain, **{name: value for name, value in ours.items() if value is not None}}
 
-    def run(self, *calls: list[str], **environment: str | None) -> list[tuple[int, str, str]]:
-        """Exit status, standard output and standard error of each call; the calls share one process."""
-        code = (
-            "import sys, json\nfrom contextlib import redirect_stdout, redirect_stderr\nfrom io import StringIO\n"
-            "from fpp_ml_bench.commands import main\nsaid = []\n"
-            "for call in json.loads(sys.argv[1]):\n"
-            "    out, err = StringIO(), StringIO()\n"
-            "    with redirect_stdout(out), redirect_stderr(err):\n"
-            "        status = main(['publish', *call])\n"
-            "    said.append((status, out.getvalue(), err.getvalue()))\n"
-            "print(json.dumps(said))"
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", code, json.dumps(calls)], capture_output=True, text=True, cwd=self.home.parent,
-            env=self.environment(**environment), timeout=120,
+    def _start(self, **environment: str | None) -> "subprocess.Popen[str]":
+        return subprocess.Popen(
+            [sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            cwd=self.home.parent, env=self.environment(**environment),
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return [tuple(said) for said in json.loads(done.stdout)]
+
+    def run(self, *calls: list[str], **environment: str | None) -> list[tuple[int, str, str]]:
+        """Exit status, standard output and standard error of each call."""
+        process = self._start(**environment) if environment else self._process
+        said = [self._answer(process, call) for call in calls]
+        if environment:
+            stop(process)
+        return said
+
+    def _answer(self, process: "subprocess.Popen[str]", call: list[str]) -> tuple[int, str, str]:
+        assert process.stdin is not None and process.stdout is not None
+        process.stdin.write(json.dumps(call) + "\n")
+        process.stdin.flush()
+        line = process.stdout.readline()
+        assert line, f"fpp-bench publish {call} ended the process: a traceback, see above"
+        status, out, err = json.loads(line)
+        return status, out, err
 
     def good(self, call: list[str], **environment: str | None) -> str:
         ((status, out, err),) = self.run(call, **environment)
         assert status == 0, err
         return out
 
+    def close(self) -> None:
+        stop(self._process)
+        self.server.shutdown()
+        self.server.server_close()
+
+
+def stop(process: "subprocess.Popen[str]") -> None:
+    process.communicate(timeout=60)
+
 
 @contextmanager
 def running_hub(home: Path) -> Iterator[Client]:
-    server = HubServer()
+    client = Client(HubServer(), home)
     try:
-        yield Client(server, home)
+        yield client
     finally:
-        server.shutdown()
-        server.server_close()
+        client.close()
 
 
 def listed(said: str) -> dict[str, str]:

@@ -81,8 +81,9 @@ for config in datasets.get_dataset_config_names("alice/fpp"):
         rows = list(rows.with_format("numpy"))
         columns = {name: np.stack([row[name] for row in rows]) for name in features}
         np.savez(f"{out}/{config}-{split}.npz", **columns, features=json.dumps(features))
-first = next(iter(datasets.load_dataset("alice/fpp", split="test")))
+first = next(iter(datasets.load_dataset("alice/fpp", split="test", streaming=True)))
 assert first["frame_00"].mode == "L", first["frame_00"].mode
+np.save(f"{out}/streamed.npy", np.asarray(first["frame_00"]))
 """
 
 
@@ -92,6 +93,7 @@ def test_load_dataset_reads_the_same_rows_of_every_configuration(published, clie
         timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    same_bits(np.load(tmp_path / "streamed.npy"), dataset.frame(dataset.splits["test"][0], 0))
     assert dataset.configs == ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
     for config in dataset.configs:
         for split, samples in dataset.splits.items():
@@ -174,6 +176,7 @@ def test_refusals(client, small, tmp_path):
     good = ["dataset", str(small.path), "--repo"]
     client.good([*good, "alice/public"])
     client.server.repos["datasets", "alice/other"] = Repo(files={"train.csv": b"a,b\n"})
+    client.server.repos["datasets", "raced/fpp"] = Repo()
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
     (tmp_path / "page").mkdir()
@@ -185,6 +188,7 @@ def test_refusals(client, small, tmp_path):
         ([*good, "forbidden/fpp"], r"403\); it needs write access.*The Hub says: You don't have the rights"),
         ([*good, "broken/fpp"], r"fault \(500\)"),
         ([*good, "alice/other"], r"did not publish \(train.csv.*--adopt"),
+        ([*good, "raced/fpp"], r"committed meanwhile \(412\)"),
         ([*good, "alice/public", "--private"], "exists and is public"),
         ([*good, "alice/new", "--staging", str(tmp_path / "occupied")], "holds files"),
         ([*good, "alice/new", "--license", "all rights: reserved"], "--license"),
@@ -197,7 +201,8 @@ def test_refusals(client, small, tmp_path):
         assert status == 2, call
         assert re.search(wanted, error, re.DOTALL), (call, error)
         assert "Traceback" not in error and "\x1b" not in error
-    assert [path for _, path in client.server.writes() if path != "/api/repos/create"] == []
+    assert set(client.server.repos["datasets", "raced/fpp"].files) == {".gitattributes"}
+    assert ("datasets", "alice/new") not in client.server.repos
     assert (tmp_path / "occupied" / "thesis.tex").read_text() == "mine"
 
 

@@ -163,6 +163,18 @@ def test_the_page_becomes_a_static_space(client, tmp_path):
     }  # fmt: skip
 
 
+def test_the_page_of_results(client, scored, tmp_path):
+    """The leaderboard's own page, made from results, passes as a page; without any it is that of the shipped rows."""
+    call = ["leaderboard", str(scored["good"]), str(scored["many"]), "--repo", "alice/ranked"]
+    made, again, none, both = client.run(call, call, ["leaderboard", "--repo", "alice/ranked"], [*call, "--page", "x"])
+    assert made[0] == again[0] == none[0] == 0, (made, again, none)
+    assert "Nothing to send" in again[1]
+    pages = [name for name in listed(made[1]) if name.startswith("submissions/")]
+    assert len(pages) == 2
+    assert {name: listed(none[1])[name] for name in pages} == dict.fromkeys(pages, "deleted")
+    assert both[0] == 2 and "got both" in both[2]
+
+
 def test_what_is_no_part_of_a_page_stays_home(client, tmp_path):
     names = (".env", ".git/config", "notes.docx", "README.md", "sub/key.pem")
     calls = []

@@ -15,7 +15,7 @@ SUMMARY = "Publish a dataset, the leaderboard's page or results on the Hugging F
 EXAMPLES = (
     "fpp-bench publish dataset data/mini --repo me/fpp-mini --dry-run      what would change; sends nothing",
     "fpp-bench publish dataset data/full --repo me/fpp --staging staged    continues where an earlier run stopped",
-    "fpp-bench publish leaderboard --page page --repo me/fpp-leaderboard",
+    "fpp-bench publish leaderboard --repo me/fpp-leaderboard --dataset-repo me/fpp",
     "fpp-bench publish results result.json --repo me/my-model --dataset-repo me/fpp",
 )
 _SIGNS = {"new": "+", "changed": "~", "deleted": "-", "unchanged": " "}
@@ -37,7 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
     page = _part(what, "leaderboard", "the leaderboard's page as a static Space")
-    page.add_argument("--page", type=Path, required=True, metavar="DIR", help="folder with index.html")
+    page.add_argument(
+        "results", type=Path, nargs="*", metavar="RESULT.json",
+        help="result or row files, or folders of them (default: the rows shipped with the package)",
+    )  # fmt: skip
+    page.add_argument("--page", type=Path, metavar="DIR", help="a page written before, instead of results")
     page.add_argument("--private", action="store_true", help="make the Space private if it is new")
     page.add_argument("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")
 
@@ -99,10 +103,14 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
 def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
     from tempfile import TemporaryDirectory
 
-    from fpp_ml_bench.leaderboard.publish_page import stage_page
+    from fpp_ml_bench.leaderboard.publish_page import stage_page, write_page_of
 
-    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
-        publication = stage_page(args.page, args.repo, Path(folder), args.dataset_repo)
+    if args.page is not None and args.results:
+        raise PublishError("expected result files or --page, got both: the page is made from the results, or given")
+    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as made:
+        if args.page is None:
+            write_page_of(args.results, Path(made))
+        publication = stage_page(args.page or Path(made), args.repo, Path(folder), args.dataset_repo)
         return _carry_out(args, hub, publication, _remote(args, hub, "space"))
 
 
