@@ -1,7 +1,7 @@
 """The report a person looks at: the errors' histogram, the scores, and samples from best to worst on one HTML page."""
 
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from threading import local
 from typing import Protocol
@@ -15,7 +15,7 @@ from fpp_ml_bench.evaluation.numbers import millimetres, seconds
 from fpp_ml_bench.evaluation.reading import reader_for
 from fpp_ml_bench.evaluation.report_histogram import histogram_svg
 from fpp_ml_bench.evaluation.report_html import escaped, page
-from fpp_ml_bench.evaluation.report_panels import panels_html, sample_panels
+from fpp_ml_bench.evaluation.report_panels import Panel, panels_html, sample_panels
 from fpp_ml_bench.evaluation.report_scores import sample_table, score_table
 from fpp_ml_bench.evaluation.result import Result, SampleResult
 from fpp_ml_bench.evaluation.text import printable
@@ -53,12 +53,8 @@ def write_report(result: Result, dataset: ReportedDataset, predictions_folder: s
     Raises DatasetError when ``dataset`` is not the one that was scored, PredictionError for a prediction that can't be
     read any more, and SubmissionError where the page can't be written.
     """
-    if dataset.fingerprint != result.dataset.fingerprint:
-        raise DatasetError(
-            f"{dataset.path}: fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was "
-            "scored; give the dataset that the result names"
-        )
-    body = report_body(result, panels_of(result, dataset, Path(predictions_folder)))
+    found = chosen_panels(result, dataset, Path(predictions_folder))
+    body = report_body(result, [_sample_html(*sample) for sample in found])
     path = Path(out) / REPORT_FILE
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,20 +79,31 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
     return row.object_mae_mm or 0.0, row.sample
 
 
-def panels_of(result: Result, dataset: ReportedDataset, folder: Path) -> list[str]:
-    """HTML of each chosen sample with its panels."""
+def chosen_panels(
+    result: Result, dataset: ReportedDataset, folder: Path
+) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
+    """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time.
+
+    Raises DatasetError when ``dataset`` is not the one that was scored.
+    """
+    if dataset.fingerprint != result.dataset.fingerprint:
+        raise DatasetError(
+            f"{dataset.path}: fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was "
+            "scored; give the dataset that the result names"
+        )
     read = prediction_reader(result, dataset, folder)
-    parts = []
     for title, row in chosen_samples(result.per_sample):
         prediction_mm, target_mm = read(row)
-        panels = sample_panels(_fringe(result, dataset, row.sample), target_mm, prediction_mm, row.sample)
-        parts.append(
-            f"<div><h3>{escaped(title)}: {escaped(row.sample)}</h3>"
-            f'<p class="soft small">Object MAE {millimetres(row.object_mae_mm)} mm, RMSE '
-            f"{millimetres(row.object_rmse_mm)} mm; background MAE {millimetres(row.background_mae_mm)} mm</p>"
-            f"{panels_html(panels)}</div>"
-        )
-    return parts
+        yield title, row, sample_panels(_fringe(result, dataset, row.sample), target_mm, prediction_mm, row.sample)
+
+
+def _sample_html(title: str, row: SampleResult, panels: list[Panel]) -> str:
+    return (
+        f"<div><h3>{escaped(title)}: {escaped(row.sample)}</h3>"
+        f'<p class="soft small">Object MAE {millimetres(row.object_mae_mm)} mm, RMSE '
+        f"{millimetres(row.object_rmse_mm)} mm; background MAE {millimetres(row.background_mae_mm)} mm</p>"
+        f"{panels_html(panels)}</div>"
+    )
 
 
 def prediction_reader(result: Result, dataset: ReportedDataset, folder: Path) -> Callable[[SampleResult], Pair]:

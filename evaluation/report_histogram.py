@@ -72,4 +72,5 @@ def histogram_svg(values: Sequence[float], mean: float, label: str) -> str:
         f"{escaped(label)}, mm</text>"
     )
     said = f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm"
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escaped(said)}">{"".join(parts)}</svg>'
+    attributes = f'class="histogram" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escaped(said)}"'
+    return f"<svg {attributes}>{''.join(parts)}</svg>"

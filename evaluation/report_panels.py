@@ -20,14 +20,24 @@ CLIP_PERCENTILE = 95
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture as PNG, what it shows in words, and its scale: the colour bar as PNG and the values at its ends."""
+    """A picture as ``indices`` (0 is transparent) into a map of ``colours``, what it shows, its scale's ends."""
 
     title: str
-    png: bytes
+    indices: NDArray[np.uint8]
+    colours: str
     description: str
-    scale_png: bytes | None = None
     low: str = ""
     high: str = ""
+
+    @property
+    def png(self) -> bytes:
+        return palette_png(self.indices, colour_table(self.colours))
+
+    @property
+    def scale_png(self) -> bytes | None:
+        """The colour bar; None for a panel without ends."""
+        ramp = np.linspace(1, 255, 128).round().astype(np.uint8)[None].repeat(2, axis=0)
+        return palette_png(ramp, colour_table(self.colours)) if self.high else None
 
 
 def sample_panels(
@@ -43,7 +53,7 @@ def sample_panels(
     ends = f"{low:.0f}", f"{high:.0f} mm"
     limit = f"{millimetres(clip)} mm"
     return [
-        Panel("Fringe", _grey(fringe), f"{sample}: the captured fringe image"),
+        Panel("Fringe", np.maximum(_thinned(fringe), 1), "gray", f"{sample}: the captured fringe image"),
         _coloured(
             "Truth", target_mm, inside, "viridis", low, high, ends,
             f"{sample}: true depth, {ends[0]} to {ends[1]}",
@@ -81,23 +91,17 @@ def panels_html(panels: list[Panel]) -> str:
 
 
 @cache
-def _colours(name: str) -> NDArray[np.uint8]:
-    """256 RGB colours of a matplotlib map; the first stands for index 0, which is transparent."""
+def colour_table(name: str, levels: int = 255) -> NDArray[np.uint8]:
+    """Index 0, which is transparent, and ``levels`` RGB colours of a matplotlib map, (levels + 1, 3)."""
     import matplotlib
 
-    table = matplotlib.colormaps[name](np.linspace(0, 1, 255))[:, :3]
+    table = matplotlib.colormaps[name](np.linspace(0, 1, levels))[:, :3]
     return np.vstack([np.zeros((1, 3)), 255 * table]).round().astype(np.uint8)
 
 
 def _thinned(image: NDArray) -> NDArray:
     step = max(1, -(-max(image.shape) // PANEL_PX))
     return image[::step, ::step]
-
-
-def _grey(image: NDArray[np.uint8]) -> bytes:
-    ramp = np.repeat(np.linspace(0, 255, 255).round()[:, None], 3, axis=1)
-    table = np.vstack([np.zeros((1, 3)), ramp]).astype(np.uint8)
-    return palette_png(np.maximum(_thinned(image), 1).astype(np.uint8), table)
 
 
 def _coloured(
@@ -114,6 +118,4 @@ def _coloured(
     values, shown = _thinned(np.asarray(values, np.float64)), _thinned(shown)
     share = np.clip((values - low) / (high - low), 0, 1) if high > low else np.zeros_like(values)
     indices = np.where(shown, 1 + np.round(254 * share), 0).astype(np.uint8)
-    table = _colours(colours)
-    ramp = np.linspace(1, 255, 128).round().astype(np.uint8)[None].repeat(2, axis=0)
-    return Panel(title, palette_png(indices, table), description, palette_png(ramp, table), *ends)
+    return Panel(title, indices, colours, description, *ends)

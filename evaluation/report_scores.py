@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from fpp_ml_bench.evaluation.numbers import millimetres, percent
-from fpp_ml_bench.evaluation.protocol import METRICS
+from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.report_html import escaped
 from fpp_ml_bench.evaluation.result import Result
 
@@ -81,7 +81,7 @@ def html_table(
     )
     note = f"<p class='soft small'>{escaped(small, 500)}</p>" if small else ""
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escaped(caption)}"><table>'
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escaped(caption)}"><table class="dense">'
         f"<caption>{escaped(caption, 400)}</caption><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>"
         f"{note}"
     )
@@ -100,7 +100,7 @@ def score_table(result: Result) -> str:
         rows.append([
             metric_title(key),
             value(getattr(result.metrics, key)),
-            interval_text(result.intervals.of(key)),
+            interval_text(result.intervals.of(key)) if key in HEADLINE else "",
             value(getattr(result.median, key)),
             value(pooled) if pooled is not None else "",
         ])  # fmt: skip

@@ -23,7 +23,8 @@ def markdown_text(text: str) -> str:
     return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
 
 
-def _table(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
+def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table; ``right`` says which columns stand on the right. Cells are Markdown already."""
     lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(" ---: " if r else " --- " for r in right) + "|"]
     return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
@@ -35,7 +36,7 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
     for group in groups:
         rows = [[markdown_text(column.text(row)) for column in shown] for row in group.rows]
         titles = [column.title.replace("#", "Rank") for column in shown]
-        lines += [f"### {markdown_text(group.title)}", "", *_table(titles, [c.right for c in shown], rows), ""]
+        lines += [f"### {markdown_text(group.title)}", "", *markdown_rows(titles, [c.right for c in shown], rows), ""]
     if groups:
         lines += [NOTE.replace("*", "\\*"), ""]
     if papers:
@@ -43,7 +44,12 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
     for paper in papers:
         rows = [[markdown_text(cell) for cell in paper_cells(row)] for row in paper.rows]
         right = [number > 1 for number in range(len(PAPER_TITLES))]
-        lines += [f"{markdown_text(f'{paper.name}: {paper.title}, mm')}", "", *_table(PAPER_TITLES, right, rows), ""]
+        lines += [
+            f"{markdown_text(f'{paper.name}: {paper.title}, mm')}",
+            "",
+            *markdown_rows(PAPER_TITLES, right, rows),
+            "",
+        ]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 

@@ -11,6 +11,9 @@ Box = tuple[float, float, float, float]
 _CHARACTER_PX, _LINE_PX = 6.7, 15.0
 """Of sans-serif type at 12 px; wider than most, so that a name that fits here fits everywhere."""
 
+_SHORTEST = 26
+"""Characters that a name keeps however narrow the picture: fewer would tell nothing."""
+
 
 @dataclass(frozen=True)
 class Named:
@@ -29,7 +32,7 @@ def label_texts(marks: Sequence[Named], lines: Sequence[Box], inside: Box) -> li
     No name covers a mark, another name, or leaves ``inside``; nor one of ``lines``, unless there is no other place.
     """
     taken: list[Box] = [(m.x - m.r, m.y - m.r, m.x + m.r, m.y + m.r) for m in marks]
-    longest = int(0.42 * (inside[2] - inside[0]) / _CHARACTER_PX)
+    longest = max(_SHORTEST, int(0.42 * (inside[2] - inside[0]) / _CHARACTER_PX))
     parts = []
     for mark in marks:
         text = shortened(mark.name, longest)

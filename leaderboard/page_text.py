@@ -14,9 +14,9 @@ INTRODUCTION = (
 )
 
 SCATTER_KEY = (
-    "Error against run time: lower and further left is better. "
-    '<span class="front-key">The line</span> is the front: nobody is both faster and more exact. '
-    "Area of a mark: frames needed. Whiskers: 95% interval of the error, 5th to 95th percentile of the time. Hollow: time self-reported."
+    'Error against run time: lower and further left is better. <span class="front-key">The line</span> is the front: '
+    "nobody is both faster and more exact. Area of a mark: frames needed. Whiskers: 95% interval of the error, 5th to "
+    "95th percentile of the time. Hollow: time self-reported."
 )
 
 _READING = (

@@ -1,17 +1,22 @@
 """``fpp-bench leaderboard``: rank result files, and show the paper's rows beside them."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import METRICS
 
-SUMMARY = "Rank result files of fpp-eval: error and run time side by side, and the paper's rows apart."
+SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
 EXAMPLES = (
     "fpp-bench leaderboard result.json other.json",
     "fpp-bench leaderboard results/ --sort object_rmse_mm --markdown table.md",
     "fpp-bench leaderboard --paper loss",
+    "fpp-bench leaderboard --page page",
+    "fpp-bench leaderboard --readme README.md --check",
+    "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json --provenance verified",
 )
+_PROVENANCES = ("measured here", "verified", "self-reported")
 _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "all", "none")
 
 
@@ -32,19 +37,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
         help=f"tables the paper reports: {', '.join(_TABLES)} (default: architecture, normalization; alone: all)",
     )  # fmt: skip
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="DIR",
+        help="write the static page of the shipped rows, or of those given: index.html, one page a submission",
+    )
+    parser.add_argument(
+        "--readme", type=Path, metavar="FILE",
+        help="make the block between the leaderboard markers of this file anew, from the rows shipped with the package",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="with --readme: only tell; exit status 1 when the block is not what rows give",
+    )
+    parser.add_argument(
+        "--row", type=Path, metavar="FILE", help="write the one result given as a row file for the page"
+    )
+    parser.add_argument(
+        "--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
+        help=f"who stands for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the tables and write what was asked for. Raises SubmissionError naming a file that is no sound result."""
+    """Do what was asked for and print the tables. Raises SubmissionError naming a file that is no sound result."""
     from fpp_ml_bench.evaluation.console import output_width, show
     from fpp_ml_bench.leaderboard.export import markdown, table_json
+    from fpp_ml_bench.leaderboard.page import write_page
     from fpp_ml_bench.leaderboard.paper import chosen_tables
-    from fpp_ml_bench.leaderboard.ranking import discover, expand, rank, read_entries
+    from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, discover, expand, rank, read_entries, shipped_rows
+    from fpp_ml_bench.leaderboard.rows import read_entry, write_row
     from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
     from fpp_ml_bench.loaders.manifest import write_atomically
 
-    files = expand(args.results) if args.results else discover(Path.cwd())
-    groups = rank(read_entries(files), args.sort)
+    if args.check and args.readme is None:
+        raise SubmissionError("--check asks about a README; give it with --readme FILE")
+    if args.readme is not None:
+        return _readme(args)
+    if args.row is not None:
+        if len(args.results) != 1:
+            raise SubmissionError(f"--row makes a row of one result, {len(args.results)} were given")
+        write_row(read_entry(args.results[0]), args.provenance, args.row)
+        print(f"{args.row}: {args.provenance}")
+        return 0
+    # What gets published holds the shipped rows or what was named, never a result that happens to lie about.
+    unnamed = shipped_rows() if args.page is not None else discover(Path.cwd())
+    files = expand(args.results) if args.results else unnamed
+    entries = read_entries(files)
+    groups = rank(entries, args.sort)
     papers = chosen_tables(args.paper)
     for path, text in ((args.markdown, markdown), (args.json, table_json)):
         if path is None:
@@ -53,5 +95,27 @@ def run(args: argparse.Namespace) -> int:
             write_atomically(path, text(groups, papers, args.sort).encode("utf-8"))
         except OSError as error:
             raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
+    if args.page is not None:
+        written = write_page(rank(entries, DEFAULT_SORT), papers, args.page)
+        print(f"{args.page}: {len(written)} files; open {written[0]}")
+        return 0
     show(*group_tables(groups, args.sort, output_width()), *paper_rich_tables(papers))
+    return 0
+
+
+def _readme(args: argparse.Namespace) -> int:
+    """Make or check README's block from the shipped rows: results lying about must not get into it."""
+    from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+    from fpp_ml_bench.leaderboard.readme_block import update_readme
+
+    entries = read_entries(expand(args.results) if args.results else shipped_rows())
+    same = update_readme(args.readme, rank(entries), args.check)
+    if args.check and not same:
+        print(
+            f"{args.readme}: the ranking is not what the rows give; don't edit it by hand, run: "
+            f"fpp-bench leaderboard --readme {args.readme}",
+            file=sys.stderr,
+        )
+        return 1
+    print(f"{args.readme}: {'the ranking is what the rows give' if same else 'written'}")
     return 0

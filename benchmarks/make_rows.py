@@ -1,0 +1,70 @@
+"""Make the leaderboard's own rows again: predict, time, score, and write one row file and one picture a method.
+
+    fpp-bench build data/full --preset full
+    python benchmarks/make_rows.py data/full --work rows-work
+    fpp-bench leaderboard --readme README.md
+    fpp-bench leaderboard --page page
+
+Every step is a command of the package, printed before it runs; the same data gives the same scores, and times that this
+machine measured. Test split against the exact depth: against ``depth`` the full sequence scores 0, for it made it.
+"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from fpp_ml_bench.commands import main as fpp_bench
+from fpp_ml_bench.commands.evaluate import main as fpp_eval
+from fpp_ml_bench.evaluation.report_sheet import write_sheet
+from fpp_ml_bench.evaluation.result_io import read_result
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+ROWS = Path(__file__).resolve().parent.parent / "leaderboard" / "rows"
+METHODS = (
+    (18, "both"), (18, "vertical"), (18, "horizontal"), (9, "both"), (9, "vertical"), (6, "vertical"), (4, "vertical"),
+    (3, "vertical"),
+)  # fmt: skip
+"""Steps and directions of the classical method; 18 is divisible by all but 4, whose phases are not evenly spaced."""
+
+
+def run(command: str, *words: object) -> None:
+    """Run one command and stop at the first that fails."""
+    arguments = [str(word) for word in words]
+    print("$", command, shlex.join(arguments), flush=True)
+    status = (fpp_eval if command == "fpp-eval" else fpp_bench)(arguments)
+    if status != 0:
+        sys.exit(status)
+
+
+def make_row(dataset: Path, work: Path, out: Path, steps: int, direction: str, repeats: int) -> None:
+    """Predictions, time, result, row and picture of one setting."""
+    name = f"classical-{steps:02d}-{direction}"
+    predictions, result = work / name, work / f"{name}.json"
+    settings = ["classical", dataset, "--steps", steps, "--direction", direction]
+    run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
+    run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
+    run("fpp-eval", predictions, "--dataset", dataset, "--target", "depth_exact", "--json", result)
+    run("fpp-bench", "leaderboard", result, "--row", out / f"{name}.json", "--provenance", "measured here")
+    write_sheet(read_result(result), DatasetFolder(dataset), predictions, out / f"{name}.png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__.split("\n", 1)[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path, help="dataset folder with all frames")
+    parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
+    parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
+    parser.add_argument("--repeats", type=int, default=40, help="timed runs a method")
+    args = parser.parse_args()
+    if args.work.exists() and any(args.work.iterdir()):
+        parser.error(f"{args.work} is not empty")
+    args.work.mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for steps, direction in METHODS:
+        make_row(args.dataset, args.work, args.out, steps, direction, args.repeats)
+
+
+if __name__ == "__main__":
+    main()
