@@ -65,7 +65,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
     data = [shard for shard in manifest.shards if shard.group == DATA_GROUP]
     for split in manifest.samples:
         files = [shard.path for shard in data if shard.split == split]
-        state = {
+        state: dict[str, Any] = {
             "_data_files": [{"filename": path.split("/")[-1]} for path in files],
             "_fingerprint": manifest.fingerprint[:16],
             "_format_columns": None,

@@ -70,6 +70,11 @@ class Manifest:
         return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
     @property
+    def files(self) -> tuple[ShardFile | OtherFile, ...]:
+        """Every file but the manifest itself."""
+        return (*self.others, *self.shards)
+
+    @property
     def splits(self) -> dict[str, list[str]]:
         return {split: [row["sample"] for row in rows] for split, rows in self.samples.items()}
 

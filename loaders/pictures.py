@@ -66,7 +66,10 @@ def sample_picture(opened: DatasetFolder, sample: str, path: Path) -> None:
 
 
 def _grey(image: NDArray) -> "Callable[[Axes], None]":
-    return lambda axes: axes.imshow(image, cmap="gray", vmin=0, vmax=255) and None
+    def draw(axes: "Axes") -> None:
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+
+    return draw
 
 
 def _colours(image: NDArray, colours: str, low: float, high: float, unit: str) -> "Callable[[Axes], None]":
@@ -93,13 +96,12 @@ def _save(save: Callable[..., None], path: Path) -> None:
 
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     """The mesh from above and to the side, lit from the eye; uint8 (size, size)."""
-    import trimesh
-
+    from fpp_ml_bench.loaders.meshes import load_user_mesh
     from fpp_ml_bench.loaders.raycast import TracedObject
-    from fpp_ml_bench.loaders.scene import SolidMesh, turned
+    from fpp_ml_bench.loaders.scene import turned
+    from fpp_ml_bench.loaders.settings import UserMesh
 
-    loaded = trimesh.load(path, force="mesh", process=False)
-    mesh = SolidMesh(path.stem, np.asarray(loaded.vertices), np.asarray(loaded.faces, dtype=np.int32))
+    mesh = load_user_mesh(UserMesh(path.stem, str(path), centre=False))
     vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
     tilt = np.deg2rad(25.0)
     rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])

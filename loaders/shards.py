@@ -212,18 +212,20 @@ class _DataBatch:
         values.update(zip(RANGE, range_mm, strict=True))
         for name, value in values.items():
             self._values.setdefault(name, []).append(value)
-        images = {sequence.frames[SINGLE_SHOT_FRAME].column: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
+        first = sequence.frames[SINGLE_SHOT_FRAME].column
+        images: dict[str, NDArray] = {first: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
         if row.depth_exact_mm is not None:
             images[DEPTH_EXACT] = row.depth_exact_mm
         for column, image in images.items():
-            image = _checked_image(image, self._size, column)
-            self._buffer(column, image.dtype)[self._filled] = image
+            self._buffer(column, image.dtype)[self._filled] = _checked_image(image, self._size, column)
         self._filled += 1
 
     def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
         """The batch; its images live in the shared buffers until the next shard."""
-        columns = [self._values.get(name, _buffers.get((name, self._size))) for name in schema.names]
-        return _record_batch([c if isinstance(c, list) else c[: self._rows] for c in columns], schema)
+        columns: list[Any] = [
+            self._values.get(name) or _buffers[name, self._size][: self._rows] for name in schema.names
+        ]
+        return _record_batch(columns, schema)
 
 
 def _checked_image(image: NDArray, size: tuple[int, int], column: str) -> NDArray:

@@ -43,7 +43,7 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     findings = foreign_files(folder, manifest)
     places: ImagePlaces = {}
     opened = None
-    for file in (*manifest.others, *manifest.shards):
+    for file in manifest.files:
         damage = file_damage(folder, file.path, file.bytes, file.xxh3_128)
         if damage:
             findings.append(damage)
@@ -104,7 +104,7 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
             if column in (DEPTH, DEPTH_EXACT):
                 findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
             if image.min() != image.max():  # a uniform image (black without noise) says nothing about what it shows
-                digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image))
+                digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image).data)
                 places.setdefault(digest, []).append((shard.split, row["sample"], column))
     opened.forget(shard)
     return findings

@@ -119,7 +119,7 @@ def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: f
     from fpp_ml_bench.commands.console import gigabytes
     from fpp_ml_bench.loaders.statistics import ground_truth_summary
 
-    size = sum(file.bytes for file in (*manifest.shards, *manifest.others))
+    size = sum(file.bytes for file in manifest.files)
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
     print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)}; {rate}")

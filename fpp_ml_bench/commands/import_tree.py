@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("importing", rows, "images", images) as advance:
         manifest = import_tree(args.out, planned, workers, advance)
     seconds = perf_counter() - started
-    size = sum(file.bytes for file in (*manifest.shards, *manifest.others))
+    size = sum(file.bytes for file in manifest.files)
     parts = ", ".join(f"{split} {len(found)}" for split, found in manifest.samples.items())
     print(f"{args.out}: {parts} samples, {rows * images:,} images, {gigabytes(size)} in {seconds:.1f} s")
     for note in import_notes(manifest):

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
             "origin": opened.manifest.origin,
             "size": list(opened.size),
             "configs": list(opened.configs),
-            "bytes": sum(file.bytes for file in (*opened.manifest.shards, *opened.manifest.others)),
+            "bytes": sum(file.bytes for file in opened.manifest.files),
             "settings": opened.manifest.settings,
             "rig": opened.manifest.rig,
             "splits": [asdict(split) for split in statistics],

@@ -18,7 +18,7 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.verify import verify
 
     manifest = read_manifest(args.dataset)
-    files = (*manifest.shards, *manifest.others)
+    files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:
         findings = verify(args.dataset, advance)
     for finding in findings:
