@@ -73,7 +73,7 @@ def time_method(
         latencies_ms.append(1000 * one(number))
         progress(1)
     many, batched = _batch_runner(method)
-    pictures = [stacks[number % len(stacks)] for number in range(batch)]
+    pictures: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
     rates = []
     for number in range(1 + max(1, -(-repeats // batch))):
         wait()

@@ -31,10 +31,10 @@ def _check(name: str) -> None:
 
 
 def normalise(
-    depth_mm: NDArray[np.float32], name: Normalisation, depth_min_mm: float, depth_max_mm: float,
-    out: NDArray[np.float32] | None = None,
-) -> NDArray[np.float32]:  # fmt: skip
-    """Depth map in mm, 0 = background, to the representation ``name``; float32 of the same shape, in ``out`` if given.
+    depth_mm: NDArray[np.floating], name: Normalisation, depth_min_mm: float, depth_max_mm: float,
+    out: NDArray[np.floating] | None = None,
+) -> NDArray:  # fmt: skip
+    """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
 
     Single precision loses nothing here: the difference of two float32 depths within a factor of two of each other is
     exact (Sterbenz), and the division rounds once. Raises ``ValueError`` for an unknown name or a range that is not

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
 from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.mat_files import matrix_bytes
 from fpp_ml_bench.loaders.published_layout import (
     BACKGROUND_REMOVED_FOLDERS,
@@ -37,7 +38,7 @@ from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.normalisation import Normalisation, normalise
 from fpp_ml_bench.pixel_sets import object_mask
 
-_PHASE_DIRECTION = "horizontal"
+_PHASE_DIRECTION: Direction = "horizontal"
 """The published phases have no direction in their name; they are those of the single-shot frame's own sequence."""
 
 

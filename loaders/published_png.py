@@ -73,7 +73,7 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
     if image is None or image.dtype != np.uint8 or image.shape != (*header.size, *channels):
         raise LayoutError(f"{path}: can't be decoded as an 8-bit {_COLOURS[header.colour]} PNG")
     if not channels:
-        return image
+        return np.asarray(image, dtype=np.uint8)
     blue, green, red = image[..., 0], image[..., 1], image[..., 2]
     if not (np.array_equal(blue, green) and np.array_equal(green, red)):
         raise LayoutError(f"{path}: an RGB image whose channels differ; expected grey levels")
