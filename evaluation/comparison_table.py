@@ -13,8 +13,8 @@ def comparison_table(found: Comparison) -> Group:
     """The comparison as rich tables; every text from a submission is shown as plain text, never as markup."""
     table = Table(caption="mm; mean of second - first over samples, 95% interval over objects", caption_justify="left")
     table.add_column("Error")
-    for title in ("Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"):
-        table.add_column(title, justify="right", no_wrap=True)
+    for heading in ("Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for key, row in found.differences.items():
         low, high = row.interval_mm
         ends = None if low is None or high is None else (low, high)

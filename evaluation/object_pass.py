@@ -20,10 +20,10 @@ _COMPILED_DTYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
 
 class ObjectErrors(NamedTuple):
-    """``index`` of the object's n pixels in the flat image, their errors in mm float64 (n,), which of them were not
+    """``pixels``: where in the flat image the object's n pixels lie, their errors in mm float64 (n,), which of them were not
     measured (n,), and the statistics of all other pixels."""
 
-    index: NDArray[np.intp]
+    pixels: NDArray[np.intp]
     errors: NDArray[np.float64]
     missing: NDArray[np.bool_]
     background: ErrorStats

@@ -47,7 +47,9 @@ def _pages(content: bytes, start: int, stop: int) -> tuple[int, int]:
         except (IndexError, struct.error):
             raise PredictionError("has a damaged page header; write it again with pyarrow") from None
         kind, unpacked, packed = header.get(1), header.get(2), header.get(3)
-        if not all(isinstance(value, int) and value >= 0 for value in (kind, unpacked, packed)):
+        if not (isinstance(kind, int) and isinstance(unpacked, int) and isinstance(packed, int)):
+            raise PredictionError("has a damaged page header; write it again with pyarrow")
+        if min(unpacked, packed) < 0:
             raise PredictionError("has a damaged page header; write it again with pyarrow")
         total += unpacked
         about = header.get(_HEADERS.get(kind, 0))

@@ -150,11 +150,11 @@ def score_sample(
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
     found = object_errors(prediction_mm, target_mm, compiled)
-    if not found.index.size:
+    if not found.pixels.size:
         return SampleScores(found.background, {}, Distribution())
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
-    zone = near.ravel().take(found.index).view(np.uint8) * np.uint8(_EDGE)
-    zone |= wide.ravel().take(found.index).view(np.uint8) * np.uint8(_WIDE)
+    zone = near.ravel().take(found.pixels).view(np.uint8) * np.uint8(_EDGE)
+    zone |= wide.ravel().take(found.pixels).view(np.uint8) * np.uint8(_WIDE)
     zone |= found.missing.view(np.uint8) * np.uint8(_MISSING)
     present = np.flatnonzero(np.bincount(zone)).tolist()
     zones = {code: stats_of(found.errors[zone == code]) for code in present}

@@ -59,8 +59,8 @@ def unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, tar
 def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str) -> tuple[Depth, Depth]:
     """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
 
-    ``standard``: depth in mm, 0 = background. Normalised values above 0 go back through the sample's own range,
-    D = v (D_max - D_min) + D_min; 0 and below stays 0, background.
+    ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
+    D = v (D_max - D_min) + D_min, but for an exact 0, which stays 0: background, or not measured.
 
     ``paper-individual`` (paper Section 5.3.2, individual normalisation): the target is normalised first, its mask is
     D_norm > 0, and prediction and target go through that one affine map everywhere. D_min cancels in every difference,
@@ -75,15 +75,15 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
         return values.astype(np.float64) * MM_PER_M, target_mm
     inside = object_mask(target_mm)
     if not inside.any():
-        if mode == "standard" and not (values > 0).any():
-            return np.minimum(values, 0), target_mm
+        if mode == "standard" and not values.any():
+            return values, target_mm
         raise DatasetError(
             f"{sample}: the target holds no object, so normalised depth has no range to go back through; submit mm"
         )
     low, high = (float(edge(target_mm[inside])) for edge in (np.min, np.max))
     if mode == "standard":
         depth = values.astype(np.float64) * (high - low) + low
-        depth[values <= 0] = 0.0
+        depth[values == 0] = 0.0
         return depth, target_mm
     if high == low:
         raise DatasetError(

@@ -1,0 +1,184 @@
+"""Every score against an independent float128 reference, the identity of the three sets, and the compiled kernels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+from scored_dataset import disk_depth
+
+from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED
+from fpp_ml_bench.evaluation.scores import headline_scores, score_sample
+
+LONG = np.longdouble
+
+
+def edges_of(target):
+    """Pixels beside a depth edge, from shifted copies: written anew from PROTOCOL.md."""
+    jump = 10.0 * 960 / target.shape[1]
+    marked = np.zeros(target.shape, bool)
+    for axis, length in enumerate(target.shape):
+        for place in range(length - 1):
+            one, two = (np.take(target, place + step, axis) for step in (0, 1))
+            crossed = ((one > 0) != (two > 0)) | ((one > 0) & (two > 0) & (np.abs(two - one) > jump))
+            for step in (0, 1):
+                index = [slice(None)] * 2
+                index[axis] = place + step
+                marked[tuple(index)] |= crossed
+    return marked
+
+
+def reference(prediction, target, band):
+    """All scores in float128 by sorting and masking; None for an empty set."""
+    error = prediction.astype(LONG) - target.astype(LONG)
+    inside, edges = target > 0, edges_of(target)
+    distance = ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
+    valid = inside & (prediction > 0)
+
+    def mae(pixels):
+        return np.abs(error[pixels]).mean() if pixels.any() else None
+
+    def rmse(pixels):
+        return np.sqrt((error[pixels] ** 2).mean()) if pixels.any() else None
+
+    def share(part, whole):
+        return LONG(np.count_nonzero(part)) / np.count_nonzero(whole) if whole.any() else None
+
+    core, near = inside & (distance >= band), inside & (distance < band)
+    wide, deep = inside & (distance < 8), inside & (distance >= 8)
+    found = {
+        "overall_mae_mm": mae(np.ones_like(inside)), "overall_rmse_mm": rmse(np.ones_like(inside)),
+        "object_mae_mm": mae(inside), "object_rmse_mm": rmse(inside),
+        "background_mae_mm": mae(~inside), "background_rmse_mm": rmse(~inside),
+        "object_interior_mae_mm": mae(core), "object_interior_rmse_mm": rmse(core),
+        "object_edge_mae_mm": mae(near), "object_edge_rmse_mm": rmse(near),
+        "object_valid_mae_mm": mae(valid), "object_interior_valid_mae_mm": mae(valid & core),
+        "object_edge_share": share(near, inside), "object_missing_share": share(inside & ~valid, inside),
+        "object_interior_missing_share": share(core & ~valid, core),
+        "object_wide_band_mae_mm": mae(wide), "object_wide_interior_mae_mm": mae(deep),
+        "object_wide_band_share": share(wide, inside),
+        "object_bias_mm": error[inside].mean() if inside.any() else None,
+        "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
+    }  # fmt: skip
+    ordered, signed = np.sort(np.abs(error[inside])), np.sort(error[inside])
+
+    def quantile(values, level):
+        place = LONG(level) * (values.size - 1)
+        low = int(np.floor(place))
+        high = min(low + 1, values.size - 1)
+        return values[low] + (values[high] - values[low]) * (place - low)
+
+    some = bool(ordered.size)
+    found["object_median_mm"] = quantile(ordered, LONG(1) / 2) if some else None
+    found["object_p95_mm"] = quantile(ordered, LONG(95) / 100) if some else None
+    found["object_max_mm"] = ordered[-1] if some else None
+    for limit in (1, 2, 5, 10):
+        found[f"object_within_{limit}mm_share"] = share(ordered <= limit, np.ones(ordered.size, bool))
+    found["object_shift_free_mae_mm"] = np.abs(signed - quantile(signed, LONG(1) / 2)).mean() if some else None
+    return found
+
+
+@st.composite
+def cases(draw):
+    """A prediction and target of any small shape, cover, scale from 1e-30 to 1e30, dtype and memory order."""
+    shape = draw(st.tuples(st.integers(1, 36), st.integers(1, 36)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    kind = draw(st.sampled_from([np.float16, np.float32, np.float64]))
+    largest = 4 if kind is np.float16 else 30
+    scale = 10.0 ** draw(st.integers(-largest, largest))
+    cover = draw(st.sampled_from([0.0, 0.03, 0.5, 0.97, 1.0]))
+    target = np.where(ndimage.uniform_filter(rng.random(shape), 3) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
+    noise = (
+        rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
+    )
+    prediction = (target + noise) * (rng.random(shape) < draw(st.sampled_from([1.0, 0.8])))
+    prediction = prediction.astype(kind)
+    target = target.astype(draw(st.sampled_from([kind, np.float64])))
+    return np.asarray(prediction, order=draw(st.sampled_from("CF"))), target, draw(st.sampled_from([0, 1, 3, 8, 50]))
+
+
+@given(cases(), st.booleans())
+@settings(max_examples=200, deadline=None)
+def test_every_score_agrees_with_float128_to_1e_minus_10(case, compiled):
+    prediction, target, band = case
+    found = score_sample(prediction, target, band, compiled and numba_enabled()).metrics()
+    expected = reference(prediction, target, band)
+    assert set(found) == set(expected) == set(METRICS)
+    scale = float(expected["object_mae_mm"] or 0)
+    for key, value in expected.items():
+        if value is None:
+            assert found[key] is None, key
+            continue
+        # A signed mean, and what is left of a shift, are small differences: accurate to the errors they come from.
+        dust = 1e-12 * scale if key in SIGNED or key == "object_shift_free_mae_mm" else 0.0
+        assert found[key] == pytest.approx(float(value), rel=1e-10, abs=dust), key
+
+
+@given(cases())
+@settings(max_examples=150, deadline=None)
+def test_identity_of_the_three_sets(case):
+    prediction, target, band = case
+    found = score_sample(prediction, target, band).metrics()
+    share = np.count_nonzero(target > 0) / target.size
+    composed = share * (found["object_mae_mm"] or 0.0) + (1 - share) * (found["background_mae_mm"] or 0.0)
+    assert found["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
+
+
+@pytest.mark.skipif(not numba_enabled(), reason="numba is switched off")
+@pytest.mark.parametrize("kinds", [("f4", "f4"), ("f8", "f4"), ("f2", "f4"), (">f4", "<f4")])
+@pytest.mark.parametrize("size", [(3, 5), (97, 103), (240, 250)])
+def test_compiled_passes_give_the_same_numbers(kinds, size):
+    rng = np.random.default_rng(3)
+    target = disk_depth(size, 4).astype(kinds[1])
+    prediction = ((target + rng.normal(0, 3, size)) * (rng.random(size) < 0.9)).astype(kinds[0])
+    plain, compiled = (score_sample(prediction, target, compiled=flag).metrics() for flag in (False, True))
+    for key, value in plain.items():
+        assert compiled[key] == (value if value is None else pytest.approx(value, rel=1e-13, abs=1e-13)), key
+    for flag in (False, True):
+        overall, inside, outside = headline_scores(prediction, target, compiled=flag)
+        for name, stats in (("overall", overall), ("object", inside), ("background", outside)):
+            assert stats.mae_mm == pytest.approx(plain[f"{name}_mae_mm"], rel=1e-13)
+            assert stats.rmse_mm == pytest.approx(plain[f"{name}_rmse_mm"], rel=1e-13)
+
+
+def test_compiled_passes_refuse_what_numpy_refuses():
+    from fpp_ml_bench.errors import PredictionError
+
+    target = disk_depth((20, 20), 0)
+    for row, column in (np.argwhere(target > 0)[0], np.argwhere(target == 0)[0]):
+        prediction = target.copy()
+        prediction[row, column] = np.nan
+        for score in (score_sample, headline_scores):
+            with pytest.raises(PredictionError, match="finite"):
+                score(prediction, target, compiled=numba_enabled())
+
+
+def test_closed_forms_of_the_distribution():
+    target = np.full((1, 101), 1800.0)
+    errors = np.arange(101, dtype=np.float64) - 20.0  # -20 .. 80
+    found = score_sample(target + errors, target).metrics()
+    assert found["object_bias_mm"] == 30.0
+    assert found["object_max_mm"] == 80.0
+    assert found["object_median_mm"] == np.median(np.abs(errors))
+    assert found["object_p95_mm"] == 75.0
+    assert found["object_shift_free_mae_mm"] == pytest.approx(np.abs(np.arange(-50, 51)).mean(), rel=1e-15)
+    assert [found[f"object_within_{k}mm_share"] for k in (1, 2, 5, 10)] == [3 / 101, 5 / 101, 11 / 101, 21 / 101]
+
+
+def test_bias_of_measured_pixels_stands_beside_the_bias_of_all():
+    target = np.full((10, 10), 1800.0)
+    prediction = target + 2.0
+    prediction[0, :] = 0.0
+    found = score_sample(prediction, target).metrics()
+    assert found["object_valid_bias_mm"] == 2.0
+    assert found["object_bias_mm"] == pytest.approx(0.9 * 2 - 0.1 * 1800)
+
+
+def test_wide_band_is_eight_pixels_whatever_the_edge_band_is():
+    target = disk_depth((120, 120), 3)
+    prediction = target + np.random.default_rng(0).normal(0, 1, target.shape)
+    one, two = (score_sample(prediction, target, band).metrics() for band in (3, 8))
+    for key in ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"):
+        assert one[key] == pytest.approx(two[key], rel=1e-14)
+    assert two["object_wide_band_mae_mm"] == two["object_edge_mae_mm"] != one["object_edge_mae_mm"]
