@@ -8,14 +8,15 @@ from fpp_ml_bench.evaluation.report_html import escaped
 
 WIDTH, HEIGHT = 720, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 22, 44
+_LEAST = 1e-30
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 def nice_step(span: float, parts: int) -> float:
-    """The round number (1, 2, 2.5 or 5 x 10^k) nearest above ``span / parts``; 1 for no span."""
-    if not span > 0:
-        return 1.0
+    """The round number (1, 2, 2.5 or 5 x 10^k) nearest above ``span / parts``; 1 for no span to speak of."""
     raw = span / parts
+    if not raw > _LEAST:
+        return 1.0
     power = 10.0 ** math.floor(math.log10(raw))
     return next(power * factor for factor in _ROUND if power * factor >= raw * (1 - 1e-12))
 
@@ -24,7 +25,8 @@ def bins(values: Sequence[float]) -> tuple[list[float], list[int]]:
     """Edges of equal bins at round numbers, and how many values lie in each; a value on an edge counts right of it."""
     low, high = min(values), max(values)
     # Twice the cube root of n bins (Rice's rule); values that are all the same get one bin around them.
-    step = nice_step(high - low or abs(high) or 1.0, max(4, round(2 * len(values) ** (1 / 3))))
+    # Where they differ in the last digits only, bins that narrow would have no numbers to tell them apart.
+    step = nice_step(max(high - low, 1e-6 * high) if high > low else high, max(4, round(2 * len(values) ** (1 / 3))))
     first, last = math.floor(low / step), math.floor(high / step) + 1
     counts = [0] * (last - first)
     for value in values:

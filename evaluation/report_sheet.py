@@ -40,9 +40,14 @@ def sheet_png(rows: list[list[Panel]]) -> bytes:
 
 
 def _tile(panel: Panel) -> NDArray[np.uint8]:
-    """The panel's indices into the common palette, thinned to the tile, with the gap right of it and below."""
-    step = max(1, -(-max(panel.indices.shape) // TILE_PX))
-    small = panel.indices[::step, ::step]
+    """The panel's indices into the common palette at the tile's size, with the gap right of it and below.
+
+    Pixels are left out or repeated, never mixed.
+    """
+    height, width = panel.indices.shape
+    side = max(height, width)
+    rows, columns = (np.arange(n * TILE_PX // side) * side // TILE_PX for n in (height, width))
+    small = panel.indices[np.ix_(rows, columns)]
     levels = 1 + (small.astype(np.int64) - 1) * _LEVELS // 255 + _LEVELS * _MAPS.index(panel.colours)
     tile = np.zeros((TILE_PX + GAP_PX, TILE_PX + GAP_PX), np.uint8)
     tile[: small.shape[0], : small.shape[1]] = np.where(small > 0, levels, 0)

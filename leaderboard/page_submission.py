@@ -60,9 +60,13 @@ def _panels(entry: Entry) -> str:
     picture = picture_of(entry)
     if picture is None:
         return ""
-    said = "Samples from best to worst; in each line fringe, truth, prediction, absolute error and signed error"
+    said = "Samples from the best to the worst, a line each: fringe, truth, prediction, absolute error and signed error"
+    heads = "".join(
+        f"<span>{title}</span>" for title in ("Fringe", "Truth", "Prediction", "Absolute error", "Signed error")
+    )
     return (
-        f'<section><h2>Errors</h2><figure><img class="sheet" src="{data_uri(picture)}" alt="{said}">'
+        f'<section><h2>Errors</h2><figure><div class="sheet-heads soft small" aria-hidden="true">{heads}</div>'
+        f'<img class="sheet" src="{data_uri(picture)}" alt="{said}">'
         f"<figcaption>{said}. Absolute error clipped at its 95th percentile over the object; signed: blue is too near, "
         "red is too far.</figcaption></figure></section>\n"
     )

@@ -62,6 +62,7 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
+        self.call("Page.setLifecycleEventsEnabled", enabled=True)
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """Answer of one DevTools command; events that come meanwhile are kept."""
@@ -88,24 +89,25 @@ class Browser:
         message, _, self._pending = self._pending.partition(b"\0")
         return json.loads(message)
 
-    def wait_for(self, event: str) -> None:
-        """Until ``event`` comes."""
-        while not any(found.get("method") == event for found in self.events):
+    def _go(self, address: str) -> None:
+        """Navigate, and wait until the load of that very document is over."""
+        loader = self.call("Page.navigate", url=address).get("loaderId")
+        over = {"name": "load", "loaderId": loader}
+        while not any(
+            event.get("method") == "Page.lifecycleEvent" and over.items() <= event["params"].items()
+            for event in self.events
+        ):
             self.events.append(self._next())
 
     def open(self, page: Path | str, width: int = 1280, height: int = 900, dark: bool = False) -> None:
         """Load a file or an address in a window of that size and wait until it is there."""
         phone = width < 600
-        self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone
-        )
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=scheme)
-        self.call("Page.navigate", url="about:blank")  # or a change of the fragment alone would load nothing
-        self.wait_for("Page.loadEventFired")
+        self._go("about:blank")  # or a change of the fragment alone would load nothing
         self.events.clear()
-        self.call("Page.navigate", url=page.resolve().as_uri() if isinstance(page, Path) else page)
-        self.wait_for("Page.loadEventFired")
+        self._go(page.resolve().as_uri() if isinstance(page, Path) else page)
 
     def run(self, script: str) -> Any:
         """Value of a JavaScript expression on the page; an exception in it fails the test."""

@@ -1,0 +1,251 @@
+"""The static page as files: the same bytes, no way out of it, and nothing that a submission's text could do."""
+
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from board_rows import some_rows, timing, write_result_file
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.commands import main
+from fpp_ml_bench.evaluation.report_html import escaped, page
+from fpp_ml_bench.leaderboard.log_axis import LogAxis
+from fpp_ml_bench.leaderboard.page import page_files, slug
+from fpp_ml_bench.leaderboard.page_labels import Named, label_texts, shortened
+from fpp_ml_bench.leaderboard.page_scatter import front_rows
+from fpp_ml_bench.leaderboard.paper import chosen_tables
+from fpp_ml_bench.leaderboard.pareto import pareto_front
+from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, dataset):
+    return some_rows(tmp_path_factory.mktemp("rows"), dataset)
+
+
+class Parsed(HTMLParser):
+    """Elements with their attributes, and the visible text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, {key: value or "" for key, value in attrs}))
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def pages(paths) -> dict[str, bytes]:
+    return page_files(rank(read_entries(expand(paths))), chosen_tables(None))
+
+
+def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
+    assert pages(files) == pages(files[::-1])
+    for out in ("one", "two"):
+        arguments = [*map(str, files if out == "one" else files[::-1]), "--page", str(tmp_path / out)]
+        assert main(["leaderboard", *arguments]) == 0
+    found = [
+        {str(p.relative_to(tmp_path / out)): p.read_bytes() for p in (tmp_path / out).rglob("*") if p.is_file()}
+        for out in ("one", "two")
+    ]
+    assert found[0] == found[1] and len(found[0]) == 2 + len(files)
+
+
+def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path):
+    out = tmp_path / "page"
+    assert main(["leaderboard", *map(str, files), "--page", str(out)]) == 0
+    (out / "submissions" / "notes.html").write_text("mine")
+    (out / "CNAME").write_text("example.org")
+    assert main(["leaderboard", str(files[0]), "--page", str(out)]) == 0
+    left = sorted(path.name for path in (out / "submissions").iterdir())
+    assert len(left) == 2 and "notes.html" in left and (out / "CNAME").exists()
+
+
+def test_groups_stay_apart_and_the_papers_rows_too(files):
+    index = pages(files)["index.html"].decode()
+    sections = re.findall(r'<section id="s(\d)".*?</section>', index, flags=re.DOTALL)
+    assert sections == ["0", "1"]
+    metric, oracle = (re.search(rf'<section id="s{n}".*?</section>', index, flags=re.DOTALL)[0] for n in (0, 1))
+    assert "Was told" in oracle and "Was told" not in metric and "Fast and rough" not in oracle
+    assert "were given the depth range" in oracle
+    assert "TransUNet" not in metric + oracle and "TransUNet" in index
+    assert "reported by the paper" in index
+
+
+def test_front_is_those_nobody_beats(files):
+    metric = rank(read_entries(files))[0]
+    assert [row.entry.name for row in front_rows(metric)] == ["Fast and rough", "Slow and fine"]
+
+
+def test_links_lead_somewhere_and_nowhere_else(files):
+    found = pages(files)
+    for name, content in found.items():
+        if not name.endswith(".html"):
+            continue
+        parsed = Parsed(content.decode())
+        ids = {attributes.get("id") for _, attributes in parsed.elements}
+        for tag, attributes in parsed.elements:
+            assert not any(key.startswith("on") or key == "style" for key in attributes), (name, tag, attributes)
+            for key in ("href", "src"):
+                address = attributes.get(key, "#main")
+                if address.startswith("#"):
+                    assert address[1:] in ids, (name, address)
+                elif not address.startswith("data:"):
+                    target = str(Path("/", name).parent.joinpath(address).resolve().relative_to("/"))
+                    assert target in found, (name, address)
+        policy = next(a["content"] for t, a in parsed.elements if t == "meta" and "http-equiv" in a)
+        assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
+
+
+def test_tables_are_tables(files):
+    parsed = Parsed(pages(files)["index.html"].decode())
+    heads = [attributes for tag, attributes in parsed.elements if tag == "th"]
+    assert heads and all(attributes.get("scope") in ("col", "row") for attributes in heads)
+    sorted_by = [attributes["aria-sort"] for attributes in heads if "aria-sort" in attributes]
+    assert sorted_by == ["ascending"] * 2  # one table a group, by rank
+    assert all(a.get("aria-label") for tag, a in parsed.elements if tag == "svg" and a.get("role") == "img")
+    assert all("alt" in a for tag, a in parsed.elements if tag == "img")
+
+
+HOSTILE = [
+    "<script>hacked = 1</script>",
+    "</script><script>hacked = 1</script>",
+    '"><img src=x onerror=hacked=1>',
+    "' onmouseover='hacked=1",
+    "--><svg/onload=hacked=1>",
+    "javascript:hacked=1",
+    "../../../etc/passwd",
+    "{{7*7}}${7*7}<%= 7 %>",
+    "]]></style><style>*{display:none}",
+    "&lt;b&gt; &amp; </title>",
+    "مرحبا \N{GREEK SMALL LETTER MU}m 漢字",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
+    path = write_result_file(
+        tmp_path / "x.json", dataset, 1.0, name=name, method=name, settings={name[:50]: name},
+        timing=timing(3.0, hardware={"cpu": name, "cores": 1, "memory_gib": 1.0, "gpu": name, "platform": name}),
+    )  # fmt: skip
+    found = pages([path, files[0]])
+    expected = pages([write_result_file(tmp_path / "y.json", dataset, 1.0, name="plain", timing=timing(3.0)), files[0]])
+    for file in found:
+        assert re.fullmatch(r"index\.html|data\.json|submissions/[a-z0-9-]+-[0-9a-f]{12}\.html", file)
+    index, plain = Parsed(found["index.html"].decode()), Parsed(expected["index.html"].decode())
+    assert [tag for tag, _ in index.elements] == [tag for tag, _ in plain.elements]
+    assert [tuple(attributes) for _, attributes in index.elements] == [tuple(a) for _, a in plain.elements]
+    assert name in index.text
+    for file, content in found.items():
+        if file.startswith("submissions/"):
+            assert not any(tag == "script" for tag, _ in Parsed(content.decode()).elements)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("\x1b[2Jgone", "control character U+001B"), ("x" * 10_000_000, "at most 200 characters"), ("a\nb", "U+000A"),
+     ("\u202egnp.exe", "U+202E"), ("  ", "expected some text")],
+)  # fmt: skip
+def test_text_that_could_do_more_is_refused_by_every_door(name, message, files, tmp_path, capsys):
+    import json
+
+    content = json.loads(files[0].read_text())
+    content["submission"]["name"] = name
+    bad = tmp_path / "bad.json"
+    bad.write_text(json.dumps(content))
+    for door in (["--page", str(tmp_path / "page")], ["--markdown", str(tmp_path / "t.md")], []):
+        assert main(["leaderboard", str(bad), *door]) == 2
+        said = capsys.readouterr()
+        assert message in said.err and "bad.json" in said.err and len(said.err) < 2000 and "\x1b" not in said.err
+    assert not (tmp_path / "page").exists() and not (tmp_path / "t.md").exists()
+
+
+def test_escaping_holds_without_the_checks_before_it():
+    assert escaped("\x1b[31m<b>\u202e") == "\\x1b[31m&lt;b&gt;\\u202e"
+    assert len(escaped("<" * 10_000_000)) < 1000
+    assert "<title>&lt;/title&gt;</title>" in page("</title>", "")
+
+
+def test_a_slug_is_a_file_name_of_its_own(files):
+    entry = read_entries(files[:1])[0]
+    other = replace(entry, result=entry.result.model_copy(update={"created": "2020-01-01T00:00:00+00:00"}))
+    assert re.fullmatch(r"fast-and-rough-[0-9a-f]{12}", slug(entry)) and slug(entry) != slug(other)
+
+
+points = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12)
+
+
+@given(points)
+@settings(max_examples=300, deadline=None)
+def test_front_against_its_definition(found):
+    def beaten(one):
+        return any(o[0] <= one[0] and o[1] <= one[1] and o != one for o in found)
+
+    assert sorted(pareto_front(found)) == [i for i, one in enumerate(found) if not beaten(one)]
+    assert [found[i] for i in pareto_front(found)] == sorted(found[i] for i in pareto_front(found))
+
+
+@given(st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=5), st.integers(3, 9))
+@settings(max_examples=200, deadline=None)
+def test_log_axis_holds_its_values_and_its_ticks_are_round(values, most):
+    axis = LogAxis.around(values, 10.0, 110.0)
+    for value in values:
+        assert 10 < axis.at(value) < 110
+    ticks = axis.ticks(most)
+    assert 1 <= len(ticks) <= max(most, 2) + 1
+    assert ticks == sorted(set(ticks)) and all(axis.low <= tick <= axis.high for tick in ticks)
+    for tick in ticks:
+        leading = tick / 10 ** math.floor(math.log10(tick) + 1e-9)
+        assert min(abs(leading - f) for f in (1, 1.5, 2, 3, 4, 5, 7, 10)) < 1e-6
+
+
+@given(st.lists(st.tuples(st.floats(60, 800), st.floats(20, 380)), min_size=1, max_size=25))
+@settings(max_examples=100, deadline=None)
+def test_names_cover_neither_each_other_nor_the_edge(places):
+    marks = [Named("A method of some length", f"m{i}", x, y, 5.0) for i, (x, y) in enumerate(places)]
+    boxes = []
+    for text in label_texts(marks, [], (58, 0, 860, 382)):
+        x, y = (float(re.search(rf' {axis}="([\d.]+)"', text)[1]) for axis in "xy")
+        wide = 6.7 * 23
+        left = x - {"start": 0, "end": wide, "middle": wide / 2}[re.search('anchor="(.*?)"', text)[1]]
+        boxes.append((left, y - 11.5, left + wide, y + 3.5))
+    for number, (left, top, right, bottom) in enumerate(boxes):
+        assert left >= 57.9 and right <= 860.1 and top >= -0.1 and bottom <= 382.1
+        for other in boxes[:number]:
+            apart = right <= other[0] + 0.2 or other[2] <= left + 0.2 or bottom <= other[1] + 0.2
+            assert apart or other[3] <= top + 0.2
+
+
+def test_long_names_keep_both_ends():
+    assert shortened("Classical 18-step, vertical", 20) == "Classical…, vertical"
+    assert shortened("short", 20) == "short"
+    assert all(len(shortened("x" * n, 26)) <= 26 for n in range(1, 200))
+
+
+def test_empty_board_says_how_to_begin(tmp_path, monkeypatch):
+    from fpp_ml_bench.leaderboard import rows
+
+    monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
+    assert main(["leaderboard", "--page", str(tmp_path / "page")]) == 0
+    assert "No submission yet" in (tmp_path / "page" / "index.html").read_text()
+
+
+def test_unwritable_page_is_an_error(files, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["leaderboard", str(files[0]), "--page", str(tmp_path / "file")]) == 2
+    assert "can't be written" in capsys.readouterr().err
