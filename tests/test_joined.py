@@ -10,8 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from conftest import TINY_SIZE, tiny_settings
+from synthetic import SyntheticShard, make
 
 import fpp_ml_bench
+from fpp_ml_bench.constants import OBJECTS, VIEWS, split_sample_name
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import CONFIGS, PAPER_SEQUENCE
 from fpp_ml_bench.loaders import load_dataset
@@ -73,6 +75,29 @@ def test_plain_load_dataset_and_load_from_disk_give_the_same_values(tiny):
             for column, image in images.items():
                 np.testing.assert_array_equal(found[sample][column], image)
     assert datasets.get_dataset_split_names(str(tiny), "single_shot") == ["train", "validation", "test"]
+
+
+def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
+    """Nine objects of one split are two files of 30 and 24 rows."""
+    folder = make(tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported")
+    opened = DatasetFolder(folder)
+    assert [s.rows for s in opened.manifest.shards if s.split == "train"] == [30, 24]
+    expected = [f"{name}_{view}" for name in OBJECTS[:9] for view in VIEWS]
+    doors = {
+        "ours": load_dataset(folder, split="train"),
+        "plain": datasets.load_dataset(str(folder), split="train"),
+        "in place": datasets.load_from_disk(str(folder))["train"],
+    }
+    for dataset in doors.values():
+        assert dataset["sample"][:] == expected == opened.splits["train"]
+        formatted = dataset.with_format("numpy")
+        for row in (0, 29, 30, 53):
+            for column in ("depth", "depth_exact"):
+                np.testing.assert_array_equal(formatted[row][column], opened.depth_mm(expected[row], column))
+            np.testing.assert_array_equal(formatted[row]["frame_00"], opened.frame(expected[row], 0))
+    alone = SyntheticShard().row(expected[30], *split_sample_name(expected[30]))
+    np.testing.assert_array_equal(opened.frame(expected[30], 0), alone.frames[0])
+    np.testing.assert_array_equal(opened.depth_mm(expected[30]), alone.depth_mm)
 
 
 def test_in_place_reading_copies_nothing_into_a_cache(tiny):

@@ -8,12 +8,13 @@ import torch
 from conftest import tiny_settings
 from torch.utils.data import DataLoader
 
+from fpp_ml_bench.acceleration import SWITCH
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import CONFIGS, PAPER_SEQUENCE
 from fpp_ml_bench.loaders.build import build, plan_build
 from fpp_ml_bench.loaders.settings import BuildSettings
-from fpp_ml_bench.loaders.training import FringeDepthDataset
+from fpp_ml_bench.loaders.training import FringeDepthDataset, _unit_range
 from fpp_ml_bench.rig import paper_rig
 
 
@@ -78,6 +79,16 @@ def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed)
         assert item.fringe.min() >= 0 and item.fringe.max() <= 1
         if background_removed:
             assert (item.fringe[0].numpy()[depth == 0] == 0).all()
+
+
+@pytest.mark.parametrize("switch", ["0", "1"])
+def test_grey_levels_become_the_unit_range(monkeypatch, switch):
+    monkeypatch.setenv(SWITCH, switch)
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    out = np.full((16, 16), np.nan, np.float32)
+    _unit_range(grey, out)
+    np.testing.assert_allclose(out, grey.astype(np.float64) / 255, rtol=2**-23)
+    assert out[0, 0] == 0 and out[15, 15] == 1
 
 
 def test_background_is_there_unless_removed(tiny, opened):

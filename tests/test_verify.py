@@ -1,63 +1,19 @@
 """`verify` finds every kind of damage and leak, one finding each, and nothing on a clean dataset."""
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic import make
 
 from fpp_ml_bench.commands import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.frames import PAPER_SEQUENCE
 from fpp_ml_bench.loaders import shards as writing
-from fpp_ml_bench.loaders.assemble import Assembly, assemble
-from fpp_ml_bench.loaders.manifest import Manifest, ShardFile, file_hash, read_manifest
-from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.manifest import ShardFile, file_hash, read_manifest
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.loaders.verify import verify
-from fpp_ml_bench.rig import paper_rig
-
-SIZE = (12, 16)
-SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_drill",)}
-
-
-@dataclass(frozen=True)
-class SyntheticShard:
-    """Rows of noise, one seed a sample; ``same`` gives a sample the frame of another one."""
-
-    same: tuple[tuple[str, str], ...] = ()
-    spoil: tuple[str, float] | None = None
-
-    def __call__(self, folder, scratch, plan, row_done):
-        writer = ShardWriter(folder, scratch, plan, PAPER_SEQUENCE, "single_shot", True, SIZE)
-        return writer.write((self.row(*sample) for sample in plan.samples), row_done)
-
-    def row(self, sample, name, view):
-        def noise(label):
-            return np.random.default_rng(list(label.encode()))
-
-        depth = noise(sample + "depth").uniform(1500, 2100, SIZE).astype(np.float32)
-        depth[:3] = 0
-        exact = np.where(depth > 0, depth + np.float32(0.1), np.float32(0))
-        if self.spoil and self.spoil[0] == sample:
-            depth[5, 5] = self.spoil[1]
-            if self.spoil[1] == 0:
-                depth[:] = 0
-        frame = noise(dict(self.same).get(sample, sample)).integers(0, 256, SIZE, dtype=np.uint8)
-        return Row(sample, name, view, {0: frame}, depth, exact)
-
-
-def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):
-    plans = []
-    for split, names in splits.items():
-        plans += plan_shards(split, {name: [(f"{name}_{v}", name, v) for v in views] for name in names})
-    manifest = Manifest(
-        origin=origin, generator={"name": "test", "version": "0"}, settings={}, rig=paper_rig().to_dict(), size=SIZE,
-        stored="single_shot", exact=True, samples={}, shards=[],
-    )  # fmt: skip
-    assemble(folder, Assembly(plans, SyntheticShard(**changes), manifest, 0), workers=1)
-    return folder
 
 
 @pytest.fixture
