@@ -6,13 +6,11 @@ style and that script and allows nothing else: no request leaves the page, and n
 
 import hashlib
 import html
-import json
 import struct
 import zlib
 from base64 import b64encode
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +23,6 @@ _HERE = Path(__file__).resolve().parent
 def escaped(value: object, limit: int = NAME_LIMIT) -> str:
     """``value`` as HTML text or attribute value that shows exactly it: at most ``limit`` characters, none special."""
     return html.escape(printable(value, limit), quote=True)
-
-
-def json_in_script(value: Any) -> str:
-    """``value`` as JSON for a script element, which nothing in it can end: no ``<``, ``>``, ``&`` or line separator."""
-    text = json.dumps(value, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
 
 
 @cache
