@@ -1,5 +1,6 @@
 """Scoring a folder of predictions against one split of a dataset: everything checked, every offender named, at once."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, get_args
@@ -48,12 +49,14 @@ def evaluate(
     target: str = "depth",
     edge_band_px: int = EDGE_BAND_PX,
     mode: str = "standard",
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> "Result":
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
     or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
-    of samples, and the result does not depend on the number of cores.
+    of samples, and the result does not depend on the number of cores. ``meanwhile`` is called once while threads score:
+    a command imports there what it needs afterwards.
 
     Raises SubmissionError for the description, PredictionError (naming every offending file) for the predictions, and
     DatasetError for a target that is no depth map.
@@ -79,6 +82,9 @@ def evaluate(
             submission = _described(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
             refused = error
+        from fpp_ml_bench.evaluation import provenance, result  # noqa: F401  imported while the threads score
+
+        meanwhile()
     for offences, row in found:
         problems += offences
         rows += row

@@ -57,7 +57,7 @@ def test_interval_is_the_expanded_percentile_of_resampled_objects():
 
 
 def test_interval_covers_the_truth_about_as_often_as_it_says():
-    """Five objects of six correlated views each, as in the test split; the plain percentile interval covers 80%."""
+    """Five objects of six correlated views each, as in the test split; the plain percentile interval covers 84%."""
     rng = np.random.default_rng(7)
     objects = np.repeat(np.arange(5), 6).tolist()
     covered = 0

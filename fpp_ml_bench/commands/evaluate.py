@@ -71,9 +71,9 @@ def _band(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Score, write the JSON if asked to, print the table. Raises FppBenchError for anything that can't be scored."""
-    from fpp_ml_bench.evaluation.memory import keep_freed_memory
+    from fpp_ml_bench.evaluation.process import prepare_process
 
-    keep_freed_memory()
+    prepare_process()
     from fpp_ml_bench.evaluation.evaluator import evaluate
     from fpp_ml_bench.loaders.store import DatasetFolder
 
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         _check_report(args.report, args.folder)
     dataset = DatasetFolder(args.dataset)
-    result = evaluate(args.folder, dataset, args.split, args.target, args.edge_band, args.mode)
+    result = evaluate(args.folder, dataset, args.split, args.target, args.edge_band, args.mode, _import_output)
     if args.json is not None:
         from fpp_ml_bench.evaluation.result_io import write_result
 
@@ -99,6 +99,10 @@ def run(args: argparse.Namespace) -> int:
         if written is not None:
             print(f"Written: {written}")
     return 0
+
+
+def _import_output() -> None:
+    from fpp_ml_bench.evaluation import console, result_io, table  # noqa: F401
 
 
 def _check_output(path: Path, folder: Path) -> None:
