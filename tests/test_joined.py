@@ -20,6 +20,7 @@ from fpp_ml_bench.loaders import load_dataset
 from fpp_ml_bench.loaders.build import build
 from fpp_ml_bench.loaders.schema import arrow_schema, config_columns, features
 from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.loaders.verify import verify
 
 datasets.disable_progress_bars()
 IMAGES = ("frame_00", "depth", "depth_exact")
@@ -133,8 +134,10 @@ def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
     assert (seen[0] != seen[1]).any()
 
 
-def test_usual_operations(tiny, opened):
-    dataset = load_dataset(tiny, "vertical", split="train")
+def test_usual_operations(tiny, opened, tmp_path):
+    folder = tmp_path / "copy"  # `filter` and `map` leave their caches beside the data
+    shutil.copytree(tiny, folder)
+    dataset = load_dataset(folder, "vertical", split="train")
     shuffled = dataset.shuffle(seed=3)
     assert (
         sorted(shuffled["sample"]) == sorted(opened.splits["train"]) and shuffled["sample"][:] != dataset["sample"][:]
@@ -152,8 +155,9 @@ def test_usual_operations(tiny, opened):
     assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
     again = pickle.loads(pickle.dumps(dataset))
     np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
-    joined = datasets.concatenate_datasets([dataset, load_dataset(tiny, "vertical", split="test")])
+    joined = datasets.concatenate_datasets([dataset, load_dataset(folder, "vertical", split="test")])
     assert len(joined) == 18
+    assert verify(folder) == []  # and verify does not mind those caches
 
 
 def test_fingerprints_follow_the_data(tiny, tmp_path):
