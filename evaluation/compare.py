@@ -15,7 +15,7 @@ from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.result_models import Interval
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.evaluation.uncertainty import object_interval
+from fpp_ml_bench.evaluation.uncertainty import caution, object_interval
 
 MAIN_KEY = "object_mae_mm"
 
@@ -155,11 +155,14 @@ def sentence(first: str, second: str, found: Difference) -> str:
             "interval, so nothing can be said beyond it."
         )
     ends = f"{_signed(low)} to {_signed(high)} mm over {found.objects} objects"
+    few = f" {said}" if (said := caution(found.objects)) else ""
     if found.told_apart:
-        return f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {ends}), {views}."
+        return (
+            f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {ends}), {views}.{few}"
+        )
     return (
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
-        f"but the 95% interval, {ends}, holds 0."
+        f"but the 95% interval, {ends}, holds 0.{few}"
     )
 
 

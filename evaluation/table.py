@@ -10,6 +10,7 @@ from fpp_ml_bench.evaluation.numbers import interval_text, millimetres, percent,
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 from fpp_ml_bench.evaluation.result import Result, SampleResult
 from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.evaluation.uncertainty import caution
 
 WORST = 5
 
@@ -90,6 +91,9 @@ def _notes(result: Result) -> Text:
         lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
     if result.track == "oracle range":
         lines.append("Oracle range: the method was given depth_min and depth_max of these very samples.")
+    few = caution(len(result.per_object))
+    if few:
+        lines.append(few)
     taken = result.submission.seconds_per_sample
     frames = len(result.submission.frames_used)
     time = "unknown time" if taken is None else f"{seconds(taken)} s ({result.submission.seconds_source})"

@@ -86,6 +86,17 @@ def _student_cdf(t: float, freedom: int) -> float:
     return 0.5 + inside / 2
 
 
+def caution(objects: int) -> str | None:
+    """What to say of an interval over so few objects that no resampling can cover the truth in 95% of cases.
+
+    An interval of resampled means lies between the smallest and the largest object; the truth (the median, for a
+    spread without skew) lies outside of all n objects in 2^(1 - n) of cases.
+    """
+    if objects < 2 or (reach := 1 - 2.0 ** (1 - objects)) >= 0.9:
+        return None
+    return f"With {objects} objects an interval can cover the truth in at most {100 * reach:.0f}% of cases."
+
+
 def intervals_over_objects(
     rows: Sequence[Mapping[str, float | None]], objects: Sequence[Hashable], keys: Sequence[str]
 ) -> dict[str, Interval | None]:

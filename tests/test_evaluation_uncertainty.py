@@ -77,6 +77,18 @@ def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
     assert object_interval([2.0, 2.0], ["a", "b"]) == (2.0, 2.0)
 
 
+def test_too_few_objects_for_95_percent_are_said():
+    assert "at most 50% of cases" in uncertainty.caution(2) and "at most 88%" in uncertainty.caution(4)
+    assert uncertainty.caution(5) is None and uncertainty.caution(1) is None
+    rng = np.random.default_rng(3)
+    for objects, reach in ((2, 0.5), (3, 0.75)):
+        covered = 0
+        for _ in range(150):
+            low, high = object_interval(rng.normal(0, 1, objects).tolist(), list(range(objects)))
+            covered += low <= 0 <= high
+        assert covered / 150 == pytest.approx(reach, abs=0.1)
+
+
 def test_ranks_with_ties():
     spans = [(1.0, (0.8, 1.2)), (1.1, (0.9, 1.3)), (1.25, (1.21, 1.4)), (9.0, (8.0, 10.0))]
     values, intervals = zip(*spans, strict=True)
