@@ -58,10 +58,8 @@ def test_dependencies_flow_one_way():
         mine = order.index("core" if top == "fpp_ml_bench" else top)
         for path in (ROOT / top).rglob("*.py"):
             relative = path.relative_to(ROOT).parts
-            if (
-                relative[:2] == ("fpp_ml_bench", "commands")
-                or (path.name in ("__init__.py", "__main__.py")
-                and mine == 0)
+            if relative[:2] == ("fpp_ml_bench", "commands") or (
+                path.name in ("__init__.py", "__main__.py") and mine == 0
             ):
                 continue
             text = path.read_text()
