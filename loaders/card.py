@@ -13,7 +13,7 @@ from fpp_ml_bench.loaders.manifest import Manifest, write_atomically
 from fpp_ml_bench.loaders.schema import DATA_GROUP, available_configs, features, group_columns, stored_groups
 
 RIG_FILE = "rig.yaml"
-_CARD = """\
+CARD_HEAD = """\
 ---
 license: mit
 pretty_name: FPP-ML-Bench
@@ -26,6 +26,9 @@ tags:
 - structured-light
 - metrology
 configs:
+"""
+"""Front matter of every card up to its configurations."""
+_CARD = """\
 - config_name: single_shot
   default: true
   version: {version}
@@ -80,7 +83,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         _write_json(folder / split / "dataset_info.json", info)
     _write_json(folder / "dataset_dict.json", {"splits": list(manifest.samples)})
     save_rig(rig, folder / RIG_FILE)
-    text = _CARD.format(
+    text = CARD_HEAD + _CARD.format(
         version=data_version(manifest.fingerprint),
         data_files="\n".join(
             f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples

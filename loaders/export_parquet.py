@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpp_ml_bench.loaders.card import data_version
+from fpp_ml_bench.loaders.card import CARD_HEAD, data_version
 from fpp_ml_bench.loaders.manifest import Manifest, ShardFile
 from fpp_ml_bench.loaders.schema import (
     DATA_GROUP,
@@ -32,18 +32,6 @@ ROW_GROUP_BYTES = 1 << 28
 """Rows are written, and read by ``datasets``, in groups of about this size before compression."""
 _MOST_ROWS = 24
 _CARD = """\
----
-license: mit
-pretty_name: FPP-ML-Bench
-task_categories:
-- depth-estimation
-size_categories:
-- n<1K
-tags:
-- fringe-projection-profilometry
-- structured-light
-- metrology
-configs:
 {configs}
 ---
 # FPP-ML-Bench dataset ({origin}), Parquet
@@ -161,7 +149,7 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
         }
         for config in dataset.configs
     ]
-    return _CARD.format(
+    return CARD_HEAD + _CARD.format(
         configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(),
         origin=manifest.origin,
         rows=sum(len(dataset.samples(split)) for split in splits),
