@@ -17,7 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("method", metavar="METHOD", help="classical: N-step phase, Gray-code order, triangulation")
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
     parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left"
+    )
     add_method_options(parser)
 
 
