@@ -37,5 +37,7 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out}: {done.samples} predictions by {chosen.title}; {len(chosen.frames_used)} frames and "
         f"{done.seconds_per_sample:.3f} s a sample (median)"
     )
-    print(f"next: fpp-eval {args.out} --dataset {args.dataset} --split {args.split} --json result.json")
+    # Against the decoded depth, the process that made it scores 0.
+    target = " --target depth_exact" if opened.has_exact else ""
+    print(f"next: fpp-eval {args.out} --dataset {args.dataset} --split {args.split}{target} --json result.json")
     return 0
