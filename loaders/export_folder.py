@@ -1,13 +1,12 @@
 """An export's folder appears complete or not at all: it is written beside its place and renamed when it is done."""
 
-import fcntl
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.folder_lock import exclusive
 
 _LOCK = ".lock"
 
@@ -25,18 +24,7 @@ def exporting(out: Path) -> Iterator[Path]:
     if target.is_dir() and any(target.iterdir()):
         raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to one or overwrites it")
     staging = target.with_name(f".{target.name}.export")
-    try:
-        staging.mkdir(parents=True, exist_ok=True)
-        lock = os.open(staging / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise BuildError(f"{out}: can't be written ({error.strerror or error})") from error
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise BuildError(
-                f"{out}: another process is exporting there; wait for it or choose another folder"
-            ) from error
+    with exclusive(staging / _LOCK, out, "exporting there"):
         try:
             _clear(staging)
             yield staging
@@ -51,8 +39,6 @@ def exporting(out: Path) -> Iterator[Path]:
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             raise
-    finally:
-        os.close(lock)
 
 
 def _clear(staging: Path) -> None:

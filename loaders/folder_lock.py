@@ -22,22 +22,27 @@ def writing(folder: Path) -> Iterator[Path]:
         raise BuildError(f"{folder}: is a file; give a folder")
     if folder.is_dir() and not (folder / MANIFEST).exists() and not work.exists() and any(folder.iterdir()):
         raise BuildError(f"{folder}: holds other files and no dataset; give a new or empty folder")
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-        lock = os.open(work / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise BuildError(f"{folder}: can't be written ({error.strerror})") from error
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise BuildError(
-                f"{folder}: another process is writing this folder; wait for it or choose another"
-            ) from error
+    with exclusive(work / "lock", folder, "writing this folder"):
         try:
             yield work
         finally:
             if (folder / MANIFEST).exists():
                 shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def exclusive(lock_file: Path, folder: Path, doing: str) -> Iterator[None]:
+    """Hold ``lock_file``, made with its folder where absent; `BuildError` about ``folder`` if another process does."""
+    try:
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise BuildError(f"{folder}: can't be written ({error.strerror or error})") from error
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise BuildError(f"{folder}: another process is {doing}; wait for it or choose another") from error
+        yield
     finally:
         os.close(lock)

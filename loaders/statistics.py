@@ -37,6 +37,11 @@ def split_statistics(manifest: Manifest) -> list[SplitStatistics]:
     return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
 
 
+def whole_statistics(manifest: Manifest) -> SplitStatistics:
+    """Statistics of all rows together, as a split called ``all``."""
+    return _split("all", [row for rows in manifest.samples.values() for row in rows], manifest)
+
+
 def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> SplitStatistics:
     pixels = manifest.size[0] * manifest.size[1]
     cover = np.array([row["object_px"] for row in rows]) / pixels

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as spawning
+from scored_dataset import disk_depth
 
-torch = pytest.importorskip("torch")
-import torch.distributed as dist  # noqa: E402
-import torch.multiprocessing as spawning  # noqa: E402
-from scored_dataset import disk_depth  # noqa: E402
-
-from fpp_ml_bench.errors import PredictionError  # noqa: E402
-from fpp_ml_bench.evaluation.scores import score_sample  # noqa: E402
-from fpp_ml_bench.evaluation.summary import mean_over_samples  # noqa: E402
-from fpp_ml_bench.evaluation.torch_metric import KEYS, DepthScores  # noqa: E402
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.scores import score_sample
+from fpp_ml_bench.evaluation.summary import mean_over_samples
+from fpp_ml_bench.evaluation.torch_metric import KEYS, DepthScores
 
 SIZE, SAMPLES = (40, 48), 11
 

@@ -75,8 +75,15 @@ def test_ply_of_a_mesh_reads_back_and_is_the_same_bytes_twice(tmp_path):
     np.testing.assert_array_equal(back.faces, mesh.faces)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("damage", ["empty", "noise", "text", "third", "almost whole"])
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [
+        (suffix, damage)
+        for suffix in SUFFIXES
+        for damage in ("empty", "noise", "text", "third", "almost whole")
+        if not (suffix == "obj" and damage in ("third", "almost whole"))  # a shorter OBJ is an OBJ
+    ],
+)
 def test_damaged_files_are_refused_by_name(tmp_path, wedge, capfd, suffix, damage):
     path = tmp_path / f"part.{suffix}"
     wedge.export(path)
@@ -89,8 +96,6 @@ def test_damaged_files_are_refused_by_name(tmp_path, wedge, capfd, suffix, damag
         "almost whole": whole[:-7],
     }[damage]
     path.write_bytes(content)
-    if suffix == "obj" and damage in ("third", "almost whole"):
-        pytest.skip("a shorter OBJ is an OBJ")
     with pytest.raises(MeshError, match=f"part.{suffix}"):
         load_user_mesh(UserMesh("part", str(path)))
     assert "Traceback" not in capfd.readouterr().err

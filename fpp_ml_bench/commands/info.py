@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
 
     from fpp_ml_bench.constants import MM_PER_M
     from fpp_ml_bench.frames import DIRECTIONS
-    from fpp_ml_bench.loaders.statistics import split_statistics
+    from fpp_ml_bench.loaders.statistics import split_statistics, whole_statistics
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     opened = DatasetFolder(args.dataset)
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
             "settings": opened.manifest.settings,
             "rig": opened.manifest.rig,
             "splits": [asdict(split) for split in statistics],
+            "all": asdict(whole_statistics(opened.manifest)),
             "samples": opened.splits,
         }
         print(json.dumps(content, indent=1, allow_nan=False))
@@ -70,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     table = Table(title="lengths in mm, means over samples", title_justify="left")
     table.add_column("")
+    statistics = [*statistics, whole_statistics(manifest)]
     for split in statistics:
         table.add_column(split.split, justify="right")
     for title, cells in _rows(statistics):
