@@ -35,7 +35,11 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
         ) from None
     form = _form(set(names), samples)
     expected = {form} if form in TABLES else {f"{sample}{form}" for sample in samples}
-    problems = [f"{name}: is missing" for name in _in_order(expected, samples, form) if name not in names]
+    problems = [
+        f"{name}: is missing; write one for each sample"
+        for name in _in_order(expected, samples, form)
+        if name not in names
+    ]
     problems += [
         f"{printable(name)}: is extra ({_hint(name, form, samples, split, split_of)})"
         for name in names

@@ -93,6 +93,7 @@ def replace_by_pipe(folder: Path) -> None:
     os.mkfifo(folder / FILE)
 
 
+CURE = r"\b(write|save|use|predict|give|convert|put|copy|remove|replace|check)\b"
 FILES = {
     "missing": (lambda f: (f / FILE).unlink(), "is missing"),
     "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
@@ -141,7 +142,9 @@ def test_bad_prediction_file_is_refused_by_name(case, capsys, tmp_path, dataset,
     if case == "symbolic link":
         (tmp_path / "elsewhere.npy").rename(predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy")
     error = refused(capsys, tmp_path, dataset, predictions)
-    assert re.search(rf"^\s*{re.escape(FILE)}: .*{message}", error, flags=re.MULTILINE), error
+    found = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
+    assert found, error
+    assert re.search(CURE, found[0]), f"no cure in {found[0]}"
 
 
 def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions):

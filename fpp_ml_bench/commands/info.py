@@ -69,7 +69,9 @@ def run(args: argparse.Namespace) -> int:
     )
     print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
-    table = Table(title="lengths in mm, means over samples", title_justify="left")
+    table = Table(
+        title="lengths in mm, means over samples; ground-truth error: decoded - exact depth", title_justify="left"
+    )
     table.add_column("")
     statistics = [*statistics, whole_statistics(manifest)]
     for split in statistics:
@@ -90,12 +92,12 @@ def _rows(statistics: "list[SplitStatistics]") -> list[tuple[str, list[str]]]:
     return [
         ("objects, samples", [f"{s.objects}, {s.samples}" for s in statistics]),
         ("cover, mean", [share(s.cover_mean) for s in statistics]),
-        ("cover, least - most", [f"{share(s.cover_min)} - {share(s.cover_max)}" for s in statistics]),
+        ("cover, least-most", [f"{100 * s.cover_min:.1f}-{100 * s.cover_max:.1f}%" for s in statistics]),
         ("depth range, median", [f"{s.depth_range_median_mm:.0f}" for s in statistics]),
         ("depth range, largest", [f"{s.depth_range_max_mm:.0f}" for s in statistics]),
-        ("ground-truth error (decoded - exact), MAE", [millimetres(s.gt_mae_mm) for s in statistics]),
+        ("ground-truth error, MAE", [millimetres(s.gt_mae_mm) for s in statistics]),
         ("  RMSE", [millimetres(s.gt_rmse_mm) for s in statistics]),
-        ("  MAE 3 px or more from a depth edge", [millimetres(s.gt_interior_mae_mm) for s in statistics]),
+        ("  MAE inside (3 px from edges)", [millimetres(s.gt_interior_mae_mm) for s in statistics]),
         ("  largest", [millimetres(s.gt_max_mm) for s in statistics]),
-        ("object pixels without ground truth", [share(s.undecoded_share) for s in statistics]),
+        ("pixels without ground truth", [share(s.undecoded_share) for s in statistics]),
     ]
