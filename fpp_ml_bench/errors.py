@@ -11,6 +11,10 @@
     │   └── BuildError            a build that can't start or go on (locked, other settings, disk full)
     ├── PredictionError           predictions that can't be scored: missing, extra, mis-shaped, not finite
     ├── SubmissionError           a submission.yaml or result file that does not say what it must
+    ├── NetworkError              a network, an option or an input size that there is not
+    ├── RecipeError               a recipe with an unknown key or an impossible value
+    ├── TrainingError             a training that diverged, or that can't start or go on
+    ├── WeightsError              a weights file that is damaged, foreign or made for other data
     └── PublishError              something that can't be published: no token, no network, refused by the Hub
 
 A message says what was expected, what came, in which file or sample, and what to do.
@@ -55,6 +59,22 @@ class PredictionError(FppBenchError, ValueError):
 
 class SubmissionError(FppBenchError, ValueError):
     """A submission description or result file that does not say what it must."""
+
+
+class NetworkError(FppBenchError, ValueError):
+    """A network, an option or an input size that there is not."""
+
+
+class RecipeError(FppBenchError, ValueError):
+    """A recipe with an unknown key or an impossible value."""
+
+
+class TrainingError(FppBenchError):
+    """A training that diverged, or that can't start or go on."""
+
+
+class WeightsError(FppBenchError):
+    """A weights file that is damaged, foreign, or made for other data."""
 
 
 class PublishError(FppBenchError):

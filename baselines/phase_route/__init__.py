@@ -1,0 +1,1 @@
+"""Depth through wrapped phase and fringe order, from one frame: what the rig knows is computed, never learned."""

@@ -1,0 +1,1 @@
+"""Training a recipe: losses, objectives, one engine, its log and its checkpoint."""
