@@ -1,0 +1,132 @@
+"""pix2pixHD (paper section 5.6, Wang et al. 2018): the global generator and the two-scale discriminator."""
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, initialise_normal, whole
+
+DOWNSAMPLINGS = 4
+RESIDUAL_BLOCKS = 9
+LEAK = 0.2
+
+
+def _convolution(c_in: int, c_out: int, kernel: int, stride: int = 1, reflect: bool = False) -> nn.Conv2d:
+    return nn.Conv2d(
+        c_in, c_out, kernel, stride, kernel // 2, padding_mode="reflect" if reflect else "zeros"
+    )  # biases as published, though an instance normalisation after them takes them out again
+
+
+class GeneratorBlock(nn.Module):
+    """x + norm-convolved x: two reflected 3x3 convolutions with instance normalisation, (B, c, h, w) -> same."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.residual = nn.Sequential(
+            _convolution(channels, channels, 3, reflect=True),
+            nn.InstanceNorm2d(channels),
+            nn.ReLU(inplace=True),
+            _convolution(channels, channels, 3, reflect=True),
+            nn.InstanceNorm2d(channels),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.residual(x)
+
+
+class Generator(nn.Sequential):
+    """The bare generator, (B, 1, H, W) in [-1, 1] -> the same; 182,430,721 parameters at width 64."""
+
+    def __init__(self, width: int) -> None:
+        widths = [width * 2**level for level in range(DOWNSAMPLINGS + 1)]
+
+        def normed(layer: nn.Module, channels: int) -> nn.Sequential:
+            return nn.Sequential(layer, nn.InstanceNorm2d(channels), nn.ReLU(inplace=True))
+
+        super().__init__()
+        self.stem = normed(_convolution(1, width, 7, reflect=True), width)
+        self.down = nn.Sequential(
+            *(normed(_convolution(c // 2, c, 3, stride=2), c) for c in widths[1:]),
+        )
+        self.bottleneck = nn.Sequential(*(GeneratorBlock(widths[-1]) for _ in range(RESIDUAL_BLOCKS)))
+        self.up = nn.Sequential(
+            *(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, output_padding=1), c) for c in reversed(widths[:-1]))
+        )
+        self.head = nn.Sequential(_convolution(width, 1, 7, reflect=True), nn.Tanh())
+
+
+class Pix2Pix(FringeNetwork):
+    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back.
+
+    Output can't leave [0, 1], so the network suits representations in that range. width: channels of the first layer.
+    Convolutions start from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width
+    channels, 1/16 of the image), up4..up1 (up1 at full resolution, ``width`` channels).
+    """
+
+    name = "pix2pix"
+    stride = 2**DOWNSAMPLINGS
+    last_layer = "up1"
+
+    def __init__(self, *, width: int = 64) -> None:
+        width = whole(self.name, "width", width)
+        super().__init__(width=width)
+        self.generator = Generator(width)
+        initialise_normal(self)
+
+    @property
+    def probe_layers(self) -> dict[str, nn.Module]:
+        layers: dict[str, nn.Module] = {"stem": self.generator.stem}
+        layers |= {f"down{level}": layer for level, layer in enumerate(self.generator.down, 1)}
+        layers["bottleneck"] = self.generator.bottleneck
+        return layers | {f"up{DOWNSAMPLINGS - step}": layer for step, layer in enumerate(self.generator.up)}
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0
+
+
+class Discriminator(nn.Module):
+    """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64.
+
+    ``forward`` takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1], concatenated. It gives, for
+    each scale (full resolution first), the list of feature maps after each of its ``layers + 2`` convolutions; the
+    last map is the judgement, (B, 1, h, w), unbounded (a least-squares GAN has no sigmoid). The scales do not share
+    weights. Convolutions start from N(0, 0.02).
+
+    width: channels of the first layer. layers: stride-2 layers of a scale. scales: number of scales.
+    """
+
+    def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
+        width = whole("discriminator", "width", width)
+        layers = whole("discriminator", "layers", layers)
+        scales = whole("discriminator", "scales", scales)
+        super().__init__()
+        self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
+        self.scales = nn.ModuleList(_patch_judge(width, layers) for _ in range(scales))
+        initialise_normal(self)
+
+    def forward(self, pair: Tensor) -> list[list[Tensor]]:
+        features = []
+        for step, judge in enumerate(self.scales):
+            if step:
+                pair = functional.avg_pool2d(pair, 3, stride=2, padding=1, count_include_pad=False)
+            x, maps = pair, []
+            for stage in judge:  # type: ignore[attr-defined]
+                x = stage(x)
+                maps.append(x)
+            features.append(maps)
+        return features
+
+
+def _patch_judge(width: int, layers: int) -> nn.ModuleList:
+    """One scale: 4x4 convolutions, ``layers`` of stride 2, one of stride 1, then the judgement."""
+    widths = [min(width * 2**level, 8 * width) for level in range(layers + 1)]
+    stages = [nn.Sequential(nn.Conv2d(2, width, 4, 2, 2), nn.LeakyReLU(LEAK, inplace=True))]
+    for level in range(1, layers + 1):
+        stages.append(
+            nn.Sequential(
+                nn.Conv2d(widths[level - 1], widths[level], 4, 2 if level < layers else 1, 2),
+                nn.InstanceNorm2d(widths[level]),
+                nn.LeakyReLU(LEAK, inplace=True),
+            )
+        )
+    stages.append(nn.Sequential(nn.Conv2d(widths[-1], 1, 4, 1, 2)))
+    return nn.ModuleList(stages)
