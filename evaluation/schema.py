@@ -41,7 +41,7 @@ def problems_of(error: ValidationError) -> list[str]:
         message = item["msg"].removeprefix("Value error, ")
         if item["type"] == "missing":
             lines.append(f"{where}: is missing")
-        elif item["type"] == "extra_forbidden":
+        elif item["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
             lines.append(f"{where}: is not a key of this file; remove it or correct its spelling")
         elif item["loc"] and isinstance(item["input"], str | int | float | bool | type(None)):
             lines.append(f"{where}: {message} (got {printable(repr(item['input']), 60)})")

@@ -1,0 +1,35 @@
+"""Tiny networks and their configurations, for tests of what is done with a trained network."""
+
+from typing import Any
+
+import torch
+
+from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.weights_file import ModelConfig
+
+RECIPE: dict[str, Any] = {
+    "preset": "cpu", "seed": 42, "max_epochs": 3, "loss": {"name": "hybrid_l1", "alpha": 0.7}, "batch": 4,
+}  # fmt: skip
+
+
+def tiny_network(name: str = "unet", width: int = 4, seed: int = 0, **options: Any) -> torch.nn.Module:
+    """A network with random weights, in eval mode; the same ``seed`` gives the same."""
+    torch.manual_seed(seed)
+    return networks.build(name, width=width, **options).eval()
+
+
+def config_of(network: torch.nn.Module, **changes: Any) -> ModelConfig:
+    """A configuration that fits ``network``."""
+    about: dict[str, Any] = {
+        "name": "unet-individual-hybrid_l1_0.7",
+        "title": "UNet, individual, hybrid l1 0.7",
+        "network": "unet",
+        "options": network.options,
+        "normalisation": "individual",
+        "image_size": (32, 48),
+        "dataset_fingerprint": "0" * 64,
+        "recipe": RECIPE,
+        "epoch": 2,
+        "validation": {"object_mae_mm": 12.5},
+    }
+    return ModelConfig(**{**about, **changes})
