@@ -34,7 +34,8 @@ def fold_radius_squared(coefficients: Coefficients) -> float:
     return min(real, default=math.inf)
 
 
-def _distort(x: NDArray, y: NDArray, coefficients: Coefficients) -> Pair:
+def distortion_polynomial(x: NDArray, y: NDArray, coefficients: Coefficients) -> Pair:
+    """The model itself, without a look at its fold: arithmetic only, so that arrays of any library pass through."""
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -51,7 +52,7 @@ def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     if not is_distorted(coefficients):
         return x.copy(), y.copy()
     with np.errstate(invalid="ignore", over="ignore"):
-        xd, yd = _distort(x, y, coefficients)
+        xd, yd = distortion_polynomial(x, y, coefficients)
         folded = ~(x * x + y * y < fold_radius_squared(coefficients))
     return np.where(folded, np.nan, xd), np.where(folded, np.nan, yd)
 
@@ -68,7 +69,7 @@ def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     xi, yi = xd.copy(), yd.copy()
     with np.errstate(all="ignore"):
         for _ in range(MAX_ITERATIONS):
-            fx, fy = _distort(xi, yi, coefficients)
+            fx, fy = distortion_polynomial(xi, yi, coefficients)
             ex, ey = fx - xd, fy - yd
             r2 = xi * xi + yi * yi
             radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -1,0 +1,153 @@
+"""The fixed calibration layer: wrapped phase and fringe order to depth, in closed form, for any rig.
+
+With ``a = R (x, y, 1)`` a camera pixel's ray is seen by the projector at ``(Z a_i + t_i) / (Z a_2 + t_2)`` (see
+`fpp_ml_bench.triangulation`), and far out at ``a_i / a_2``. What is left when the phase of that point at infinity is
+taken off the absolute phase,
+
+    psi = Phi - Phi_infinity = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2),
+
+is the residual phase: for the paper's rig ``-2 pi f_p C / (P Z)``. It varies as slowly as 1 / Z does, and gives depth
+back without subtracting large numbers, so that float32 is enough. Everything here is arithmetic: NumPy arrays and torch
+tensors pass through the same lines (`fpp_ml_bench.baselines.phase_route.calibration_layer_torch` holds the buffers).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.frames import DIRECTIONS, Direction
+from fpp_ml_bench.lens import Coefficients, distortion_polynomial, is_distorted
+from fpp_ml_bench.pinhole import Maps
+from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.triangulation import FIXED_POINT_STEPS, rotated_ray
+
+TAU = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a distorted projector adds: ``rays`` a (three maps), ``t`` in metres, the axis that the fringes measure."""
+
+    rays: tuple[Any, Any, Any]
+    t: tuple[float, float, float]
+    axis: int
+    coefficients: Coefficients
+
+
+@dataclass(frozen=True)
+class CalibrationLayer:
+    """Constants of one rig and fringe direction for every pixel; float64 maps of the image's shape.
+
+    ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, split in wrapped
+    phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
+    ``rad_per_unit``: phase of one normalised projector unit, 2 pi f_p / P.
+    """
+
+    infinity_rad: Any
+    infinity_order: Any
+    gain: Any
+    forward: Any
+    back_m: float
+    rad_per_unit: float
+    lens: Lens | None = None
+
+    @classmethod
+    def of(cls, rig: Rig, direction: Direction, rays: Maps | None = None) -> "CalibrationLayer":
+        """The layer of ``rig`` for ``direction`` at all its camera's pixels, or at normalised ``rays`` (x, y).
+
+        Raises `DecodeError` for an unknown direction.
+        """
+        if direction not in DIRECTIONS:
+            raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
+        where = rig.camera.rays() if rays is None else rays
+        axis = 0 if direction == "vertical" else 1
+        device = rig.projector
+        focal, centre = (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
+        a = (rotated_ray(where, rig, 0), rotated_ray(where, rig, 1), rotated_ray(where, rig, 2))
+        per_unit = TAU * focal / rig.pitch(direction)
+        infinity = per_unit * (a[axis] / a[2]) + TAU * centre / rig.pitch(direction)
+        order = np.floor(infinity / TAU + 0.5)
+        lens = None
+        if device.is_distorted and is_distorted(device.distortion):
+            lens = Lens(a, rig.translation_m, axis, device.distortion)
+        return cls(
+            infinity_rad=infinity - TAU * order,
+            infinity_order=order,
+            gain=per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2]),
+            forward=a[2],
+            back_m=float(rig.t[2]),
+            rad_per_unit=per_unit,
+            lens=lens,
+        )
+
+    def residual_phase(self, phase_rad: Any, order: Any) -> Any:
+        """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole
+        periods counted, so that float32 keeps its digits."""
+        return (phase_rad - self.infinity_rad) + TAU * (order - self.infinity_order)
+
+    def absolute_phase(self, depth_mm: ArrayLike) -> NDArray[np.float64]:
+        """Absolute phase Phi in rad that a point at ``depth_mm`` on each pixel's ray shows, float64 (NumPy only)."""
+        z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
+        residual = self.gain / (self.forward * z + self.back_m)
+        if self.lens is not None:
+            residual = residual + self._lens_shift(z)
+        return residual + self.infinity_rad + TAU * self.infinity_order
+
+    def depth_mm(self, phase_rad: Any, order: Any) -> Any:
+        """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or tensors of the maps' shape
+        (leading dimensions may be more). Not bounded: what lies behind a device comes out negative or infinite."""
+        return self.depth_of_residual_mm(self.residual_phase(phase_rad, order))
+
+    def depth_of_residual_mm(self, residual_rad: Any) -> Any:
+        """Depth in mm from the residual phase psi in rad."""
+        ideal = residual_rad
+        if self.lens is not None:
+            for _ in range(FIXED_POINT_STEPS):
+                ideal = residual_rad - self._lens_shift((self.gain / ideal - self.back_m) / self.forward)
+        return (self.gain / ideal - self.back_m) / self.forward * MM_PER_M
+
+    def _lens_shift(self, z: Any) -> Any:
+        """Phase by which the projector's lens displaces a point at z metres on the ray."""
+        lens = self.lens
+        if lens is None:
+            return 0.0 * z
+        ahead = z * lens.rays[2] + lens.t[2]
+        point = [(z * lens.rays[i] + lens.t[i]) / ahead for i in range(2)]
+        moved = distortion_polynomial(point[0], point[1], lens.coefficients)
+        return self.rad_per_unit * (moved[lens.axis] - point[lens.axis])
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Orders whose depth lies in the working range: ``first`` int32 (H, W), ``count`` int32 (H, W), 0 where none.
+
+    They are ``first, first + 1, ..., first + count - 1``.
+    """
+
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]
+
+    @property
+    def most(self) -> int:
+        """The largest number of candidates that any pixel has."""
+        return int(self.count.max(initial=0))
+
+
+def orders_in_range(layer: CalibrationLayer, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
+    """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none.
+
+    The rig decides how many there are: periods_in_range rounded up or down, one pixel more, one less.
+    """
+    phase = np.asarray(phase_rad, dtype=np.float64)
+    ends = [layer.absolute_phase(end) for end in range_mm]
+    low, high = np.minimum(*ends), np.maximum(*ends)
+    known = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
+    with np.errstate(invalid="ignore"):
+        first = np.ceil((low - phase) / TAU)
+        last = np.floor((high - phase) / TAU)
+    count = np.where(known, np.maximum(last - first + 1, 0), 0)
+    return Candidates(np.where(known, first, 0).astype(np.int32), count.astype(np.int32))
