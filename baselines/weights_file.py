@@ -136,11 +136,10 @@ def open_weights(path: str | Path) -> WeightsFile:
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
     config = _config(path, metadata)
-    heads = {
-        name.removeprefix(HEAD_PREFIX): tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)
-    }
+    held = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
     _check_tensors(path, config, tensors)
-    _check_finite(path, heads)
+    _check_finite(path, held)
+    heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in held.items()}
     return WeightsFile(path, config, tensors, heads, sha256(data).hexdigest())
 
 
@@ -235,13 +234,15 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
             f"{_shown(path)}: its configuration builds no network: {printable(str(error), 300)}"
         ) from None
     built = f"{config.network} with {_options(config)}"
+    for name in tensors:
+        if name not in expected:
+            raise WeightsError(f"{_shown(path)}: tensor {printable(name, 100)} is none of {built}")
     for name in expected:
         if name not in tensors:
             raise WeightsError(f"{_shown(path)}: tensor {name} is missing, which {built} has; train or copy it again")
-    for name, tensor in tensors.items():
-        if name not in expected:
-            raise WeightsError(f"{_shown(path)}: tensor {printable(name, 100)} is none of {built}")
-        want, came = (f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (expected[name], tensor))
+        want, came = (
+            f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (expected[name], tensors[name])
+        )
         if want != came:
             raise WeightsError(f"{_shown(path)}: tensor {name}: expected {want} for {built}, got {came}")
     _check_finite(path, tensors)
