@@ -1,0 +1,213 @@
+"""The losses against the paper's equations in NumPy float64, their gradients, and what they must never hide."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from fpp_ml_bench.baselines.training.losses import EPSILON, LOSSES, loss_function, sample_losses
+from fpp_ml_bench.errors import RecipeError
+
+ALL = [(name, alpha) for name in LOSSES for alpha in ((0.0, 0.3, 0.7, 1.0) if name.startswith("hybrid") else (None,))]
+MASKED = [(name, alpha) for name, alpha in ALL if name.startswith("masked") or alpha]
+every_loss = pytest.mark.parametrize(("name", "alpha"), ALL)
+masked_loss = pytest.mark.parametrize(("name", "alpha"), MASKED)
+
+
+def paper(name, alpha, prediction, target):
+    """Section 5.5 in float64, on the pixels of whatever it is given."""
+    p, t = (np.asarray(values, dtype=np.float64).ravel() for values in (prediction, target))
+    inside = t > 0
+
+    def measure(error):
+        return math.sqrt((error**2).mean() + 1e-8) if name.endswith("rmse") else abs(error).mean()
+
+    if name.startswith("masked"):
+        return measure((p - t)[inside])
+    if name.startswith("hybrid"):
+        return alpha * measure((p - t)[inside]) + (1 - alpha) * measure(p - t)
+    return measure(p - t)
+
+
+def images(count=3, height=11, width=14, seed=0, scale=1.0, dtype=torch.float64):
+    """Predictions and targets whose objects differ in size, (count, 1, height, width)."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, 1, height, width)
+    prediction = torch.rand(shape, generator=generator, dtype=torch.float64) * 1.4 - 0.2
+    target = torch.rand(shape, generator=generator, dtype=torch.float64) * 0.9 + 0.1
+    for sample in range(count):
+        target[sample, :, : 2 + 3 * sample] = 0
+    return (prediction * scale).to(dtype), (target * scale).to(dtype)
+
+
+@every_loss
+def test_values_are_the_papers(name, alpha):
+    prediction, target = images()
+    value = loss_function(name, alpha)(prediction, target)
+    assert value.dtype == torch.float64 and value.shape == ()
+    assert value.item() == pytest.approx(paper(name, alpha, prediction, target), rel=1e-13)
+
+
+@every_loss
+def test_a_sample_is_a_batch_of_its_own_and_not_a_share_of_the_pool(name, alpha):
+    prediction, target = images()
+    values = sample_losses(name, alpha, prediction, target)
+    assert values.shape == (3,)
+    assert values.tolist() == pytest.approx(
+        [paper(name, alpha, *pair) for pair in zip(prediction, target, strict=True)]
+    )
+    if name != "l1" and (name, alpha) != ("hybrid_l1", 0.0):
+        assert abs(values.mean() - loss_function(name, alpha)(prediction, target)) > 1e-5
+
+
+@pytest.mark.parametrize("name", ["rmse", "l1", "masked_rmse", "masked_l1"])
+def test_float32_sums_hold_at_full_size_in_mm(name):
+    prediction, target = images(4, 960, 960, scale=2100.0, dtype=torch.float32)
+    # Errors of one sign and size, hundreds of mm: the case in which a running float32 sum would lose most.
+    shifted = prediction.abs() + 800
+    expected = loss_function(name)(shifted.double(), target.double())
+    value = loss_function(name)(shifted, target)
+    assert value.dtype == torch.float32
+    assert value.item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+@every_loss
+def test_gradcheck(name, alpha):
+    prediction, target = images(2, 5, 6)
+    prediction.requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: loss_function(name, alpha)(p, target), prediction)
+    assert torch.autograd.gradcheck(lambda p: sample_losses(name, alpha, p, target), prediction)
+
+
+@every_loss
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("scale", [1.0, 2100.0], ids=["unit", "mm"])
+def test_half_precision_overflows_nowhere(name, alpha, dtype, scale):
+    prediction, target = images(scale=scale, dtype=dtype)
+    prediction.requires_grad_()
+    value = loss_function(name, alpha)(prediction, target)
+    value.backward()
+    assert value.dtype == torch.float32
+    assert value.item() == pytest.approx(paper(name, alpha, prediction.detach().float(), target.float()), rel=1e-5)
+    assert prediction.grad.dtype == dtype
+    assert prediction.grad.isfinite().all() and prediction.grad.any()
+
+
+@every_loss
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("level", [0.0, 0.5], ids=["empty mask", "object everywhere"])
+def test_zero_residual_on_a_constant_image(name, alpha, dtype, level):
+    target = torch.full((2, 1, 6, 5), level, dtype=dtype)
+    prediction = target.clone().requires_grad_()
+    value = loss_function(name, alpha)(prediction, target)
+    value.backward()
+    assert (prediction.grad == 0).all()
+    share = 0.0 if name.endswith("l1") else 1.0
+    if level == 0:  # no object: the masked part is exactly 0, without its epsilon
+        share *= {"masked": 0.0, "hybrid": 1 - (alpha or 0)}.get(name.split("_")[0], 1.0)
+    assert value.item() == pytest.approx(share * math.sqrt(EPSILON), rel=1e-6, abs=0)
+
+
+@pytest.mark.parametrize("name", ["masked_rmse", "masked_l1"])
+def test_an_empty_mask_says_nothing(name):
+    prediction, _ = images()
+    target = torch.zeros_like(prediction)
+    prediction.requires_grad_()
+    value = loss_function(name)(prediction, target)
+    value.backward()
+    assert value.item() == 0
+    assert (prediction.grad == 0).all()
+    assert sample_losses(name, None, prediction, target).tolist() == [0, 0, 0]
+
+
+@masked_loss
+def test_samples_with_an_object_decide_for_those_without(name, alpha):
+    prediction, target = images()
+    target[1] = 0
+    prediction.requires_grad_()
+    value = loss_function(name, alpha)(prediction, target)
+    value.backward()
+    assert value.item() == pytest.approx(paper(name, alpha, prediction.detach(), target), rel=1e-13)
+    values = sample_losses(name, alpha, prediction, target)
+    for sample in (0, 2):
+        assert values[sample].item() == pytest.approx(paper(name, alpha, prediction[sample].detach(), target[sample]))
+    if name.startswith("masked"):
+        assert values[1] == 0
+        assert (prediction.grad[1] == 0).all()
+        assert prediction.grad[0].any()
+
+
+@pytest.mark.parametrize("name", ["masked_rmse", "masked_l1"])
+def test_background_has_no_influence_on_a_masked_loss(name):
+    prediction, target = images()
+    prediction.requires_grad_()
+    loss_function(name)(prediction, target).backward()
+    assert (prediction.grad[target == 0] == 0).all()
+    changed = torch.where(target == 0, prediction * 100, prediction)
+    assert loss_function(name)(changed, target) == loss_function(name)(prediction, target)
+
+
+@every_loss
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("row", [0, 10], ids=["background", "object"])
+def test_what_is_not_finite_is_never_masked_away(name, alpha, bad, row):
+    for place in (0, 1):
+        pair = images()
+        pair[place][0, 0, row, 3] = bad
+        assert not loss_function(name, alpha)(*pair).isfinite()
+        values = sample_losses(name, alpha, *pair)
+        assert not values[0].isfinite()
+        assert values[1:].isfinite().all()
+
+
+def test_hybrids_end_at_their_parts():
+    pair = images()
+    for measure in ("rmse", "l1"):
+        hybrid, masked, whole = f"hybrid_{measure}", f"masked_{measure}", measure
+        assert loss_function(hybrid, 0)(*pair) == loss_function(whole)(*pair)
+        assert loss_function(hybrid, 1)(*pair) == loss_function(masked)(*pair)
+
+
+def test_a_stepwise_descent_reaches_the_target():
+    _, target = images(dtype=torch.float32)
+    for name, alpha in ALL:
+        prediction = torch.zeros_like(target).requires_grad_()
+        optimiser = torch.optim.RMSprop([prediction], lr=8e-3)
+        for _ in range(150):
+            optimiser.zero_grad()
+            loss_function(name, alpha)(prediction, target).backward()
+            optimiser.step()
+        on_object = (prediction.detach() - target)[target > 0].abs().mean()
+        assert on_object < 0.02, name
+
+
+def test_wrong_names_and_alphas_are_refused():
+    with pytest.raises(RecipeError, match=r"unknown loss 'mse'; there are rmse, l1, masked_rmse"):
+        loss_function("mse")
+    for name in ("hybrid_rmse", "hybrid_l1"):
+        for alpha in (None, -0.1, 1.01, math.nan, "0.7", True):
+            with pytest.raises(RecipeError, match=f"{name} needs alpha.*from 0 to 1, got"):
+                loss_function(name, alpha)
+            with pytest.raises(RecipeError, match=f"{name} needs alpha"):
+                sample_losses(name, alpha, *images())
+    for name in ("rmse", "l1", "masked_rmse", "masked_l1"):
+        with pytest.raises(RecipeError, match=f"{name} takes no alpha, got 0.5"):
+            loss_function(name, 0.5)
+
+
+@every_loss
+def test_wrong_tensors_are_refused(name, alpha):
+    loss = loss_function(name, alpha)
+    prediction, target = images()
+    for other in (target[:, 0], target[:1], target[..., :-1], target.expand(3, 2, 11, 14)):
+        with pytest.raises(ValueError, match=r"of one shape \(B, 1, H, W\)"):
+            loss(prediction, other)
+    for empty in (prediction[:0], prediction[..., :0]):
+        with pytest.raises(ValueError, match="not empty"):
+            loss(empty, empty)
+    both = prediction.expand(3, 2, 11, 14)
+    with pytest.raises(ValueError, match="of one shape"):
+        loss(both, both)
+    with pytest.raises(ValueError, match=r"as floats, got torch.float64 and torch.int64"):
+        loss(prediction, target.long())

@@ -1,0 +1,349 @@
+"""Objectives as the engine drives them: every module gets its own gradient, the discriminator really learns."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.training import gan_losses
+from fpp_ml_bench.baselines.training.losses import loss_function, sample_losses
+from fpp_ml_bench.baselines.training.objectives import Adversarial, AdversarialSettings, Regression
+from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.loaders.training import FringeDepth
+
+SIZE = 32
+
+
+class Generator(nn.Module):
+    """[0, 1] to [0, 1] by way of a Tanh, and a count of its calls."""
+
+    def __init__(self):
+        super().__init__()
+        self.calls = 0
+        self.layers = nn.Sequential(nn.Conv2d(1, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1), nn.Tanh())
+
+    def forward(self, fringe):
+        self.calls += 1
+        return (self.layers(fringe * 2 - 1) + 1) / 2
+
+
+class Discriminator(nn.Module):
+    """Two scales, two layers and a patch score each: the interface of the real one."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+        self.scales = nn.ModuleList(
+            nn.ModuleList([nn.Conv2d(2, 8, 4, 2, 1), nn.Conv2d(8, 8, 4, 2, 1), nn.Conv2d(8, 1, 4, 1, 1)])
+            for _ in range(2)
+        )
+
+    def forward(self, pair):
+        self.seen.append(pair.detach())
+        answers = []
+        for layers in self.scales:
+            features = [pair]
+            for layer in layers:
+                features.append(functional.leaky_relu(layer(features[-1]), 0.2 if layer is not layers[-1] else 1.0))
+            answers.append(features[1:])
+            pair = functional.avg_pool2d(pair, 2)
+        return answers
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.manual_seed(0)
+
+
+def batch(count=2, seed=0, empty=False):
+    """Fringes across a square object whose depth follows them, so that there is something to learn."""
+    generator = torch.Generator().manual_seed(seed)
+    phase = torch.rand(count, 1, 1, 1, generator=generator) * 2 * math.pi
+    columns = torch.arange(SIZE, dtype=torch.float32).expand(count, 1, SIZE, SIZE)
+    fringe = 0.5 + 0.4 * torch.cos(columns * 2 * math.pi / 8 + phase)
+    depth = torch.zeros_like(fringe)
+    if not empty:
+        depth[:, :, 8:24, 8:24] = fringe[:, :, 8:24, 8:24]
+    rows = torch.arange(count)
+    return FringeDepth(fringe, depth, torch.tensor([[1500.0, 1700.0]] * count), rows, torch.zeros_like(rows))
+
+
+def optimisers(objective, rate=1e-3):
+    return {name: torch.optim.RMSprop(module.parameters(), rate) for name, module in objective.modules.items()}
+
+
+def take(objective, optimiser, one_batch):
+    """The engine's part: one update for every step; returns what was logged."""
+    logged = {}
+    for name, loss, values in objective.steps(one_batch):
+        optimiser[name].zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser[name].step()
+        assert not values.keys() & logged.keys()
+        assert all(not value.requires_grad and value.shape == () for value in values.values())
+        logged |= values
+    return logged
+
+
+def weights(module):
+    return torch.cat([parameter.detach().flatten().clone() for parameter in module.parameters()])
+
+
+# Regression
+
+
+def test_regression_is_its_loss_on_its_network():
+    network, one = Generator(), batch()
+    objective = Regression(network, "hybrid_l1", 0.7)
+    assert list(objective.modules) == ["network"]
+    [(name, loss, logged)] = objective.steps(one)
+    expected = loss_function("hybrid_l1", 0.7)(network(one.fringe), one.depth)
+    assert name == "network"
+    assert loss == expected and loss.requires_grad
+    assert logged == {"loss": expected.detach()}
+    prediction = network(one.fringe).detach()
+    values = objective.validation_losses(prediction, one)
+    assert torch.equal(values, sample_losses("hybrid_l1", 0.7, prediction, one.depth)) and values.shape == (2,)
+
+
+def test_regression_learns():
+    objective = Regression(Generator(), "rmse")
+    optimiser = optimisers(objective)
+    losses = [take(objective, optimiser, batch(seed=step))["loss"].item() for step in range(60)]
+    assert np.mean(losses[-5:]) < 0.6 * losses[0]
+
+
+def test_unknown_losses_are_refused_before_training():
+    with pytest.raises(RecipeError, match="unknown loss 'gan'"):
+        Regression(Generator(), "gan")
+    with pytest.raises(RecipeError, match="needs alpha"):
+        Regression(Generator(), "hybrid_rmse")
+
+
+@pytest.mark.parametrize("kind", ["regression", "adversarial"])
+def test_calls_go_through_the_modules_that_the_engine_put_in(kind):
+    objective = Regression(Generator(), "l1") if kind == "regression" else Adversarial(Generator(), Discriminator())
+    inner = dict(objective.modules)
+    wrapped = {name: nn.Sequential(module) for name, module in inner.items()}
+    called = []
+    for name, module in wrapped.items():
+        module.register_forward_pre_hook(lambda *_, name=name: called.append(name))
+    objective.modules.update(wrapped)
+    take(objective, optimisers(objective), batch())
+    assert set(called) == set(inner)
+
+
+# The adversarial pair
+
+
+def test_a_step_of_each_with_one_generator_forward():
+    objective = Adversarial(Generator(), Discriminator())
+    assert list(objective.modules) == ["network", "discriminator"]
+    before = {name: weights(module) for name, module in objective.modules.items()}
+    names = [name for name, *_ in objective.steps(batch())]
+    assert names == ["discriminator", "network"]
+    assert objective.modules["network"].calls == 1
+    take(objective, optimisers(objective), batch())
+    for name, module in objective.modules.items():
+        assert not torch.equal(weights(module), before[name])
+
+
+def test_gradients_stay_with_the_module_whose_step_it_is():
+    objective = Adversarial(Generator(), Discriminator())
+    generator, discriminator = objective.modules["network"], objective.modules["discriminator"]
+    steps = objective.steps(batch())
+    next(steps)[1].backward()
+    assert all(parameter.grad is None for parameter in generator.parameters())
+    learnt = [parameter.grad.clone() for parameter in discriminator.parameters()]
+    assert all(gradient.any() for gradient in learnt)
+    next(steps)[1].backward()
+    assert all(parameter.grad.any() for parameter in generator.parameters())
+    # Untouched by the generator's backward: the next discriminator step starts clean.
+    for parameter, gradient in zip(discriminator.parameters(), learnt, strict=True):
+        assert torch.equal(parameter.grad, gradient)
+        assert parameter.requires_grad
+
+
+def test_frozen_parameters_stay_frozen_and_free_ones_are_freed_after_an_error():
+    discriminator = Discriminator()
+    first = next(discriminator.parameters())
+    first.requires_grad_(False)
+    objective = Adversarial(Generator(), discriminator)
+    steps = objective.steps(batch())
+    next(steps)
+    discriminator.forward = None
+    with pytest.raises(TypeError):
+        next(steps)
+    assert [parameter.requires_grad for parameter in discriminator.parameters()] == [False] + [True] * 11
+
+
+def test_the_discriminator_learns_on_two_fixed_distributions():
+    """A generator that stands still: the loss must fall from guessing (0.5 with two scales) to telling them apart."""
+    objective = Adversarial(Generator(), Discriminator())
+    optimiser = optimisers(objective)
+    optimiser["network"] = torch.optim.SGD(objective.modules["network"].parameters(), lr=0.0)
+    before = weights(objective.modules["discriminator"])
+    losses = [take(objective, optimiser, batch(seed=step))["discriminator"].item() for step in range(120)]
+    assert losses[0] > 0.4
+    assert max(losses[-10:]) < 0.1
+    assert not torch.equal(weights(objective.modules["discriminator"]), before)
+    with torch.no_grad():
+        unseen = batch(seed=1000)
+        made = objective.modules["network"](unseen.fringe)
+        for depth, expected in ((made, 0.0), (unseen.depth, 1.0)):
+            pair = torch.cat([unseen.fringe, depth], 1) * 2 - 1
+            for scale in objective.modules["discriminator"](pair):
+                assert scale[-1].mean().item() == pytest.approx(expected, abs=0.3)
+
+
+def test_the_generator_learns_from_the_discriminator_alone():
+    """Without depth terms, the only way to fool the discriminator is a depth that looks like the batch's."""
+    settings = AdversarialSettings(l1=0, gradient_l1=0, scale_invariant_log=0)
+    objective = Adversarial(Generator(), Discriminator(), settings)
+    optimiser = optimisers(objective)
+    first = take(objective, optimiser, batch())["l1"].item()
+    for step in range(200):
+        last = take(objective, optimiser, batch(seed=step))["l1"].item()
+    assert last < 0.8 * first
+
+
+def test_the_discriminator_sees_fringe_and_depth_in_minus_one_to_one():
+    one, discriminator = batch(), Discriminator()
+    objective = Adversarial(Generator(), discriminator)
+    made = objective.modules["network"](one.fringe).detach()
+    list(objective.steps(one))
+    both, generated, real = discriminator.seen
+    assert torch.equal(both, torch.cat([generated, real]))
+    assert torch.equal(real, torch.cat([one.fringe * 2 - 1, one.depth * 2 - 1], dim=1))
+    assert torch.equal(generated, torch.cat([one.fringe * 2 - 1, made * 2 - 1], dim=1))
+
+
+def test_the_generators_loss_is_the_weighted_sum():
+    objective = Adversarial(Generator(), Discriminator())
+    (_, discriminator_loss, seen), (_, loss, terms) = objective.steps(batch())
+    halves = seen["discriminator_generated"] + seen["discriminator_real"]
+    assert discriminator_loss.item() == pytest.approx(halves.item() / 2)
+    expected = {"adversarial": 1, "feature_matching": 10, "l1": 10, "gradient_l1": 5, "scale_invariant_log": 2}
+    assert set(terms) == {"loss", *expected}
+    assert loss.item() == pytest.approx(sum(weight * terms[name].item() for name, weight in expected.items()))
+    assert terms["loss"] == loss.detach()
+
+
+def test_validation_looks_at_depth_alone():
+    one, objective = batch(), Adversarial(Generator(), Discriminator())
+    prediction = torch.rand_like(one.depth)
+    expected = (prediction - one.depth).abs().mean((1, 2, 3))
+    assert torch.allclose(objective.validation_losses(prediction, one), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_gradients_are_finite_without_an_object(dtype):
+    objective = Adversarial(Generator().to(dtype), Discriminator().to(dtype))
+    one = batch(empty=True)
+    for constant in (0.0, 1.0):
+        fringe = torch.full_like(one.fringe, constant).to(dtype)
+        for name, loss, _ in objective.steps(one._replace(fringe=fringe, depth=one.depth.to(dtype))):
+            assert loss.dtype == torch.float32 and loss.isfinite()
+            objective.modules[name].zero_grad()
+            loss.backward()
+            assert all(parameter.grad.isfinite().all() for parameter in objective.modules[name].parameters())
+
+
+@pytest.mark.parametrize("place", [(0, 0), (15, 15)], ids=["background", "object"])
+def test_nan_reaches_the_loss(place):
+    objective = Adversarial(Generator(), Discriminator())
+    for field in ("fringe", "depth"):
+        one = batch()
+        getattr(one, field)[0, 0][place] = math.nan
+        for _, loss, _ in objective.steps(one):
+            assert loss.isnan()
+
+
+@pytest.mark.parametrize("weight", [-1, math.nan, math.inf, "10", None, True])
+def test_weights_that_make_no_sense_are_refused(weight):
+    with pytest.raises(RecipeError, match="weight l1: expected a number from 0 up"):
+        AdversarialSettings(l1=weight)
+
+
+def test_spread_over_processes_it_is_the_same_training(tmp_path):
+    """DistributedDataParallel stops where a forward has no backward, or a parameter gets no gradient."""
+
+    def losses(wrap):
+        torch.manual_seed(3)
+        objective = Adversarial(Generator(), Discriminator())
+        for name, module in objective.modules.items():
+            objective.modules[name] = wrap(module)
+        optimiser = optimisers(objective)
+        return [take(objective, optimiser, batch(seed=step)) for step in range(3)]
+
+    alone = losses(lambda module: module)
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/rendezvous", rank=0, world_size=1)
+    try:
+        assert losses(nn.parallel.DistributedDataParallel) == alone
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+# The terms, against closed forms
+
+
+def test_scores_and_features_against_numpy():
+    rng = np.random.default_rng(0)
+
+    def answers():
+        return [[torch.from_numpy(rng.normal(size=(2, channels, 4, 4))) for channels in (3, 5, 1)] for _ in range(2)]
+
+    generated, real = answers(), answers()
+    expected = sum(((scale[-1].numpy() - 1) ** 2).mean() for scale in generated)
+    assert gan_losses.scores_against(generated, real=True).item() == pytest.approx(expected)
+    expected = sum((scale[-1].numpy() ** 2).mean() for scale in generated)
+    assert gan_losses.scores_against(generated, real=False).item() == pytest.approx(expected)
+    expected = np.mean(
+        [sum(abs(g[layer] - r[layer]).mean() for layer in (0, 1)) for g, r in zip(generated, real, strict=True)]
+    )
+    assert gan_losses.feature_matching(generated, real).item() == pytest.approx(expected)
+    assert gan_losses.feature_matching(real, real) == 0
+
+
+def test_gradient_l1_of_a_ramp_and_of_an_offset():
+    rows, columns = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
+    ramp = (0.25 * rows - 0.5 * columns)[None, None]
+    flat = torch.zeros_like(ramp)
+    assert gan_losses.gradient_l1(ramp, flat).item() == pytest.approx(0.25 + 0.5)
+    assert gan_losses.gradient_l1(ramp + 3, ramp) == 0
+    assert gan_losses.l1(ramp + 3, ramp) == 3
+
+
+def test_scale_invariant_log_of_a_wrong_scale_is_half_its_squared_logarithm():
+    """With lambda 1/2, log p = log t + c everywhere on the object costs c^2 / 2; the background costs nothing."""
+    floor = gan_losses.LOG_FLOOR
+    target = torch.rand(2, 1, 6, 6, dtype=torch.float64) * 0.4 + 0.1
+    target[:, :, :2] = 0
+    factor = torch.tensor([1.5, 0.8], dtype=torch.float64)[:, None, None, None]
+    prediction = (target + floor) * factor - floor
+    prediction[:, :, :2] = 0.7
+    expected = (np.log(1.5) ** 2 + np.log(0.8) ** 2) / 2 / 2
+    assert gan_losses.scale_invariant_log(prediction, target).item() == pytest.approx(expected)
+    assert gan_losses.scale_invariant_log(target, target) == 0
+
+
+def test_scale_invariant_log_at_its_ends():
+    target = torch.rand(2, 1, 6, 6, dtype=torch.float64) * 0.9 + 0.05
+    target[1] = 0
+    prediction = torch.rand_like(target).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: gan_losses.scale_invariant_log(p, target), prediction)
+    for level in (-0.5, 0.0, 1.0):
+        flat = torch.full_like(target, level).requires_grad_()
+        for other in (target, torch.zeros_like(target), torch.ones_like(target)):
+            value = gan_losses.scale_invariant_log(flat, other)
+            value.backward()
+            assert value.isfinite() and value >= 0
+            assert flat.grad.isfinite().all()
+    assert gan_losses.scale_invariant_log(prediction, torch.zeros_like(target)) == 0
+    for place in (0, 1):
+        pair = [prediction.detach().clone(), target.clone()]
+        pair[place][1, 0, 2, 2] = math.nan
+        assert gan_losses.scale_invariant_log(*pair).isnan()
