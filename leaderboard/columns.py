@@ -10,7 +10,7 @@ from fpp_ml_bench.leaderboard.paper import PaperRow
 from fpp_ml_bench.leaderboard.ranking import Ranked
 from fpp_ml_bench.leaderboard.rows import Entry
 
-NAME_WIDTH = 60
+NAME_WIDTH = 90
 DEVICE_WIDTH = 40
 SELF_REPORTED = "*"
 NOTE = (

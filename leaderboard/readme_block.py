@@ -19,11 +19,13 @@ _NOTE = (
     f"{_MADE_BY} Rank: 1 and the number of methods whose whole interval is better (95%, bootstrap over objects). Time: "
     f"median latency of one image. \\{SELF_REPORTED} self-reported."
 )
+SHOWN = 10
+"""Rows of a group that README shows; the page shows them all."""
 _NOBODY = f"No row yet. {_MADE_BY}"
 
 
 def readme_block(groups: Sequence[Group]) -> str:
-    """What stands between the markers; the same rows give the same bytes."""
+    """What stands between the markers: the best of each group (`SHOWN`); the same rows give the same bytes."""
     lines: list[str] = []
     for group in groups:
         height, width = group.key.size
@@ -33,8 +35,10 @@ def readme_block(groups: Sequence[Group]) -> str:
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
         title = f"{title[0].upper()}{title[1:]} ({group.key.fingerprint[:8]}){timed}"
-        rows = [[markdown_text(cell) for cell in _cells(row)] for row in group.rows]
+        rows = [[markdown_text(cell) for cell in _cells(row)] for row in group.rows[:SHOWN]]
         lines += [f"**{markdown_text(title)}**", "", *markdown_rows(_TITLES, _RIGHT, rows), ""]
+        more = len(group.rows) - SHOWN
+        lines += [f"… and {more} more on the page", ""] if more > 0 else []
     return "\n".join([*lines, _NOTE if groups else _NOBODY]) + "\n"
 
 

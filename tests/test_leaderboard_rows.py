@@ -1,6 +1,7 @@
 """Row files and who stands for them, ranks with ties by interval, and README's block that no hand may edit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from fpp_ml_bench.evaluation.report_html import palette_png
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.readme_block import BEGIN, END, readme_block
+from fpp_ml_bench.leaderboard.readme_block import BEGIN, END, SHOWN, readme_block
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry, write_row
 
 
@@ -189,6 +190,24 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
     assert block(readme, *files[::-1]) == 0 and readme.read_text() == text
     assert block(readme, *files, "--check") == 0
     assert "is what the rows give" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("extra", [0, 1, 4])
+def test_readme_shows_the_best_ten_of_a_group(extra, files):
+    count = SHOWN + extra
+    entry = read_entry(files[0])
+    about = entry.result.submission
+    named = [
+        replace(entry, result=entry.result.model_copy(update={"submission": about.model_copy(update={"name": name})}))
+        for name in (f"Method {number:02}" for number in range(count))
+    ]
+    text = readme_block(rank([*named, read_entry(files[3])]))
+    # All share one error, so names decide.
+    assert [f"Method {n:02}" for n in range(count) if f"Method {n:02}" in text] == [f"Method {n:02}" for n in range(10)]
+    assert [line for line in text.splitlines() if "more on the page" in line] == (
+        [f"… and {extra} more on the page"] if extra else []
+    )
+    assert "Was told" in text
 
 
 def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):

@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
     "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
+    "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),
     "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
     "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
 }

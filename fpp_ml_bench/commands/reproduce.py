@@ -1,0 +1,141 @@
+"""``fpp-bench reproduce``: the paper's tables, trained and scored here."""
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.leaderboard.reproduce_plan import Folders
+
+SUMMARY = "Train, predict, time and score the rows of the paper's tables, and set them beside its numbers."
+EXAMPLES = (
+    "fpp-bench reproduce --list",
+    "fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop",
+    "fpp-bench reproduce all --only-missing                 every table; rows that hold are kept",
+    "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
+)
+ALL = "all"
+_PRESETS = ("cpu", "paper")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument(
+        "table", nargs="?", choices=(*PAPER_TABLES, ALL), metavar="TABLE", help=f"{', '.join(PAPER_TABLES)} or {ALL}"
+    )
+    parser.add_argument(
+        "--preset", choices=_PRESETS, default="cpu",
+        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs"), metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
+    )  # fmt: skip
+    parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
+    parser.add_argument(
+        "--only-missing", action="store_true",
+        help="keep rows that hold for the dataset and the weights; without it, they are predicted and scored again. "
+        "Finished trainings are kept either way",
+    )  # fmt: skip
+    parser.add_argument(
+        "--minutes", type=_minutes, metavar="M",
+        help="stop after the epoch in which they run out, everything saved; exit status 1, the same command goes on",
+    )  # fmt: skip
+    parser.add_argument("--anyway", action="store_true", help="train preset paper without a GPU all the same")
+    parser.add_argument("--list", action="store_true", help="show rows, recipes and what is done, and stop")
+
+
+def _minutes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected minutes above 0, got {text!r}")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what is missing, print the tables. Raises FppBenchError where something can't be done or a training failed."""
+    from fpp_ml_bench.commands import CHECK_FAILED
+    from fpp_ml_bench.errors import RecipeError, TrainingError
+    from fpp_ml_bench.evaluation.console import show
+    from fpp_ml_bench.leaderboard.reproduce_plan import Folders
+
+    below = args.runs / args.preset
+    folders = Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
+    tables = PAPER_TABLES if args.table in (None, ALL) else (args.table,)
+    if args.list:
+        return _list(tables, folders)
+    if args.table is None:
+        raise RecipeError(f"expected a table: {', '.join(PAPER_TABLES)} or {ALL}; --list shows their rows")
+    from fpp_ml_bench.leaderboard.reproduce import Wish, reproduce
+    from fpp_ml_bench.leaderboard.reproduce_lines import table_lines
+    from fpp_ml_bench.leaderboard.reproduce_order import orderings
+    from fpp_ml_bench.leaderboard.reproduce_table import orderings_said, table_rich
+
+    command = _command(args)
+    outcome = reproduce(
+        Wish(tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, say=_say)
+    )
+    for table, path in zip(tables, outcome.tables, strict=True):
+        lines = table_lines(table, outcome.jobs, folders, outcome.opened)
+        show(table_rich(table, lines, args.preset), orderings_said(orderings(lines)))
+        print(f"Written: {path}")
+    if outcome.failed:
+        each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
+        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} trainings failed:\n{each}")
+    if outcome.stopped is not None:
+        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Go on with: {command}")
+        return CHECK_FAILED
+    return 0
+
+
+def _say(line: str) -> None:
+    """On stderr, where the engine's progress is; with the time, for a run of hours is read afterwards."""
+    import sys
+    from datetime import datetime
+
+    print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that goes on where this one stops, keeping what it has done."""
+    words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
+    for option, value in (("--data", args.data), ("--rows", args.rows)):
+        words += [] if value is None else [option, str(value)]
+    words += [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
+    words += ["--only-missing"]
+    words += [] if args.minutes is None else ["--minutes", f"{args.minutes:g}"]
+    words += ["--anyway"] if args.anyway else []
+    return shlex.join(words)
+
+
+def _list(tables: "tuple[str, ...]", folders: "Folders") -> int:
+    from rich.table import Table
+
+    from fpp_ml_bench.evaluation.console import show
+    from fpp_ml_bench.leaderboard.reproduce_plan import planned, variants
+    from fpp_ml_bench.leaderboard.reproduce_training import state_of
+
+    jobs = planned(tables, folders.preset)
+    shown = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    for title in ("Row", "Training", "State", "Rows written"):
+        shown.add_column(title, overflow="fold")
+    for job in jobs:
+        wanted = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
+        shown.add_row(
+            "\n".join(place.recipe_name for place in job.places),
+            job.recipe.name,
+            state_of(folders.training(job.recipe)),
+            f"{sum(path.is_file() for path in wanted)} of {len(wanted)}",
+        )
+    show(shown)
+    print(f"{len(jobs)} trainings fill {sum(len(job.places) for job in jobs)} rows.")
+    return 0

@@ -1,0 +1,92 @@
+"""The lines of a reproduced table: what was measured here for each row of the paper's, read from the row files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.leaderboard.reproduce_frames import AllFrames, all_frames_that_hold
+from fpp_ml_bench.leaderboard.reproduce_plan import MEAN, PREDICTED, Folders, Job, Place, places, variants
+from fpp_ml_bench.leaderboard.reproduce_row import file_sha256, row_that_holds
+from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+MAIN_KEY = "object_mae_mm"
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The six errors in mm by the keys of `HEADLINE`, the 95% interval of the object MAE, and each sample's own:
+    sample to (object, object MAE in mm)."""
+
+    errors_mm: dict[str, float | None]
+    interval_mm: tuple[float, float] | None
+    samples: dict[str, tuple[str, float | None]]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line. ``scored`` and ``entry`` are None where nothing has been measured; ``twins`` maps a twin's suffix to
+    its row. ``paper_mm`` are the paper's errors by the keys of `HEADLINE`, None where it reports none."""
+
+    place: Place
+    recipe: Recipe
+    label: str
+    scored: Scored | None
+    entry: Entry | None
+    paper_mm: dict[str, float] | None
+    twins: dict[str, Entry] = field(default_factory=dict)
+
+    @property
+    def compared(self) -> bool:
+        """Whether it stands beside numbers of the paper."""
+        return self.scored is not None and self.paper_mm is not None
+
+
+def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
+    """Lines of ``table`` in the paper's order. Rows that don't hold for these weights and this dataset are left empty.
+
+    Where the paper scores every frame (multi-frame), a training's first line does too, and a second one is its row in
+    the leaderboard: the first frame only, beside no number of the paper.
+    """
+    owners = {place: job for job in jobs for place in job.places}
+    return [line for place in places(table) for line in _lines_of(place, owners[place], folders, opened)]
+
+
+def _lines_of(place: Place, job: Job, folders: Folders, opened: DatasetFolder) -> list[Line]:
+    recipe, weights = job.recipe, folders.weights(job.recipe)
+    if not weights.is_file():
+        return [Line(place, recipe, place.label, None, None, place.errors_mm)]
+    sha256 = file_sha256(weights)
+    main, *others = variants(recipe)
+    found = {variant: row_that_holds(folders.row(recipe, variant), opened, sha256) for variant in (main, *others)}
+    entry = found[main]
+    twins = {twin.suffix: row for twin in (PREDICTED, MEAN) if (row := found.get(twin)) is not None}
+    first = None if entry is None else scored_entry(entry)
+    several = len(opened.sequence.config(recipe.data_config)) > 1
+    if place.table != "multi_frame" or not several:
+        return [Line(place, recipe, place.label, first, entry, place.errors_mm, twins)]
+    every = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+    return [
+        Line(place, recipe, place.label, None if every is None else scored_frames(every), entry, place.errors_mm),
+        Line(place, recipe, f"{place.label}, its first frame only", first, entry, None, twins),
+    ]
+
+
+def scored_entry(entry: Entry) -> Scored:
+    """Scores of a row of the leaderboard."""
+    result = entry.result
+    return Scored(
+        {key: getattr(result.metrics, key) for key in HEADLINE},
+        result.intervals.of(MAIN_KEY),
+        {row.sample: (row.object, row.object_mae_mm) for row in result.per_sample},
+    )
+
+
+def scored_frames(found: AllFrames) -> Scored:
+    """Scores over all frames."""
+    return Scored(
+        {key: getattr(found.metrics, key) for key in HEADLINE},
+        found.intervals.of(MAIN_KEY),
+        {row.sample: (row.object, row.metrics.object_mae_mm) for row in found.per_sample},
+    )

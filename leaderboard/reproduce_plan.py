@@ -1,0 +1,159 @@
+"""What there is to do for a table of the paper: which trainings fill which of its rows, and where everything lies.
+
+Rows that resolve to one recipe (``normalization/individual``, ``loss/rmse`` and ``multi_frame/frame0``) are one
+training and one row of the leaderboard.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
+from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.leaderboard.paper import paper_tables
+
+RUNS = Path("runs")
+_NOT_IN_THE_PAPER = {"hformer": "Hformer"}
+
+
+@dataclass(frozen=True)
+class Place:
+    """One row of one table; ``errors_mm`` are what the paper reports by the keys of `HEADLINE`, None where nothing."""
+
+    table: str
+    row: str
+    label: str
+    errors_mm: dict[str, float] | None = field(hash=False)
+    pairs: int | None
+
+    @property
+    def recipe_name(self) -> str:
+        return f"{self.table}/{self.row}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training, and the ``places`` that its scores stand in."""
+
+    recipe: Recipe
+    places: tuple[Place, ...]
+
+    @property
+    def all_frames(self) -> bool:
+        """Whether the paper scores this training on more frames than the first (Section 5.4)."""
+        return any(place.table == "multi_frame" for place in self.places)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to use a trained network: what its row file's name ends in, its title says, and how it is scored.
+
+    ``range_from`` is None for a network's bare output; ``predicted`` by the head in its weights file; ``mean``, the
+    training samples' mean range.
+    """
+
+    suffix: str
+    words: str
+    mode: str
+    range_from: str | None
+
+
+METRIC = Variant("", "", "standard", None)
+ORACLE = Variant("", "", "paper-individual", None)
+PREDICTED = Variant("-range-predicted", ", range predicted", "standard", "predicted")
+MEAN = Variant("-range-mean", ", range mean", "standard", "mean")
+
+
+def variants(recipe: Recipe) -> tuple[Variant, ...]:
+    """The rows that a training gives. Individual normalisation is told the test sample's range, as in the paper; its
+    metric twins are not. With the background removed the object's mask is given anyway, and there are no twins."""
+    if recipe.normalisation != "individual":
+        return (METRIC,)
+    return (ORACLE,) if recipe.background_removed else (ORACLE, PREDICTED, MEAN)
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where things lie below ``runs`` (``runs/<preset>``); ``rows`` takes the row files."""
+
+    preset: str
+    runs: Path
+    rows: Path
+
+    @property
+    def dataset_record(self) -> Path:
+        """Which dataset everything here was trained and scored on."""
+        return self.runs / "dataset.json"
+
+    def training(self, recipe: Recipe) -> Path:
+        return self.runs / recipe.name
+
+    def weights(self, recipe: Recipe) -> Path:
+        """Best weights, with range heads where the normalisation needs them: the file to ship."""
+        return self.runs / "weights" / f"{recipe.name}.safetensors"
+
+    def row_name(self, recipe: Recipe, variant: Variant) -> str:
+        return f"{self.preset}-{recipe.name}{variant.suffix}"
+
+    def row(self, recipe: Recipe, variant: Variant) -> Path:
+        return self.rows / f"{self.row_name(recipe, variant)}.json"
+
+    def all_frames(self, recipe: Recipe) -> Path:
+        # Not in the folder of the rows: there every .json is a row.
+        return self.runs / "all-frames" / f"{self.preset}-{recipe.name}-all-frames.json"
+
+    def result(self, name: str) -> Path:
+        return self.runs / "results" / f"{name}.json"
+
+    def predictions(self, name: str) -> Path:
+        return self.runs / "predictions" / name
+
+    def table(self, table: str) -> Path:
+        return self.runs / f"{table}.md"
+
+
+def places(table: str) -> tuple[Place, ...]:
+    """Rows of a table in the recipes' order, each with the paper's numbers. RecipeError for an unknown table."""
+    reported = {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
+    found = []
+    for name in table_rows(table):
+        row = reported.get(name)
+        found.append(
+            Place(table, name, _NOT_IN_THE_PAPER.get(name, name), None, None)
+            if row is None
+            else Place(table, name, row.label, row.errors_mm, row.test_samples)
+        )
+    return tuple(found)
+
+
+def planned(tables: Sequence[str], preset: str) -> list[Job]:
+    """The trainings of ``tables``, each once, in the order of their first row.
+
+    Raises RecipeError for an unknown table, an unsound recipe, or two recipes that differ under one name.
+    """
+    jobs: dict[str, Job] = {}
+    for place in (place for table in tables for place in places(table)):
+        recipe = load_recipe(place.recipe_name, preset)
+        known = jobs.get(recipe.name)
+        if known is not None and known.recipe.digest != recipe.digest:
+            raise RecipeError(
+                f"{known.places[0].recipe_name} and {place.recipe_name} differ in {differing(known.recipe, recipe)}, "
+                f"but both are called {recipe.name}; give one of the recipes what tells them apart"
+            )
+        jobs[recipe.name] = Job(recipe, (*(known.places if known else ()), place))
+    return list(jobs.values())
+
+
+def differing(one: Recipe, two: Recipe) -> str:
+    """The settings in which two recipes differ, with both values."""
+    first, second = one.to_dict(), two.to_dict()
+    keys = [key for key in {**first, **second} if first.get(key) != second.get(key)]
+    return ", ".join(f"{key} ({first.get(key)} and {second.get(key)})" for key in keys)
+
+
+def one_size(jobs: Iterable[Job]) -> int:
+    """Image width and height in px that all ``jobs`` train on. RecipeError where they don't agree."""
+    sizes = {job.recipe.size: job.recipe.name for job in jobs}
+    if len(sizes) != 1:
+        raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
+    return next(iter(sizes))
