@@ -11,6 +11,7 @@ from fpp_ml_bench.commands import main
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.evaluation.result_io import write_result
 from fpp_ml_bench.leaderboard import ranking, rows
+from fpp_ml_bench.leaderboard.columns import NAME_WIDTH
 from fpp_ml_bench.leaderboard.export import markdown_text
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, SHOWN_BY_DEFAULT, paper_tables
 
@@ -177,7 +178,7 @@ def test_submitted_text_is_only_text(make, capsys, tmp_path):
     assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
     import html
 
-    assert html.unescape(cell) == HOSTILE.strip()[:60] + ("..." if len(HOSTILE) > 60 else "")
+    assert html.unescape(cell) == HOSTILE.strip()[:NAME_WIDTH] + ("..." if len(HOSTILE) > NAME_WIDTH else "")
 
 
 @pytest.mark.parametrize("text", ["plain", "a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
