@@ -48,13 +48,21 @@ def read_plain(folder: Path) -> dict[Any, Any]:
     SubmissionError names the file, what is wrong with it and the cure.
     """
     path = folder / SUBMISSION_FILE
-    shown = printable(str(path), 500)
     if path.is_symlink() or not path.is_file():
         raise SubmissionError(
-            f"expected a file {shown} that describes the predictions, found "
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
             f"{'a symbolic link' if path.is_symlink() else 'none'}; "
             "fpp-bench predict writes one, PROTOCOL.md lists its keys"
         )
+    return read_plain_file(path, "'name: My method'")
+
+
+def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
+    """Keys and values of a YAML file, bounded and plain as this module says; ``example`` shows what a line looks like.
+
+    SubmissionError names the file, what is wrong with it and the cure.
+    """
+    shown = printable(str(path), 500)
     try:
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
@@ -69,5 +77,5 @@ def read_plain(folder: Path) -> dict[Any, Any]:
         reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
         raise SubmissionError(f"{shown} is no plain YAML: {reason}") from None
     if not isinstance(content, dict):
-        raise SubmissionError(f"{shown}: expected keys and values like 'name: My method', got {type(content).__name__}")
+        raise SubmissionError(f"{shown}: expected keys and values like {example}, got {type(content).__name__}")
     return content

@@ -1,0 +1,298 @@
+"""The one training loop: every recipe, on one processor or many, on what `accelerate` finds.
+
+    accelerate launch ...   several GPUs or machines; a batch of the recipe is then that of one process
+
+A training folder holds, after every epoch, all that is needed to go on: ``checkpoint.safetensors`` (everything),
+``weights.safetensors`` (the epoch of the lowest validation loss), ``log.jsonl``, ``recipe.json``; at the end also
+``curve.png`` and ``done.json``. On one processor type and number of threads, the same recipe and data give the same
+bits, stopped and resumed or not.
+
+The recipe is the paper's (Section 5.3): the rate falls on a plateau of the validation loss, training ends when it has
+reached its minimum, and the weights kept are those of the lowest validation loss. A validation loss is the mean over
+samples of each sample's own loss, and the scores beside it are the evaluator's (`training.validation`).
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import gather_object, set_seed
+from torch import Tensor
+from torch.optim import RMSprop
+from torch.utils.data import DataLoader
+
+from fpp_ml_bench.baselines.training import environment, history
+from fpp_ml_bench.baselines.training.checkpoint import (
+    optimizer_tensors,
+    read_checkpoint,
+    restore_optimizer,
+    save_checkpoint,
+)
+from fpp_ml_bench.baselines.training.display import Display
+from fpp_ml_bench.baselines.training.objectives import Objective
+from fpp_ml_bench.baselines.training.pairs import EpochSampler, training_loader
+from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.baselines.training.schedules import Schedule
+from fpp_ml_bench.baselines.training.setup import model_config, objective_of, open_data
+from fpp_ml_bench.baselines.training.validation import validate
+from fpp_ml_bench.baselines.weights_file import save_weights
+from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.loaders.manifest import write_atomically
+from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
+
+CHECKPOINT, WEIGHTS, RECIPE, DONE = "checkpoint.safetensors", "weights.safetensors", "recipe.json", "done.json"
+CHECK_EVERY = 16
+"""Steps between two looks at the losses: a look makes a GPU wait."""
+DIVERGED = 1e6
+"""A loss this many times the first one will not come back."""
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What a training came to; ``finished`` is False when its minutes ran out: call `train` again to go on."""
+
+    weights: Path
+    epochs: int
+    best_epoch: int
+    seconds: float
+    finished: bool
+    log: Path
+    curve: Path
+
+
+def train(
+    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
+) -> TrainingRun:
+    """Train ``recipe`` on a dataset folder into ``out``, from where ``out`` stands; returns at once if that is the end.
+
+    ``minutes``: stop, with everything saved, after the epoch in which they run out. ``show``: progress on stderr.
+
+    Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a dataset of another image
+    size, a loss that is not finite or has diverged (the batch's samples are named); what else recipe, dataset or
+    network refuse comes as their own error.
+    """
+    out = Path(out)
+    started = perf_counter()
+    training, validation = open_data(recipe, Path(dataset))
+    _claim(out, recipe, training)
+    finished = _finished(out)
+    if finished is not None:
+        return finished
+    with environment.reproducible(recipe):
+        return _Training(recipe, training, validation, out).run(started, minutes, show)
+
+
+class _Training:
+    """The state of one training and its loop."""
+
+    def __init__(self, recipe: Recipe, training: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
+        self.recipe, self.out, self.training, self.validation = recipe, out, training, validation
+        self.accelerator = Accelerator(mixed_precision="no" if recipe.precision == "fp32" else recipe.precision)
+        on_gpu = self.accelerator.device.type == "cuda"
+        set_seed(recipe.seed)
+        self.objective: Objective = objective_of(recipe)
+        if on_gpu:
+            for module in self.objective.modules.values():
+                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if on_gpu and recipe.compile:
+            self.objective.modules = {name: torch.compile(m) for name, m in self.objective.modules.items()}  # type: ignore[misc]
+        rule = recipe.optimizer
+        self.optimizers = {
+            name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
+            for name, module in self.objective.modules.items()
+        }
+        self.schedule = Schedule(recipe.schedule, rule.learning_rate)
+        self.sampler = EpochSampler(len(training), recipe.pairs_per_epoch, recipe.seed)
+        loader = training_loader(training, self.sampler, recipe.batch, pin=on_gpu)
+        self.loader: DataLoader = self.accelerator.prepare(loader)
+        for name in self.objective.modules:
+            self.objective.modules[name], self.optimizers[name] = self.accelerator.prepare(
+                self.objective.modules[name], self.optimizers[name]
+            )
+        self.history: list[history.Record] = []
+        self.first_loss: float | None = None
+        self.before = 0.0  # seconds of earlier calls
+        if (out / CHECKPOINT).exists():
+            self._resume()
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+        return len(self.history)
+
+    @property
+    def best(self) -> history.Record:
+        return min(self.history, key=lambda record: record["validation_loss"])
+
+    @property
+    def over(self) -> bool:
+        return self.epoch >= self.recipe.max_epochs or (self.epoch > 0 and self.schedule.finished)
+
+    def run(self, started: float, minutes: float | None, show: bool) -> TrainingRun:
+        with Display(self.recipe, len(self.loader), show and self.accelerator.is_main_process) as display:
+            for record in self.history:
+                display.epoch_done(record)
+            while not self.over and (minutes is None or perf_counter() - started < 60 * minutes):
+                began = perf_counter()
+                losses = self._train_epoch(display)
+                self._finish_epoch(losses, began)
+                display.epoch_done(self.history[-1])
+        seconds = self.before + perf_counter() - started
+        if self.accelerator.is_main_process:
+            history.draw_curve(self.out, self.history, self.recipe.title)
+            if self.over:
+                summary = {"epochs": self.epoch, "best_epoch": self.best["epoch"], "seconds": round(seconds, 1)}
+                write_atomically(self.out / DONE, json.dumps(summary).encode())
+        self.accelerator.wait_for_everyone()
+        best = self.best["epoch"] if self.history else 0
+        return _run(self.out, self.epoch, best, seconds, self.over)
+
+    def _train_epoch(self, display: Display) -> dict[str, float]:
+        """One pass; the mean over batches of everything the objective logs."""
+        recipe = self.recipe
+        # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
+        set_seed(recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index)
+        self.sampler.epoch = self.epoch
+        for module in self.objective.modules.values():
+            module.train()
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] = self.schedule.rate
+        waiting: list[tuple[int, Tensor, dict[str, Tensor]]] = []
+        sums: dict[str, float] = {}
+        batches = 0
+        for batch in self.loader:
+            waiting.append((batches, batch.row, self._step(batch)))
+            batches += 1
+            if len(waiting) == CHECK_EVERY:
+                self._look(waiting, sums)
+            display.step()
+        self._look(waiting, sums)
+        return {name: value / batches for name, value in sums.items()}
+
+    def _step(self, batch: FringeDepth) -> dict[str, Tensor]:
+        logged: dict[str, Tensor] = {}
+        with self.accelerator.autocast():
+            steps = self.objective.steps(batch)
+            for name, loss, values in steps:
+                optimizer = self.optimizers[name]
+                optimizer.zero_grad(set_to_none=True)
+                self.accelerator.backward(loss)
+                optimizer.step()
+                logged |= values
+        return logged
+
+    def _look(self, waiting: list[tuple[int, Tensor, dict[str, Tensor]]], sums: dict[str, float]) -> None:
+        """Take in the losses of the last steps; stop at the first that is not finite or has run away."""
+        for number, rows, logged in waiting:
+            for name, value in logged.items():
+                found = float(value)
+                if name == "loss" and self.first_loss is None and math.isfinite(found):
+                    self.first_loss = max(found, 1e-6)
+                limit = DIVERGED * (self.first_loss or math.inf)
+                if not math.isfinite(found) or (name == "loss" and found > limit):
+                    what = "is not finite" if not math.isfinite(found) else f"is {DIVERGED:g} times the first one"
+                    samples = sorted({self.training.samples[row] for row in rows.tolist()})
+                    raise TrainingError(
+                        f"{self.out}: training diverged: {name} {what} ({found:.4g}) in epoch {self.epoch + 1}, batch "
+                        f"{number + 1}, samples {', '.join(samples)}. The last good state is kept "
+                        f"({self.epoch} epochs); lower the learning rate, or look at those samples (fpp-bench show)"
+                    )
+                sums[name] = sums.get(name, 0.0) + found
+        waiting.clear()
+
+    def _finish_epoch(self, losses: dict[str, float], began: float) -> None:
+        """Validate, set the rate of the next epoch, keep the best weights, save everything."""
+        mine = validate(self.objective, self.validation, self.recipe, self.accelerator, self.out)
+        scores = mine.mean(gather_object(mine.rows) if self.accelerator.num_processes > 1 else mine.rows)
+        rate = self.schedule.rate
+        loss = losses.pop("loss")
+        record = {
+            "epoch": self.epoch + 1, "learning_rate": rate, "training_loss": loss, **scores, **losses,
+            "seconds": round(perf_counter() - began, 3),
+        }  # fmt: skip
+        improved = not self.history or record["validation_loss"] < self.best["validation_loss"]
+        self.history.append(record)
+        self.schedule.step(record["validation_loss"])
+        if self.accelerator.is_main_process:
+            if improved:
+                self._keep_weights(record)
+            self._save()
+            history.write_log(self.out, self.history)
+        self.accelerator.wait_for_everyone()
+
+    def _keep_weights(self, record: history.Record) -> None:
+        network = self.accelerator.unwrap_model(self.objective.modules["network"], keep_torch_compile=False)
+        scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
+        config = model_config(self.recipe, network, self.training.source.fingerprint, record["epoch"], scores)
+        save_weights(self.out / WEIGHTS, network, config)
+
+    def _save(self) -> None:
+        tensors: dict[str, Tensor] = {}
+        for name, module in self.objective.modules.items():
+            bare = self.accelerator.unwrap_model(module, keep_torch_compile=False)
+            tensors |= {f"module.{name}.{key}": value for key, value in bare.state_dict().items()}
+            tensors |= optimizer_tensors(self.optimizers[name], f"optimizer.{name}")
+        seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
+        state: dict[str, Any] = {
+            "recipe": self.recipe.digest, "fingerprint": self.training.source.fingerprint, "history": self.history,
+            "schedule": self.schedule.state(), "first_loss": self.first_loss, "seconds": seconds,
+        }  # fmt: skip
+        save_checkpoint(self.out / CHECKPOINT, tensors, state)
+
+    resumed_at = 0
+
+    def _resume(self) -> None:
+        tensors, state = read_checkpoint(self.out / CHECKPOINT)
+        if (state["recipe"], state["fingerprint"]) != (self.recipe.digest, self.training.source.fingerprint):
+            raise TrainingError(f"{self.out / CHECKPOINT}: belongs to another recipe or dataset; give a new folder")
+        for name, module in self.objective.modules.items():
+            bare = self.accelerator.unwrap_model(module, keep_torch_compile=False)
+            prefix = f"module.{name}."
+            bare.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+            restore_optimizer(self.optimizers[name], tensors, f"optimizer.{name}")
+        self.schedule.restore(state["schedule"])
+        self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
+        self.resumed_at = len(self.history)
+
+
+def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
+    """Make ``out`` this recipe's folder, or see that it is."""
+    path = out / RECIPE
+    content = {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    except (OSError, ValueError) as error:
+        raise TrainingError(f"{out}: expected a training folder, or a new one ({error})") from None
+    if found is None:
+        if any(out.iterdir()):
+            raise TrainingError(f"{out}: holds files but no {RECIPE}; give a new or empty folder")
+        write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
+    elif found != content:
+        theirs = found.get("recipe", {}) if isinstance(found, dict) else {}
+        differs = [key for key, value in content["recipe"].items() if theirs.get(key) != value] or ["dataset"]
+        raise TrainingError(
+            f"{path}: was made for another training, which differs in {', '.join(differs)}; give another folder, or "
+            f"remove {out} to train anew"
+        )
+
+
+def _finished(out: Path) -> TrainingRun | None:
+    path = out / DONE
+    if not path.exists() or not (out / WEIGHTS).exists():
+        return None
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
+    except (OSError, ValueError, KeyError, TypeError):
+        raise TrainingError(f"{path}: is damaged; delete it, and the training is taken up where it stands") from None
+
+
+def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
+    return TrainingRun(out / WEIGHTS, epochs, best, seconds, finished, out / history.LOG_FILE, out / history.CURVE_FILE)

@@ -1,0 +1,254 @@
+"""Recipes: one YAML file a row of a table, each only what differs from the recipe it extends (paper Sections 5.3-5.6).
+
+A recipe says what is trained and how; a preset (``cpu``, ``paper``) at what image size, and what the machine at hand
+changes. Resolved, the two are a `Recipe`: every number that the training depends on, with one digest.
+"""
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from fpp_ml_bench.baselines.networks import NETWORKS
+from fpp_ml_bench.errors import RecipeError, SubmissionError
+from fpp_ml_bench.evaluation.schema import Positive, StrictModel, Text, problems_of
+from fpp_ml_bench.evaluation.submission_file import read_plain_file
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.frames import CONFIGS
+from fpp_ml_bench.normalisation import Normalisation
+
+RECIPES = Path(__file__).resolve().parent.parent / "recipes"
+PRESETS = ("cpu", "paper")
+_ROWS: dict[str, tuple[str, ...]] = {
+    "normalization": ("raw", "global", "individual"),
+    "background_removed": ("raw", "global", "individual"),
+    "multi_frame": ("frame0", "horizontal", "vertical", "sinusoidal", "all"),
+    "loss": (
+        "rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse_0.5", "hybrid_rmse_0.7", "hybrid_rmse_0.9",
+        "hybrid_l1_0.5", "hybrid_l1_0.7", "hybrid_l1_0.9",
+    ),
+    "architecture": ("unet", "transunet", "resunet", "pix2pix", "hformer"),
+}  # fmt: skip
+"""The paper's order; ``hformer`` is the conference version's."""
+TABLES = tuple(_ROWS)
+_EXTENDS = "extends"
+_LONGEST_CHAIN = 8
+_NETWORK_TITLES = {
+    "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
+}  # fmt: skip
+
+
+class RmsProp(StrictModel):
+    """``torch.optim.RMSprop``."""
+
+    name: Literal["rmsprop"]
+    learning_rate: Positive
+    alpha: Annotated[float, Field(ge=0, lt=1)]
+    weight_decay: Annotated[float, Field(ge=0)]
+
+
+class Plateau(StrictModel):
+    """The rate times ``factor`` once the validation loss has not fallen for ``patience`` epochs; ends at ``minimum``."""
+
+    name: Literal["plateau"]
+    factor: Annotated[float, Field(gt=0, lt=1)]
+    patience: Annotated[int, Field(ge=0)]
+    minimum: Positive
+
+
+class Linear(StrictModel):
+    """The rate constant for ``constant`` epochs, then down to zero in a line over ``decay`` epochs; then done."""
+
+    name: Literal["linear"]
+    constant: Annotated[int, Field(ge=0)]
+    decay: Annotated[int, Field(ge=1)]
+
+
+class Loss(StrictModel):
+    """A name of `fpp_ml_bench.baselines.training.losses.LOSSES` or ``gan``; hybrids need ``alpha``."""
+
+    name: Literal["rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1", "gan"]
+    alpha: Annotated[float, Field(ge=0, le=1)] | None = None
+
+    @model_validator(mode="after")
+    def _alpha(self) -> "Loss":
+        hybrid = self.name.startswith("hybrid")
+        if hybrid != (self.alpha is not None):
+            raise ValueError(f"{self.name} {'needs' if hybrid else 'takes no'} alpha")
+        return self
+
+    @property
+    def label(self) -> str:
+        return self.name if self.alpha is None else f"{self.name}_{self.alpha:g}"
+
+
+class Recipe(StrictModel):
+    """Everything that a training depends on.
+
+    ``size`` is the image's width and height in px. ``pairs_per_epoch`` pairs of frame and depth are drawn anew
+    for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``options`` go to `networks.build`.
+    """
+
+    preset: Text
+    size: Annotated[int, Field(ge=16)]
+    network: Text
+    width: Annotated[int, Field(ge=1)]
+    options: dict[Text, bool | int | float | Text] = Field(default_factory=dict)
+    normalisation: Normalisation
+    background_removed: bool
+    frames: Text
+    loss: Loss
+    optimizer: RmsProp
+    schedule: Annotated[Plateau | Linear, Field(discriminator="name")]
+    batch: Annotated[int, Field(ge=1)]
+    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    max_epochs: Annotated[int, Field(ge=1)]
+    pairs_per_epoch: Annotated[int, Field(ge=1)] | None
+    validation_pairs: Annotated[int, Field(ge=1)] | None
+    precision: Literal["fp32", "bf16"]
+    compile: bool
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Recipe":
+        if self.network not in NETWORKS:
+            raise ValueError(f"network: expected one of {', '.join(NETWORKS)}, got {self.network!r}")
+        if self.frames not in CONFIGS:
+            raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
+        if (self.loss.name == "gan") != (self.network == "pix2pix"):
+            raise ValueError("loss gan and network pix2pix belong together")
+        return self
+
+    @property
+    def data_config(self) -> str:
+        """Which frames are training pairs of their own: a name of `fpp_ml_bench.frames.CONFIGS`."""
+        return self.frames
+
+    @property
+    def alpha(self) -> float | None:
+        return self.loss.alpha
+
+    @property
+    def name(self) -> str:
+        """What runs and weights are called; rows that train the same thing have the same."""
+        parts = [self.network, self.normalisation, self.loss.label]
+        parts += ["bgremoved"] if self.background_removed else []
+        parts += [self.frames] if self.frames != "single_shot" else []
+        return "-".join(parts)
+
+    @property
+    def title(self) -> str:
+        """For people: network, normalisation, loss and what else is not the rule."""
+        parts = [_NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
+        parts += ["background removed"] if self.background_removed else []
+        parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
+        return ", ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, text and mappings; `recipe_from_dict` is the way back."""
+        return self.model_dump(mode="json")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything above, 64 hex digits."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+
+def table_rows(table: str) -> tuple[str, ...]:
+    """Row names of a table in the paper's order. RecipeError for an unknown table."""
+    if table not in _ROWS:
+        raise RecipeError(f"expected a table out of {', '.join(TABLES)}, got {printable(table)!r}")
+    return _ROWS[table]
+
+
+def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
+    """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset.
+
+    Raises RecipeError for a recipe or preset that there is not, an unknown key, an impossible value, a chain of
+    ``extends`` that does not end.
+    """
+    path = _recipe_path(name_or_path)
+    content = _resolved(path, 0)
+    network = content.get("network")
+    if network not in NETWORKS:
+        raise RecipeError(f"{path}: network: expected one of {', '.join(NETWORKS)}, got {printable(repr(network), 60)}")
+    scale = _preset(preset)
+    merged = _merge(_merge(content, scale["every"], pick=True), scale["networks"].get(network, {}))
+    return recipe_from_dict({"preset": preset, "size": scale["size"], **merged}, path)
+
+
+def recipe_from_dict(content: dict[str, Any], path: Path = Path("recipe")) -> Recipe:
+    """A `Recipe` of its plain mapping; RecipeError names ``path`` and every key that is wrong."""
+    try:
+        return Recipe.model_validate(content)
+    except ValidationError as error:
+        lines = "\n  ".join(problems_of(error))
+        raise RecipeError(f"{printable(str(path), 500)} is no valid recipe:\n  {lines}") from None
+
+
+def _recipe_path(name_or_path: str | Path) -> Path:
+    text = str(name_or_path)
+    if text.endswith((".yaml", ".yml")):
+        path = Path(text)
+        if not path.is_file():
+            raise RecipeError(f"{printable(text, 500)}: there is no such recipe file")
+        return path
+    path = RECIPES / f"{text}.yaml"
+    if ".." in Path(text).parts or Path(text).is_absolute() or not path.is_file():
+        from difflib import get_close_matches
+
+        names = [*(f"{table}/{row}" for table in TABLES for row in _ROWS[table]), "base"]
+        near = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
+        raise RecipeError(
+            f"no recipe {printable(text, 100)!r}; near it: {', '.join(near)}. Give one of the shipped names (see "
+            "fpp-bench reproduce --list) or a .yaml file"
+        )
+    return path
+
+
+def _resolved(path: Path, depth: int) -> dict[str, Any]:
+    """Content of a recipe over that of the one it extends."""
+    if depth > _LONGEST_CHAIN:
+        raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
+    content = _read(path)
+    parent = content.pop(_EXTENDS, None)
+    if parent is None:
+        return content
+    if not isinstance(parent, str):
+        raise RecipeError(
+            f"{path}: extends: expected the name of a recipe, like base, got {printable(repr(parent), 60)}"
+        )
+    beside = path.parent / parent
+    return _merge(_resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1), content)
+
+
+def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:
+    """``above`` over ``below``; mappings key by key, but one with a ``name`` of its own, or ``options``, as a whole.
+
+    ``pick``: keys of nested mappings that ``below`` does not know are left out (what a preset says of another kind of
+    schedule).
+    """
+    merged = dict(below)
+    for key, value in above.items():
+        old = below.get(key)
+        if isinstance(value, dict) and isinstance(old, dict) and "name" not in value and key != "options":
+            merged[key] = {**old, **{k: v for k, v in value.items() if not pick or k in old}}
+        else:
+            merged[key] = value
+    return merged
+
+
+@cache
+def _preset(name: str) -> dict[str, Any]:
+    if name not in PRESETS:
+        raise RecipeError(f"expected a preset out of {', '.join(PRESETS)}, got {printable(name)!r}")
+    return _read(RECIPES / "presets" / f"{name}.yaml")
+
+
+def _read(path: Path) -> dict[Any, Any]:
+    try:
+        return read_plain_file(path, "'normalisation: raw'")
+    except SubmissionError as error:
+        raise RecipeError(str(error)) from None
