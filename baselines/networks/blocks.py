@@ -4,6 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fpp_ml_bench.baselines.networks.instance_norm import InstanceNorm
+
 
 class DoubleConvolution(nn.Sequential):
     """Twice: 3x3 convolution without bias, affine instance normalisation, ReLU. (B, c_in, h, w) -> (B, c_out, h, w)."""
@@ -11,10 +13,10 @@ class DoubleConvolution(nn.Sequential):
     def __init__(self, c_in: int, c_out: int) -> None:
         super().__init__(
             nn.Conv2d(c_in, c_out, 3, padding=1, bias=False),
-            nn.InstanceNorm2d(c_out, affine=True),
+            InstanceNorm(c_out, affine=True),
             nn.ReLU(inplace=True),
             nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
-            nn.InstanceNorm2d(c_out, affine=True),
+            InstanceNorm(c_out, affine=True),
             nn.ReLU(inplace=True),
         )
 

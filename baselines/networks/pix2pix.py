@@ -4,6 +4,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork, initialise_normal, whole
+from fpp_ml_bench.baselines.networks.instance_norm import InstanceNorm
 
 DOWNSAMPLINGS = 4
 RESIDUAL_BLOCKS = 9
@@ -23,10 +24,10 @@ class GeneratorBlock(nn.Module):
         super().__init__()
         self.residual = nn.Sequential(
             _convolution(channels, channels, 3, reflect=True),
-            nn.InstanceNorm2d(channels),
+            InstanceNorm(channels),
             nn.ReLU(inplace=True),
             _convolution(channels, channels, 3, reflect=True),
-            nn.InstanceNorm2d(channels),
+            InstanceNorm(channels),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -40,7 +41,7 @@ class Generator(nn.Sequential):
         widths = [width * 2**level for level in range(DOWNSAMPLINGS + 1)]
 
         def normed(layer: nn.Module, channels: int) -> nn.Sequential:
-            return nn.Sequential(layer, nn.InstanceNorm2d(channels), nn.ReLU(inplace=True))
+            return nn.Sequential(layer, InstanceNorm(channels), nn.ReLU(inplace=True))
 
         super().__init__()
         self.stem = normed(_convolution(1, width, 7, reflect=True), width)
@@ -124,7 +125,7 @@ def _patch_judge(width: int, layers: int) -> nn.ModuleList:
         stages.append(
             nn.Sequential(
                 nn.Conv2d(widths[level - 1], widths[level], 4, 2 if level < layers else 1, 2),
-                nn.InstanceNorm2d(widths[level]),
+                InstanceNorm(widths[level]),
                 nn.LeakyReLU(LEAK, inplace=True),
             )
         )
