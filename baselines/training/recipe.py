@@ -51,7 +51,7 @@ class RmsProp(StrictModel):
 
 
 class Plateau(StrictModel):
-    """The rate times ``factor`` once the validation loss has not fallen for ``patience`` epochs; ends at ``minimum``."""
+    """The rate times ``factor`` after more than ``patience`` epochs without a lower loss; over at ``minimum``."""
 
     name: Literal["plateau"]
     factor: Annotated[float, Field(gt=0, lt=1)]
@@ -89,7 +89,8 @@ class Recipe(StrictModel):
     """Everything that a training depends on.
 
     ``size`` is the image's width and height in px. ``pairs_per_epoch`` pairs of frame and depth are drawn anew
-    for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``options`` go to `networks.build`.
+    for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``options`` go to
+    `networks.build`.
     """
 
     preset: Text
