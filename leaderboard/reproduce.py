@@ -3,21 +3,22 @@
 Trainings are never thrown away: a finished one is used, a stopped one taken up, one of another recipe refused.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench.baselines.model import load
+from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.training.engine import TrainingRun, train
 from fpp_ml_bench.errors import SubmissionError, TrainingError
 from fpp_ml_bench.leaderboard.reproduce_data import the_dataset
 from fpp_ml_bench.leaderboard.reproduce_frames import all_frames_that_hold, score_all_frames, write_all_frames
-from fpp_ml_bench.leaderboard.reproduce_lines import table_lines
+from fpp_ml_bench.leaderboard.reproduce_lines import MAIN_KEY, table_lines
 from fpp_ml_bench.leaderboard.reproduce_method import named_method
 from fpp_ml_bench.leaderboard.reproduce_order import orderings
-from fpp_ml_bench.leaderboard.reproduce_plan import ORACLE, Folders, Job, planned, variants
-from fpp_ml_bench.leaderboard.reproduce_row import file_sha256, make_row, row_that_holds
+from fpp_ml_bench.leaderboard.reproduce_plan import Folders, Job, planned, variants
+from fpp_ml_bench.leaderboard.reproduce_row import make_row, row_that_holds
 from fpp_ml_bench.leaderboard.reproduce_table import table_markdown
 from fpp_ml_bench.leaderboard.reproduce_training import (
     check_machine,
@@ -120,28 +121,49 @@ def _time_left(taken: Sequence[float], jobs: Sequence[Job], folders: Folders) ->
 def _score(job: Job, run: TrainingRun, wish: Wish, opened: DatasetFolder) -> None:
     """Weights with heads, rows and scores on all frames of one training; what holds is kept if so wished."""
     folders, recipe = wish.folders, job.recipe
-    weights = finished_weights(job, run, opened, folders, wish.only_missing)
-    digest = file_sha256(weights)
-    model = load(weights)
+    model = load(finished_weights(job, run, opened, folders, wish.only_missing))
+    if job.all_frames:
+        _score_all_frames(job, model, wish, opened)
     for variant in variants(recipe):
         name = folders.row_name(recipe, variant)
-        if wish.only_missing and row_that_holds(folders.row(recipe, variant), opened, digest) is not None:
+        if wish.only_missing and row_that_holds(folders.row(recipe, variant), opened, model.sha256) is not None:
             wish.say(f"  {name}: holds, kept")
             continue
-        method = named_method(job, variant, model, digest, run.epochs, run.seconds)
-        entry = make_row(opened, method, variant.mode, name, folders)
-        value = entry.value("object_mae_mm")
-        wish.say(f"  {name}: object MAE {'-' if value is None else f'{value:.2f} mm'}, {entry.result.track}")
-    if job.all_frames:
-        path = folders.all_frames(recipe)
-        if wish.only_missing and all_frames_that_hold(path, opened.fingerprint, digest) is not None:
-            return
-        frames = opened.sequence.config(recipe.data_config)
-        found = score_all_frames(
-            opened, model.predict_representation, frames, "normalised", ORACLE.mode, recipe.name, digest
-        )
-        write_all_frames(found, path)
-        wish.say(f"  {path.stem}: object MAE {found.metrics.object_mae_mm or 0:.2f} mm on {found.pairs} pairs")
+        with _threads_kept():
+            entry = make_row(opened, named_method(job, variant, model, run), name, folders)
+        value = entry.value(MAIN_KEY)
+        wish.say(f"  {name}: object MAE {'-' if value is None else f'{value:.2f} mm'}, {entry.result.track} track")
+
+
+def _score_all_frames(job: Job, model: Model, wish: Wish, opened: DatasetFolder) -> None:
+    """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
+    path = wish.folders.all_frames(job.recipe)
+    if wish.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+        return
+    found = score_all_frames(
+        opened,
+        lambda frame: model.predict_representation([frame])[0],
+        opened.sequence.config(job.recipe.data_config),
+        "normalised",
+        "paper-individual",
+        job.recipe.name,
+        model.sha256,
+    )
+    write_all_frames(found, path)
+    value = found.metrics.object_mae_mm
+    wish.say(f"  {path.stem}: object MAE {'-' if value is None else f'{value:.2f} mm'} on {found.pairs} pairs")
+
+
+@contextmanager
+def _threads_kept() -> Iterator[None]:
+    """A method of a network sets torch's threads for the whole process; the next training wants them all again."""
+    import torch
+
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _write_table(table: str, wish: Wish, outcome: Outcome) -> Path:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.model import Model
 from fpp_ml_bench.baselines.network_method import NetworkMethod
+from fpp_ml_bench.baselines.training.engine import TrainingRun
 from fpp_ml_bench.leaderboard.reproduce_plan import Job, Variant
 
 
@@ -33,21 +34,13 @@ class NamedMethod:
         return depth
 
 
-def named_method(
-    job: Job, variant: Variant, model: Model, weights_sha256: str, epochs: int, seconds: float
-) -> NamedMethod:
-    """The method of one row. ``epochs`` and ``seconds`` are what the training took."""
+def named_method(job: Job, variant: Variant, model: Model, run: TrainingRun) -> NamedMethod:
+    """The method of one row of ``job``, whose training was ``run``."""
     recipe = job.recipe
-    flavour = {None: "oracle" if recipe.normalisation == "individual" else "metric"}.get(variant.range_from, "metric")
-    method = NetworkMethod(model, flavour=flavour, range_from=variant.range_from or "predicted")
-    title = f"{recipe.title}{variant.words} ({recipe.preset} preset)"
-    about = {
-        "recipe": recipe.name,
+    method = NetworkMethod(model, variant.depth_range)
+    about: dict[str, str | int | float | bool | None] = {
         "recipe_digest": recipe.digest,
-        "preset": recipe.preset,
-        "seed": recipe.seed,
-        "epochs": epochs,
-        "training_seconds": round(seconds, 1),
-        "weights_sha256": weights_sha256,
+        "epochs_trained": run.epochs,
+        "training_seconds": round(run.seconds, 1),
     }
-    return NamedMethod(method, title, about)
+    return NamedMethod(method, f"{method.title} ({recipe.preset} preset)", about)

@@ -7,6 +7,7 @@ training and one row of the leaderboard.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
 from fpp_ml_bench.errors import RecipeError
@@ -46,22 +47,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to use a trained network: what its row file's name ends in, its title says, and how it is scored.
-
-    ``range_from`` is None for a network's bare output; ``predicted`` by the head in its weights file; ``mean``, the
-    training samples' mean range.
-    """
+    """One way to use a trained network: what its row file's name ends in, and the range that makes mm of its output
+    (see `fpp_ml_bench.baselines.network_method.NetworkMethod`)."""
 
     suffix: str
-    words: str
-    mode: str
-    range_from: str | None
+    depth_range: Literal["oracle", "predicted", "mean"] | None
 
 
-METRIC = Variant("", "", "standard", None)
-ORACLE = Variant("", "", "paper-individual", None)
-PREDICTED = Variant("-range-predicted", ", range predicted", "standard", "predicted")
-MEAN = Variant("-range-mean", ", range mean", "standard", "mean")
+METRIC, ORACLE = Variant("", None), Variant("", "oracle")
+PREDICTED, MEAN = Variant("-range-predicted", "predicted"), Variant("-range-mean", "mean")
 
 
 def variants(recipe: Recipe) -> tuple[Variant, ...]:

@@ -26,7 +26,7 @@ REPEATS = 20
 PROVENANCE = "measured here"
 
 
-def make_row(opened: DatasetFolder, method: "NamedMethod", mode: str, name: str, folders: Folders) -> Entry:
+def make_row(opened: DatasetFolder, method: "NamedMethod", name: str, folders: Folders) -> Entry:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), write the row.
 
     Whatever an earlier run left under this name is replaced at the end, not before; an interrupted one leaves nothing
@@ -40,7 +40,7 @@ def make_row(opened: DatasetFolder, method: "NamedMethod", mode: str, name: str,
     shutil.rmtree(making, ignore_errors=True)
     predict_split(opened, method, SPLIT, making)
     write_timing(making / SUBMISSION_FILE, time_method(opened, method, SPLIT, repeats=REPEATS))
-    result = evaluate(making, opened, SPLIT, TARGET, mode=mode)
+    result = evaluate(making, opened, SPLIT, TARGET, mode=method.mode)
     for folder in (folders.rows, folders.result(name).parent):
         folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(predictions, ignore_errors=True)

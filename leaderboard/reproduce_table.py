@@ -46,7 +46,7 @@ def columns(preset: str) -> tuple[Column, ...]:
         Column(f"Object MAE with the range predicted, {here}", _twin(PREDICTED)),
         Column(f"Object MAE with the range's training mean, {here}", _twin(MEAN)),
         Column("Parameters", _parameters, terminal=False),
-        Column("Epochs", lambda line: _setting(line, "epochs")),
+        Column("Epochs", lambda line: _setting(line, "epochs_trained")),
         Column("Training, s", lambda line: _setting(line, "training_seconds")),
         Column("Latency, ms", _latency),
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from fpp_ml_bench.baselines.training.engine import DONE, RECIPE, TrainingRun
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.leaderboard.reproduce_plan import Folders, Job, variants
+from fpp_ml_bench.leaderboard.reproduce_plan import PREDICTED, Folders, Job, variants
 from fpp_ml_bench.leaderboard.reproduce_row import file_sha256
 from fpp_ml_bench.loaders.manifest import write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
@@ -86,7 +86,7 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
     if keep and _made_from(record, target, source):
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    if any(variant.range_from for variant in variants(job.recipe)):
+    if PREDICTED in variants(job.recipe):
         _add_heads(run.weights, opened, target)
     else:
         partial = target.with_suffix(".partial")
@@ -98,14 +98,12 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
 
 
 def _add_heads(weights: Path, opened: DatasetFolder, target: Path) -> None:
-    from fpp_ml_bench.baselines.networks import build
+    from fpp_ml_bench.baselines.model import load
     from fpp_ml_bench.baselines.range_heads import fit_heads
-    from fpp_ml_bench.baselines.weights_file import read_weights, save_weights
+    from fpp_ml_bench.baselines.weights_file import save_weights
 
-    config, tensors = read_weights(weights)
-    network = build(config.network, **config.options)
-    network.load_state_dict(tensors)
-    save_weights(target, network, config, fit_heads(network, config, opened.path))
+    model = load(weights)
+    save_weights(target, model.network, model.config, fit_heads(model.network, model.config, opened.path))
 
 
 def _made_from(record: Path, target: Path, source: str) -> bool:
