@@ -1,17 +1,26 @@
 """The methods that ``fpp-bench predict`` knows, by name, and what each of them must offer."""
 
+import platform
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.rig import Rig
 
 
 class Method(Protocol):
-    """One frame stack in, one depth map out."""
+    """One frame stack in, one depth map out.
+
+    A method may have besides: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
+    frames that are 0 outside the object; default no), ``seeds``, ``packages`` whose versions matter (default numpy and
+    numba), ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), and ``mode`` and
+    ``target``, how its row is scored.
+    """
 
     @property
     def name(self) -> str:
@@ -37,7 +46,8 @@ class Method(Protocol):
         """Depth float32 (H, W) in mm, 0 = background or not measured; frames not in `frames_used` are None."""
 
 
-METHODS = ("classical",)
+METHODS = ("classical", "phase")
+"""The methods that need no trained weights of a network; with those it is a `NetworkMethod`."""
 
 
 def method(name: str, rig: Rig, **options: Any) -> Method:
@@ -46,4 +56,16 @@ def method(name: str, rig: Rig, **options: Any) -> Method:
         from fpp_ml_bench.baselines.classical import ClassicalMethod
 
         return ClassicalMethod(rig, **options)
+    if name == "phase":
+        from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+
+        made: Method = PhaseMethod(rig, **options)
+        return made
     raise FppBenchError(f"unknown method {name!r}; there are {', '.join(METHODS)}")
+
+
+def software_of(method: Method) -> dict[str, str]:
+    """Versions of this package, Python and the packages that ``method`` computes with."""
+    packages: tuple[str, ...] = getattr(method, "packages", ("numpy", "numba"))
+    versions = {package: version(package) for package in packages}
+    return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}

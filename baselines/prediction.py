@@ -1,10 +1,8 @@
 """Running a method over a split: one prediction a sample, timed, and a submission that says how it was made."""
 
-import platform
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.baselines.methods import Method, software_of
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
 from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.pixel_sets import object_mask
 
 PREDICTION_SUFFIX = ".npy"
 
@@ -33,7 +31,8 @@ class Run:
 def predict_split(
     opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
 ) -> Run:
-    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) mm, and ``submission.yaml`` last.
+    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or
+    the method's own units, and ``submission.yaml`` last.
 
     A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
     run that is not counted warms caches and compiled code up. The submission gives the median over the split.
@@ -59,10 +58,16 @@ def predict_split(
 
 
 def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
-    """The sequence as the method may see it: its own frames, read into memory, and None for every other."""
+    """The sequence as the method may see it: its own frames, read into memory, and None for every other.
+
+    For a method that uses the ground-truth mask they are 0 outside the object (paper Section 5.3.4).
+    """
     frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
     for index in method.frames_used:
-        frames[index] = opened.frame(sample, index).copy()
+        frame = opened.frame(sample, index).copy()
+        if getattr(method, "uses_ground_truth_mask", False):
+            frame *= object_mask(opened.depth_mm(sample))
+        frames[index] = frame
     return frames
 
 
@@ -100,18 +105,16 @@ def _write_submission(path: Path, method: Method, seconds_per_sample: float) -> 
     content: dict[str, Any] = {
         "name": method.title,
         "method": method.name,
-        "units": "mm",
+        "units": getattr(method, "units", "mm"),
         "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
+        **({"uses_ground_truth_mask": True} if getattr(method, "uses_ground_truth_mask", False) else {}),
         "seconds_per_sample": float(f"{seconds_per_sample:.6g}"),
         "seconds_source": "measured",
         "hardware": describe_hardware().to_dict(),
-        "software": {
-            "fpp_ml_bench": __version__,
-            "python": platform.python_version(),
-            **{package: version(package) for package in ("numpy", "numba")},
-        },
+        "software": software_of(method),
         "settings": dict(method.settings),
+        **({"seeds": dict(seeds)} if (seeds := getattr(method, "seeds", {})) else {}),
     }
     temporary = path.with_suffix(".tmp")
     temporary.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")

@@ -2,12 +2,10 @@
 
 import ctypes
 import gc
-import platform
 import resource
 import statistics
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.baselines.methods import Method, software_of
 from fpp_ml_bench.baselines.prediction import captured_frames
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.evaluation.timing import HardwareInfo, Timing
@@ -100,7 +97,7 @@ def time_method(
         image_size=list(opened.size),
         device=device,
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
-        software=_software(device),
+        software=software_of(method),
     )
 
 
@@ -115,15 +112,6 @@ def _batch_runner(method: Method) -> tuple[Callable[[list[Frames]], Any], bool]:
     if at_once is not None:
         return at_once, True
     return lambda pictures: [method.predict(frames) for frames in pictures], False
-
-
-def _software(device: str) -> dict[str, str]:
-    packages = ["numpy", "numba", *(["torch"] if "torch" in sys.modules else [])]
-    return {
-        "fpp_ml_bench": __version__,
-        "python": platform.python_version(),
-        **{name: version(name) for name in packages},
-    }
 
 
 def _peak_mib() -> float:

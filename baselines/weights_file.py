@@ -1,7 +1,7 @@
 """Trained weights on disk: one safetensors file that holds the tensors and the configuration that makes sense of them.
 
 The file's metadata is ``format`` (``fpp-ml-bench``), ``version`` and ``config``, a `ModelConfig` as JSON. Tensors whose
-name starts with ``range_head.`` belong to the range heads (`fpp_ml_bench.baselines.range_heads`), the others are the
+name starts with ``range_head.`` belong to the range heads (`fpp_ml_bench.baselines.metric_twin`), the others are the
 network's ``state_dict``. Pickles (``.pt``, ``.pth``) are never opened: to open one is to run what is in it.
 
 The same tensors and configuration give the same bytes.

@@ -11,7 +11,8 @@ SchemaVersion = Literal["2.0.0"]
 RESULT_SCHEMA_VERSION: SchemaVersion = "2.0.0"
 
 Target = Literal["depth", "depth_exact"]
-Track = Literal["metric", "oracle range"]
+Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]
+"""What of the ground truth of the very samples it is scored on a method was given; see PROTOCOL.md."""
 Mode = Literal["standard", "paper-individual"]
 Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)

@@ -52,9 +52,9 @@ def differences(result: Result, folder: Path, dataset: ScoredDataset) -> list[st
 def _submission(result: Result, again: Result) -> list[str]:
     one, two = result.submission.model_dump(), again.submission.model_dump()
     return [
-        f"submission.{key}: {_shown(one[key])} in the result, {_shown(two[key])} in submission.yaml"
-        for key in one
-        if key not in _TIME_KEYS and one[key] != two[key]
+        f"submission.{key}: {_shown(one.get(key))} in the result, {_shown(two.get(key))} in submission.yaml"
+        for key in dict.fromkeys((*one, *two))
+        if key not in _TIME_KEYS and one.get(key) != two.get(key)
     ]
 
 

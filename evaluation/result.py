@@ -88,7 +88,7 @@ class Result(StrictModel):
             )
         if len({row.sample for row in self.per_sample}) != len(self.per_sample):
             raise ValueError("per_sample names a sample twice")
-        if self.mode == "paper-individual" and self.track != "oracle range":
+        if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
         for row in self.per_sample:
             check_sample(row, height * width)

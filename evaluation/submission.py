@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
@@ -17,7 +17,9 @@ class Submission(StrictModel):
 
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
-    on. ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
+    on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (as a network is whose input is
+    blackened outside it); false is never written, so that files from before there was this key stay as they are.
+    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
     """
 
     name: Text
@@ -26,6 +28,7 @@ class Submission(StrictModel):
     png_mm_per_level: Positive | None = None
     frames_used: list[Count]
     uses_ground_truth_range: bool
+    uses_ground_truth_mask: bool = False
     seconds_per_sample: Positive | None
     seconds_source: Literal["measured", "self-reported"] | None = None
     hardware: HardwareInfo | None = None
@@ -51,10 +54,19 @@ class Submission(StrictModel):
             raise ValueError("timing.frames is not the number of frames_used; time this very method")
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        if not self.uses_ground_truth_mask:
+            content.pop("uses_ground_truth_mask", None)
+        return content
+
     @property
     def track(self) -> Track:
-        """``metric``, or ``oracle range`` for a method that was given the test sample's depth range."""
-        return "oracle range" if self.uses_ground_truth_range else "metric"
+        """``metric``, or what of the test samples' ground truth the method was given: range, object mask or both."""
+        if self.uses_ground_truth_range:
+            return "oracle range + mask" if self.uses_ground_truth_mask else "oracle range"
+        return "oracle mask" if self.uses_ground_truth_mask else "metric"
 
 
 def read_submission(folder: Path) -> Submission:

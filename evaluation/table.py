@@ -89,8 +89,10 @@ def _notes(result: Result) -> Text:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
     if result.samples_without_background:
         lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
-    if result.track == "oracle range":
+    if result.submission.uses_ground_truth_range:
         lines.append("Oracle range: the method was given depth_min and depth_max of these very samples.")
+    if result.submission.uses_ground_truth_mask:
+        lines.append("Oracle mask: the method was given which pixels of these very samples are object.")
     few = caution(len(result.per_object))
     if few:
         lines.append(few)

@@ -26,6 +26,12 @@ from fpp_ml_bench.loaders.manifest import write_atomically
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
 _HERE = Path(__file__).resolve().parent
 _OURS = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
+GIVEN = {
+    "metric": "",
+    "oracle mask": "the object mask",
+    "oracle range": "the depth range",
+    "oracle range + mask": "the depth range and the object mask",
+}
 _FRAME_LIMITS = (1, 2, 12, 25)
 
 
@@ -111,11 +117,8 @@ def _filters(groups: Sequence[Group]) -> str:
 def _group_section(group: Group, slugs: dict[int, str], number: int) -> str:
     data = f"{group.dataset_name} ({group.key.fingerprint[:8]}), protocol {group.key.protocol_version}"
     objects = {part.object for row in group.rows for part in row.entry.result.per_object}
-    oracle = (
-        "<p>These methods were given the depth range of the very samples they are scored on.</p>"
-        if group.key.track == "oracle range"
-        else ""
-    )
+    given = GIVEN[group.key.track]
+    oracle = f"<p>These methods were given {given} of the very samples they are scored on.</p>" if given else ""
     mode = "" if group.key.mode == "standard" else f"; mode {group.key.mode}"
     samples = group.rows[0].entry.result.dataset.samples
     front = ", ".join(escaped(row.entry.name, 80) for row in front_rows(group)) or "nobody yet"

@@ -64,5 +64,10 @@ def task_of(result: Result, name: str) -> Task:
             f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
             f"on {result.dataset.split} against {result.target} in {result.mode} mode; score the predictions so first"
         )
+    if result.submission.uses_ground_truth_mask:
+        raise PublishError(
+            f"{name}: the Hub's benchmark has no task for the {result.track} track (the method was given the object "
+            "mask of the test samples); publish a result of a method that finds the object itself"
+        )
     single = set(result.submission.frames_used) <= {SINGLE_SHOT_FRAME}
     return next(task for task in TASKS if (task.single_shot, task.track) == (single, result.track))

@@ -90,7 +90,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
             depth_mm = self.source.depth_mm(sample)
             measured = self.source.measured(sample)
             low, high = measured["depth_min_mm"], measured["depth_max_mm"]
-            _unit_range(self.source.frame(sample, frame), fringes[place, 0])
+            unit_range(self.source.frame(sample, frame), fringes[place, 0])
             if self.background_removed:
                 fringes[place, 0] *= object_mask(depth_mm)
             normalise(depth_mm, self.normalisation, low, high, out=depths[place, 0])
@@ -119,7 +119,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
             yield self.read(indices, FringeDepth(*(tensor[: len(indices)] for tensor in buffer)))
 
 
-def _unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
+def unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
     """Grey levels / 255 into ``out``: one product with the float32 reciprocal, within one unit in the last place."""
     factor = np.float32(1 / GREY_LEVELS)
     if numba_enabled():

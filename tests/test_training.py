@@ -14,7 +14,7 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import CONFIGS, PAPER_SEQUENCE
 from fpp_ml_bench.loaders.build import build, plan_build
 from fpp_ml_bench.loaders.settings import BuildSettings
-from fpp_ml_bench.loaders.training import FringeDepthDataset, _unit_range
+from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
 from fpp_ml_bench.rig import paper_rig
 
 
@@ -86,7 +86,7 @@ def test_grey_levels_become_the_unit_range(monkeypatch, switch):
     monkeypatch.setenv(SWITCH, switch)
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
     out = np.full((16, 16), np.nan, np.float32)
-    _unit_range(grey, out)
+    unit_range(grey, out)
     np.testing.assert_allclose(out, grey.astype(np.float64) / 255, rtol=2**-23)
     assert out[0, 0] == 0 and out[15, 15] == 1
 

@@ -1,34 +1,117 @@
-"""Options that choose a method's settings: the same for ``predict`` and ``time``."""
+"""Which method, and its settings: the same for ``predict`` and ``time``."""
 
 import argparse
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.methods import Method
     from fpp_ml_bench.loaders.store import DatasetFolder
 
+METHOD_HELP = (
+    "classical (N-step phase, Gray-code order, triangulation), phase (single-shot phase), the name of weights that "
+    "come with the package, a .safetensors file, or a .yaml recipe that has been trained"
+)
+_RECIPE_SUFFIXES = (".yaml", ".yml")
+
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--threads`` and the options of each method."""
+    """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
     classical = parser.add_argument_group("classical")
     classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
     classical.add_argument(
         "--direction",
         choices=("horizontal", "vertical", "both"),
-        default="both",
         help="fringes to use: one direction is enough for a depth (default: both)",
     )
+    network = parser.add_argument_group("trained networks")
+    network.add_argument(
+        "--range",
+        dest="depth_range",
+        choices=("oracle", "predicted", "mean"),
+        help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
+        "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
+    )
+    network.add_argument("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
+    network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
 def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
-    """The method that ``args`` name, for the rig of ``opened``. Raises FppBenchError for one that there is not."""
+    """The method that ``args`` name, for the rig of ``opened``. Raises FppBenchError for one that there is not, and for
+    an option that it does not have."""
     from fpp_ml_bench.baselines.methods import METHODS, method
     from fpp_ml_bench.errors import PredictionError
 
-    if args.method not in METHODS:
-        raise PredictionError(f"unknown method {args.method!r}; there are {', '.join(METHODS)}")
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
+    kind = args.method if args.method in METHODS else "network"
+    for other, options in _OPTIONS.items():
+        given = [option for option in options if getattr(args, option) is not None]
+        if other != kind and given:
+            raise PredictionError(
+                f"{_flag(given[0])} is an option of {_KINDS[other]}, not of {args.method}; leave it out"
+            )
+    if kind == "network":
+        return _network(args, opened)
+    return method(kind, opened.rig, **_MAKERS[kind](args, opened))
+
+
+def weights_of_recipe(recipe: Path) -> Path:
+    """The weights file that training ``recipe`` left. Raises FppBenchError where there is none."""
+    from fpp_ml_bench.errors import RecipeError
+
+    raise RecipeError(f"{recipe}: a recipe has no weights of its own; train it, and give the .safetensors file")
+
+
+def _network(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+    from fpp_ml_bench.baselines.methods import METHODS
+    from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
+    from fpp_ml_bench.errors import PredictionError, WeightsError
+
+    name = args.method
+    try:
+        path = weights_of_recipe(Path(name)) if name.endswith(_RECIPE_SUFFIXES) else weights_path(name)
+    except WeightsError:
+        known = ", ".join((*METHODS, *shipped_names()))
+        raise PredictionError(
+            f"unknown method {name!r}; there are {known}, and every .safetensors file of trained weights"
+        ) from None
+    from fpp_ml_bench.baselines.model import load
+    from fpp_ml_bench.baselines.network_method import NetworkMethod
+
+    model = load(path, args.device)
+    if model.config.image_size != opened.size:
+        raise WeightsError(
+            f"{path}: was trained at {_size(model.config.image_size)} px (H x W), {opened.path} has images of "
+            f"{_size(opened.size)} px: at another size the fringe period in px is another, and so is the problem; use "
+            "weights trained at that size, or a dataset built at the weights' size"
+        )
+    return NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
+
+
+def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
     steps = opened.sequence.steps if args.steps is None else args.steps
-    return method(args.method, opened.rig, direction=args.direction, steps=steps, threads=args.threads)
+    return {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
+
+
+def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    return {}
+
+
+_MAKERS = {"classical": _classical, "phase": _phase}
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "classical": ("steps", "direction"),
+    "phase": (),
+    "network": ("depth_range", "frame", "device"),
+}
+"""What belongs to one kind of method only, by its name in the parsed arguments."""
+_KINDS = {"classical": "classical", "phase": "phase", "network": "trained networks"}
+
+
+def _flag(option: str) -> str:
+    return {"depth_range": "--range"}.get(option, f"--{option.replace('_', '-')}")
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

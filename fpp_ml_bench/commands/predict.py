@@ -2,19 +2,25 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fpp_ml_bench.commands.method_options import add_method_options, chosen_method
+from fpp_ml_bench.commands.method_options import METHOD_HELP, add_method_options, chosen_method
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.methods import Method
+    from fpp_ml_bench.loaders.store import DatasetFolder
 
 SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
 EXAMPLES = (
     "fpp-bench predict classical data/mini --split test --out predictions",
     "fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4",
+    "fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle",
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact --json result.json",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("method", metavar="METHOD", help="classical: N-step phase, Gray-code order, triangulation")
+    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
     parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
     parser.add_argument(
@@ -37,7 +43,15 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out}: {done.samples} predictions by {chosen.title}; {len(chosen.frames_used)} frames and "
         f"{done.seconds_per_sample:.3f} s a sample (median)"
     )
-    # Against the decoded depth, the process that made it scores 0.
-    target = " --target depth_exact" if opened.has_exact else ""
-    print(f"next: fpp-eval {args.out} --dataset {args.dataset} --split {args.split}{target} --json result.json")
+    how = f"--dataset {args.dataset} --split {args.split}{_scoring(chosen, opened)}"
+    print(f"next: fpp-eval {args.out} {how} --json result.json")
     return 0
+
+
+def _scoring(chosen: "Method", opened: "DatasetFolder") -> str:
+    """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
+    from, but against that depth the process that made it would score 0."""
+    mode, target = getattr(chosen, "mode", "standard"), getattr(chosen, "target", "depth_exact")
+    if target == "depth_exact" and not opened.has_exact:
+        target = "depth"
+    return (f" --mode {mode}" if mode != "standard" else "") + (f" --target {target}" if target != "depth" else "")

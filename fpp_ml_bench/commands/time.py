@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpp_ml_bench.commands.method_options import add_method_options
+from fpp_ml_bench.commands.method_options import METHOD_HELP, add_method_options
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -15,12 +15,13 @@ SUMMARY = "Measure a method's latency at batch 1, throughput, memory, parameters
 EXAMPLES = (
     "fpp-bench time classical data/mini",
     "fpp-bench time classical data/mini --steps 4 --direction vertical --batch 8 --json timing.json",
+    "fpp-bench time unet.safetensors data/mini --range predicted --threads 2",
     "fpp-bench time classical data/mini --into predictions/submission.yaml --into result.json",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("method", metavar="METHOD", help="a method of fpp-bench predict: classical")
+    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
     parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
     parser.add_argument("--batch", type=_count, default=4, metavar="N", help="images a batch (default: 4)")

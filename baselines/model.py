@@ -1,0 +1,116 @@
+"""A trained network ready to use: fringe image in, depth in mm out.
+
+>>> from fpp_ml_bench.baselines import load
+>>> model = load("unet-individual-hybrid_l1_0.7")       # doctest: +SKIP
+>>> depth_mm = model.predict(fringe)                    # uint8 (H, W) -> float32 (H, W)    # doctest: +SKIP
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.inference import Fringe, fringe_batch, probed, represent
+from fpp_ml_bench.baselines.metric_twin import TWINS, RangeHeads, Twin, heads_from_tensors
+from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.weights_file import ModelConfig, open_weights, weights_path
+from fpp_ml_bench.errors import PredictionError, WeightsError
+from fpp_ml_bench.normalisation import denormalise
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.networks.base import FringeNetwork
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network with its weights, in eval mode. ``heads`` turn an individually normalised output into mm, or None.
+
+    ``sha256`` is that of the weights file.
+    """
+
+    network: "FringeNetwork"
+    config: ModelConfig
+    heads: RangeHeads | None
+    device: torch.device
+    sha256: str
+
+    @property
+    def parameters(self) -> int:
+        """Numbers in the network; the range heads' few are not counted."""
+        return sum(parameter.numel() for parameter in self.network.parameters())
+
+    @property
+    def metric(self) -> bool:
+        """Whether `predict` can: the output is metric itself, or there are range heads."""
+        return self.config.normalisation != "individual" or self.heads is not None
+
+    def predict(self, fringe: Fringe, depth_range: Twin = "predicted") -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm of one fringe image (H, W), uint8 or float in [0, 1], of the size trained at.
+
+        Of a network trained under raw or global normalisation this is the output as it is, negative values and all.
+        Under individual normalisation the range heads make it: 0 where their mask says background, and the range
+        ``predicted`` from the image or the training set's ``mean``. A network trained with the background removed
+        expects ``fringe`` to be 0 outside the object.
+
+        Raises `PredictionError` for another image than that, or an output that is not finite; `WeightsError` where the
+        weights hold no range heads.
+        """
+        return self.predict_batch([fringe], depth_range)[0]
+
+    def predict_batch(self, fringes: Sequence[Fringe], depth_range: Twin = "predicted") -> NDArray[np.float32]:
+        """`predict` of several images at once: float32 (B, H, W) in mm."""
+        if depth_range not in TWINS:
+            raise PredictionError(f"unknown depth_range {depth_range!r}; there are {', '.join(TWINS)}")
+        if self.config.normalisation != "individual":
+            values = self.predict_representation(fringes)
+            return denormalise(values, self.config.normalisation, 0.0, 0.0).astype(np.float32)
+        if self.heads is None:
+            raise WeightsError(
+                f"{self.config.name}: its output is a share of the sample's depth range, and this file holds no range "
+                "heads to make mm of it; use predict_representation, or fit them with "
+                "fpp_ml_bench.baselines.range_heads.fit_heads and save them with the weights"
+            )
+        batch = self._batch(fringes)
+        with torch.inference_mode(), probed(self.network) as probe:
+            values_there = represent(self.network, batch, self.config.name)
+            depth = self.heads.depth_mm(values_there, probe, depth_range)
+        return depth[:, 0].cpu().numpy()
+
+    def predict_representation(self, fringes: Sequence[Fringe]) -> NDArray[np.float32]:
+        """The network's own output float32 (B, H, W) for images (B, H, W), in the representation it was trained on
+        (`fpp_ml_bench.normalisation`). Raises `PredictionError` as `predict`."""
+        batch = self._batch(fringes)
+        with torch.inference_mode():
+            output = represent(self.network, batch, self.config.name)
+        return output[:, 0].float().cpu().numpy()
+
+    def _batch(self, fringes: Sequence[Fringe]) -> torch.Tensor:
+        return fringe_batch(fringes, self.config.image_size, self.config.name).to(self.device)
+
+
+def load(name_or_path: str | Path, device: str | None = None) -> Model:
+    """The weights ``name_or_path``, shipped with the package or a ``.safetensors`` file, as a `Model`.
+
+    ``device``: ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one. Raises `WeightsError` for a name
+    that does not ship (it lists what does), a file that is no sound weights file, or a device that there is not.
+    """
+    found = open_weights(weights_path(name_or_path))
+    with torch.device("meta"):
+        network = build(found.config.network, **found.config.options)
+    network.load_state_dict(found.tensors, assign=True)
+    heads = heads_from_tensors(found.heads, str(found.path))
+    place = _device(device)
+    return Model(network.eval().requires_grad_(False).to(place), found.config, heads, place, found.sha256)
+
+
+def _device(name: str | None) -> torch.device:
+    if name is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError, ValueError, TypeError) as error:
+        raise WeightsError(f"device {name!r} can't be used here: {str(error).splitlines()[0]}; give cpu") from None
