@@ -46,14 +46,15 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     kind = args.method if args.method in METHODS else "network"
+    weights = _weights(args.method) if kind == "network" else None
     for other, options in _OPTIONS.items():
         given = [option for option in options if getattr(args, option) is not None]
         if other != kind and given:
             raise PredictionError(
                 f"{_flag(given[0])} is an option of {_KINDS[other]}, not of {args.method}; leave it out"
             )
-    if kind == "network":
-        return _network(args, opened)
+    if weights is not None:
+        return _network(weights, args, opened)
     return method(kind, opened.rig, **_MAKERS[kind](args, opened))
 
 
@@ -64,21 +65,27 @@ def weights_of_recipe(recipe: Path) -> Path:
     raise RecipeError(f"{recipe}: a recipe has no weights of its own; train it, and give the .safetensors file")
 
 
-def _network(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+def _weights(name: str) -> Path:
+    """The weights file that METHOD means, where it is no method of its own."""
     from fpp_ml_bench.baselines.methods import METHODS
     from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
     from fpp_ml_bench.errors import PredictionError, WeightsError
 
-    name = args.method
+    if name.endswith(_RECIPE_SUFFIXES):
+        return weights_of_recipe(Path(name))
     try:
-        path = weights_of_recipe(Path(name)) if name.endswith(_RECIPE_SUFFIXES) else weights_path(name)
+        return weights_path(name)
     except WeightsError:
         known = ", ".join((*METHODS, *shipped_names()))
         raise PredictionError(
             f"unknown method {name!r}; there are {known}, and every .safetensors file of trained weights"
         ) from None
+
+
+def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
     from fpp_ml_bench.baselines.model import load
     from fpp_ml_bench.baselines.network_method import NetworkMethod
+    from fpp_ml_bench.errors import WeightsError
 
     model = load(path, args.device)
     if model.config.image_size != opened.size:
