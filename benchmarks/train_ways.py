@@ -1,0 +1,206 @@
+"""What `train_speed` measures, one training in a process of its own: our engine, and the plain loop of a lab."""
+
+import contextlib
+import resource
+import statistics
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.training import environment
+from fpp_ml_bench.baselines.training.engine import _Training
+from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe
+from fpp_ml_bench.baselines.training.setup import open_data
+from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
+from fpp_ml_bench.loaders.published_layout import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
+from fpp_ml_bench.loaders.training import FringeDepth
+
+ENOUGH_S = 3.0
+"""A step's cost is measured for about so long, and three times at least."""
+
+
+class Job(NamedTuple):
+    """What a process is told: ``data`` is the dataset for ours, the exported tree for the plain loop."""
+
+    data: Path
+    scratch: Path
+    network: str
+    size: int
+    width: int
+    batch: int
+    threads: int | None
+    loader_workers: int = 0
+
+
+class Epoch(NamedTuple):
+    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were not told apart."""
+
+    step: float
+    data: float
+    compute: float
+    loss: float
+    memory_gib: float
+
+
+class Ours:
+    """The engine: its loader and its step."""
+
+    def __init__(self, job: Job) -> None:
+        recipe = recipe_of(job, compiled=torch.cuda.is_available())
+        surround(job)
+        self.engine = _Training(recipe, *open_data(recipe, job.data), job.scratch / "ours")
+        for module in self.engine.objective.modules.values():
+            module.train()
+
+    def batches(self) -> Iterable[Any]:
+        self.engine.sampler.epoch += 1
+        return self.engine.loader
+
+    def step(self, batch: FringeDepth) -> torch.Tensor:
+        return self.engine._step(batch)["loss"]
+
+
+class Plain:
+    """What the paper's readers would write in an afternoon."""
+
+    def __init__(self, job: Job) -> None:
+        torch.manual_seed(42)
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.network = networks.build(job.network, width=job.width).to(self.device)
+        self.optimizer = torch.optim.RMSprop(self.network.parameters(), lr=1e-4, alpha=0.99, weight_decay=1e-5)
+        self.loader: DataLoader = DataLoader(
+            PngAndMat(job.data), batch_size=job.batch, shuffle=True, num_workers=job.loader_workers
+        )
+
+    def batches(self) -> Iterable[Any]:
+        return ((fringe.to(self.device), depth.to(self.device)) for fringe, depth in self.loader)
+
+    def step(self, batch: Any) -> float:
+        fringe, depth = batch
+        self.optimizer.zero_grad()
+        loss = torch.sqrt(torch.mean((self.network(fringe) - depth) ** 2) + 1e-8)
+        loss.backward()
+        self.optimizer.step()
+        return loss.item()
+
+
+class PngAndMat(Dataset[tuple[torch.Tensor, torch.Tensor]]):
+    """The published tree's training pairs, one file each: fringe / 255 and individually normalised depth."""
+
+    def __init__(self, tree: Path) -> None:
+        split = tree / TRAINING / VARIANT_FOLDERS["individual"] / PUBLISHED_SPLIT_FOLDERS["train"]
+        self.fringes = sorted((split / FRINGE).glob("*.png"))
+        self.depths = [split / DEPTH / f"{path.stem}.mat" for path in self.fringes]
+
+    def __len__(self) -> int:
+        return len(self.fringes)
+
+    def __getitem__(self, index: int) -> tuple[Any, Any]:
+        import cv2
+        import scipy.io
+
+        image = cv2.imread(str(self.fringes[index]), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise OSError(f"{self.fringes[index]}: no readable PNG")
+        fringe = image.astype("float32") / 255
+        depth = scipy.io.loadmat(self.depths[index])[VARIABLES["individual"]].astype("float32")
+        return torch.from_numpy(fringe)[None], torch.from_numpy(depth)[None]
+
+
+def recipe_of(job: Job, compiled: bool) -> Recipe:
+    """The paper's base recipe at the job's scale; bfloat16 on a GPU only."""
+    return load_recipe("base", "paper").model_copy(
+        update={
+            "network": job.network, "width": job.width, "size": job.size, "batch": job.batch, "compile": compiled,
+            "precision": "bf16" if torch.cuda.is_available() else "fp32",
+        }
+    )  # fmt: skip
+
+
+_surroundings = contextlib.ExitStack()
+"""Never left: what the engine sets in a process stays set for as long as it lives."""
+
+
+def surround(job: Job) -> None:
+    """Set in this process what the engine sets around a training."""
+    _set_threads(job)
+    _surroundings.enter_context(environment.reproducible(recipe_of(job, compiled=False)))
+
+
+def _set_threads(job: Job) -> None:
+    if job.threads is not None:
+        torch.set_num_threads(job.threads)
+
+
+_way: Ours | Plain
+
+
+def start(kind: type[Ours] | type[Plain], job: Job) -> None:
+    """Begin a training in this process."""
+    global _way
+    _set_threads(job)
+    _way = kind(job)
+
+
+def run_epoch(apart: bool) -> Epoch:
+    """One pass over the data; ``apart`` waits for the GPU between data and compute."""
+
+    def wait() -> None:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+    data, compute, losses = 0.0, 0.0, []
+    wait()
+    started = perf_counter()
+    batches = iter(_way.batches())
+    while True:
+        before = perf_counter()
+        batch = next(batches, None)
+        if apart:
+            wait()
+        middle = perf_counter()
+        data += middle - before
+        if batch is None:
+            break
+        losses.append(_way.step(batch))
+        if apart:
+            wait()
+        compute += perf_counter() - middle
+    wait()
+    seconds = perf_counter() - started
+    if torch.cuda.is_available():
+        peak = torch.cuda.max_memory_allocated()
+    else:
+        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    steps, loss = len(losses), statistics.mean(map(float, losses))
+    return Epoch(seconds / steps, apart * data / steps, apart * compute / steps, loss, peak / 2**30)
+
+
+def step_seconds(job: Job) -> float | None:
+    """Median seconds of the engine's step on random images in place; None where the memory does not suffice."""
+
+    class Nothing:
+        def __len__(self) -> int:
+            return job.batch
+
+    training = _Training(recipe_of(job, compiled=False), Nothing(), Nothing(), job.scratch)  # type: ignore[arg-type]
+    image = torch.rand(job.batch, 1, job.size, job.size, device=training.accelerator.device)
+    rows = torch.arange(job.batch)
+    batch = FringeDepth(image, image * (image > 0.9), torch.zeros(job.batch, 2), rows, rows)
+    for module in training.objective.modules.values():
+        module.train()
+    seconds: list[float] = []
+    try:
+        float(training._step(batch)["loss"])
+        while len(seconds) < 3 or (sum(seconds) < ENOUGH_S and len(seconds) < 30):
+            started = perf_counter()
+            float(training._step(batch)["loss"])
+            seconds.append(perf_counter() - started)
+    except torch.cuda.OutOfMemoryError:
+        return None
+    return statistics.median(seconds)
