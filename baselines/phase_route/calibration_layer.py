@@ -11,7 +11,7 @@ back without subtracting large numbers, so that float32 is enough. Everything he
 tensors pass through the same lines (`fpp_ml_bench.baselines.phase_route.calibration_layer_torch` holds the buffers).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,14 @@ class CalibrationLayer:
             lens=lens,
         )
 
+    def at(self, where: Any) -> "CalibrationLayer":
+        """The layer of a part of the image: ``where`` indexes the maps (slices, a mask)."""
+        lens = self.lens
+        if lens is not None:
+            lens = replace(lens, rays=(lens.rays[0][where], lens.rays[1][where], lens.rays[2][where]))
+        maps = (self.infinity_rad, self.infinity_order, self.gain, self.forward)
+        return CalibrationLayer(*(one[where] for one in maps), self.back_m, self.rad_per_unit, lens)
+
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
         """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole
         periods counted, so that float32 keeps its digits."""
@@ -123,9 +131,9 @@ class CalibrationLayer:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Orders whose depth lies in the working range: ``first`` int32 (H, W), ``count`` int32 (H, W), 0 where none.
+    """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``, int32 (H, W) each.
 
-    They are ``first, first + 1, ..., first + count - 1``.
+    Where none does, ``count`` is 0, and ``first`` is the order nearest to the range's middle.
     """
 
     first: NDArray[np.int32]
@@ -146,8 +154,8 @@ def orders_in_range(layer: CalibrationLayer, phase_rad: ArrayLike, range_mm: tup
     ends = [layer.absolute_phase(end) for end in range_mm]
     low, high = np.minimum(*ends), np.maximum(*ends)
     known = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
-    with np.errstate(invalid="ignore"):
-        first = np.ceil((low - phase) / TAU)
-        last = np.floor((high - phase) / TAU)
+    phase, low, high = (np.where(known, one, 0.0) for one in (phase, low, high))
+    first, last = np.ceil((low - phase) / TAU), np.floor((high - phase) / TAU)
     count = np.where(known, np.maximum(last - first + 1, 0), 0)
-    return Candidates(np.where(known, first, 0).astype(np.int32), count.astype(np.int32))
+    first = np.where(count > 0, first, np.rint(((low + high) / 2 - phase) / TAU))
+    return Candidates(first.astype(np.int32), count.astype(np.int32))

@@ -1,0 +1,118 @@
+"""The background plane as the rig predicts it, fitted to what one image shows of it.
+
+The plane's distance is calibrated, so its phase is known at every pixel, and its brightness but for three things:
+ambient light, the lamp's strength, and a slow change of its sheen across the image. They are fitted to the image's own
+background. What then differs from the prediction by more than noise is not background. The lamp's strength is also what
+turns an object's brightness into distance and slope (`fpp_ml_bench.baselines.phase_route.shading`): the paper's plane
+and objects are of one material.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.rig import Rig
+
+TILE_PX_PER_PERIOD = 1.1
+"""Tiles on which the plane is looked for: a little over one period, so that strength and ambient light part."""
+TILE_NOISE_GREY = 3.0
+"""Largest misfit of a tile that may be background: three times the benchmark's noise."""
+LEAST_SHARE = 0.02
+"""Of the image's tiles that must show background for the image to calibrate itself."""
+SAMPLE_STEP_PX = 5
+FLOOR_NOISE_GREY = 0.3
+"""Rounding to whole grey levels alone."""
+
+
+def fall_off(rig: Rig, depth_m: float) -> NDArray[np.float64]:
+    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
+    x, y = rig.camera.rays()
+    centre = -rig.R.T @ rig.t
+    # The plane's normal is the camera's axis, whatever way the projector is turned.
+    to = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
+    squared = to[0] ** 2 + to[1] ** 2 + to[2] ** 2
+    return to[2] / (squared * np.sqrt(squared))
+
+
+@dataclass(frozen=True)
+class Background:
+    """Fit of the empty scene to one image, grey levels.
+
+    ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
+    ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
+    the calibrated constants had to do.
+    """
+
+    ambient_grey: float
+    strength: float
+    noise_grey: float
+    residual: NDArray[np.float32]
+    share: float
+
+
+class EmptyScene:
+    """What one rig and direction show of the background plane; made once, then fitted to every image.
+
+    ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
+    grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
+    surface in ambient light alone.
+    """
+
+    def __init__(self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float, ambient_grey: float):
+        self.noise_grey = 1.0
+        self.ambient_grey = ambient_grey
+        self.strength = white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        x, y = rig.camera.rays()
+        phase = layer.absolute_phase(rig.background_m * MM_PER_M)
+        light = np.nan_to_num(fall_off(rig, rig.background_m) * (0.5 + 0.5 * np.cos(phase)))
+        self._light = light
+        self._terms = [np.nan_to_num(light * term).astype(np.float32) for term in (np.ones_like(x), x, y, x * x, x * y, y * y)]
+        height, width = light.shape
+        self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), height, width)
+        self._mean, self._square = self._tiles(light), self._tiles(light * light)
+
+    def _tiles(self, image: NDArray) -> NDArray[np.float64]:
+        """Means over whole tiles."""
+        t = self._tile
+        height, width = (length // t * t for length in image.shape)
+        rows = image[:height, :width].reshape(height, width // t, t).sum(axis=2, dtype=np.float64)
+        return rows.reshape(height // t, t, width // t).sum(axis=1) / (t * t)
+
+    def fit(self, image: NDArray[np.uint8]) -> Background:
+        """Background of ``image`` uint8 (H, W)."""
+        grey = image.astype(np.float32)
+        good = self._background_tiles(grey)
+        share = float(good.mean())
+        if share < LEAST_SHARE:
+            residual = grey - self.ambient_grey - self.strength * self._terms[0]
+            return Background(self.ambient_grey, self.strength, self.noise_grey, residual, 0.0)
+        t = self._tile
+        chosen = np.zeros(image.shape, dtype=bool)
+        chosen[: good.shape[0] * t, : good.shape[1] * t] = good.repeat(t, axis=0).repeat(t, axis=1)
+        some = np.zeros_like(chosen)
+        some[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = chosen[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
+        terms = np.stack([np.ones(int(some.sum()))] + [term[some] for term in self._terms], axis=1).astype(np.float64)
+        solution = np.linalg.lstsq(terms, grey[some].astype(np.float64), rcond=None)[0]
+        misfit = grey[some] - terms @ solution
+        noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
+        residual = grey - np.float32(solution[0])
+        for weight, term in zip(solution[1:], self._terms, strict=True):
+            residual -= np.float32(weight) * term
+        return Background(float(solution[0]), float(solution[1]), noise, residual, share)
+
+    def _background_tiles(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""
+        mean, square = self._tiles(grey), self._tiles(grey * grey)
+        spread = self._square - self._mean**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self._tiles(grey * self._light) - mean * self._mean
+            slope = covariance / spread
+            misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
+            good = (misfit < TILE_NOISE_GREY) & (slope > 0) & (spread > 1e-2 * spread.max())
+        if not good.any():
+            return good
+        usual = float(np.median(slope[good]))
+        return good & (np.abs(slope / usual - 1) < 0.15)

@@ -1,0 +1,123 @@
+"""Local least squares of a fringe under a Gaussian window: phase, brightness and their uncertainty at every pixel.
+
+First fit, no photometry needed: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a
+carrier (a plane at the standoff) whose phase the answer corrects by ``atan2(-S, C)``. Second fit, once the carrier
+follows the surface: ``I - ambient = g (1 + cos(theta + d))`` with g a plane. A projected fringe goes down to black, so
+its mean and its modulation are the same number g; knowing that keeps a slope of brightness from posing as phase.
+
+Everything a fit needs are moments of masked images under the window, and a Gaussian window separates: 19 images, each
+filtered along rows and columns. The window never reaches across the object mask, which is what Fourier methods do and
+what costs them twice the error (docs/phase_route.md).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+
+WINDOW_SIGMAS = 3.0
+RIDGE = 1e-6
+"""Of the window's weight, added to the diagonal: fits of a few pixels stay finite."""
+LARGEST_STEP_RAD = 0.7
+"""Largest correction of the second fit: beyond it the linear model says nothing."""
+
+
+class Window:
+    """A Gaussian of ``sigma_px`` and its first and second moments, for `cv2.sepFilter2D`."""
+
+    def __init__(self, sigma_px: float) -> None:
+        half = int(np.ceil(WINDOW_SIGMAS * sigma_px))
+        t = np.arange(-half, half + 1) / sigma_px
+        weight = np.exp(-0.5 * t * t)
+        weight /= weight.sum()
+        self.sigma_px = sigma_px
+        self._kernels = [(weight * t**power).astype(np.float64) for power in range(3)]
+
+    def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
+        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image."""
+        kernels = self._kernels
+        return cv2.sepFilter2D(
+            image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT
+        )  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class FringeFit:
+    """``phase_rad`` float32 (H, W), not wrapped: carrier plus correction; ``brightness`` g, grey levels (a white
+    pattern's is twice as much), and its slopes a px; ``weight``: share of the window that lies on the object."""
+
+    phase_rad: Image
+    brightness: Image
+    slope_x: Image
+    slope_y: Image
+    weight: Image
+
+
+def solve_symmetric(matrix: list[list[Image]], right: list[Image]) -> list[Image]:
+    """Solve one small symmetric system a pixel by elimination without pivoting; ``matrix[i][j]`` for j >= i.
+
+    Both arguments are overwritten. The windows' normal matrices are positive; `RIDGE` keeps them so in float32.
+    """
+    size = len(right)
+    ridge = RIDGE * matrix[0][0] + np.float32(1e-9)
+    for i in range(size):
+        matrix[i][i] = matrix[i][i] + ridge
+    for i in range(size):
+        for j in range(i + 1, size):
+            factor = matrix[i][j] / matrix[i][i]
+            for k in range(j, size):
+                matrix[j][k] = matrix[j][k] - factor * matrix[i][k]
+            right[j] = right[j] - factor * right[i]
+    answer: list[Image] = [right[0]] * size
+    for i in reversed(range(size)):
+        total = right[i]
+        for j in range(i + 1, size):
+            total = total - matrix[i][j] * answer[j]
+        answer[i] = total / matrix[i][i]
+    return answer
+
+
+def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, window: Window) -> Image:
+    """Phase in rad, float32 (H, W), from the five-term fit of ``grey`` around each pixel; use it inside only."""
+    weight = inside.astype(np.float32)
+    light = grey * weight
+    cosine, sine = np.cos(carrier_rad).astype(np.float32), np.sin(carrier_rad).astype(np.float32)
+    by_cosine, by_sine = weight * cosine, weight * sine
+    m = window.moment
+    w00 = m(weight)
+    cc = m(by_cosine * cosine)
+    none = w00
+    matrix = [
+        [w00, m(weight, 1, 0), m(weight, 0, 1), m(by_cosine), m(by_sine)],
+        [none, m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
+        [none, none, m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
+        [none, none, none, cc, m(by_cosine * sine)],
+        [none, none, none, none, w00 - cc],
+    ]
+    right = [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
+    answer = solve_symmetric(matrix, right)
+    return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
+
+
+def fringe_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: Image, ambient: float, window: Window) -> FringeFit:
+    """Fit of g (1 + cos(carrier + d)), g a plane, around each pixel of ``grey`` float32 (H, W)."""
+    weight = inside.astype(np.float32)
+    light = (grey - np.float32(ambient)) * weight
+    raised, sine = 1 + np.cos(carrier_rad), np.sin(carrier_rad)
+    m = window.moment
+    rr, rs = weight * raised * raised, weight * raised * sine
+    r00 = m(rr)
+    matrix = [
+        [r00, m(rr, 1, 0), m(rr, 0, 1), m(rs)],
+        [r00, m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
+        [r00, r00, m(rr, 0, 2), m(rs, 0, 1)],
+        [r00, r00, r00, m(weight * sine * sine)],
+    ]
+    right = [m(light * raised), m(light * raised, 1, 0), m(light * raised, 0, 1), m(light * sine)]
+    g, gx, gy, s = solve_symmetric(matrix, right)
+    step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
+    scale = np.float32(1 / window.sigma_px)
+    return FringeFit(carrier_rad + step, g, gx * scale, gy * scale, m(weight))

@@ -1,0 +1,66 @@
+"""What each fringe order would mean for brightness: fall-off with distance, and the slope of the surface.
+
+The phase fixes how fast 1/Z changes along the surface whatever the order; the order fixes Z itself. Together they give
+distance and normal of every candidate, and so how bright a matte surface would be there: cos(theta) / r^2 of the light
+that the background plane has calibrated. One order nearer is nearer to the lamp AND turned more towards it, so that the
+candidates differ by a third in brightness. This cue rests on one albedo for plane and objects, which the paper's scenes
+have (Section 2.2) and a painted object has not: `PhaseMethod(shading=False)` does without.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.rig import Rig
+
+Image = NDArray[np.float32]
+Crop = tuple[slice, slice]
+
+STEEPEST_RAD_PER_PX = 0.5
+"""Largest change of the residual phase a px that counts as slope; a fringe of the carrier changes by 0.28."""
+
+
+def wrapped(phase_rad: NDArray) -> NDArray:
+    """``phase_rad`` less the nearest whole number of periods, in [-pi, pi]."""
+    return phase_rad - TAU * np.rint(phase_rad / TAU)
+
+
+def phase_slopes(residual_rad: Image, inside: NDArray[np.bool_], smooth_px: float) -> tuple[Image, Image]:
+    """Change of the residual phase a px along x and y, float32 (H, W), averaged under a Gaussian inside the mask."""
+    size = 2 * int(np.ceil(2.5 * smooth_px)) + 1
+    weight = cv2.erode(inside.astype(np.float32), np.ones((3, 3), np.uint8))
+    total = np.maximum(cv2.GaussianBlur(weight, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT), 1e-3)
+    slopes = []
+    for axis in (1, 0):
+        change = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
+        change = np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
+        slopes.append(cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT) / total)
+    return slopes[0], slopes[1]
+
+
+def irradiance(
+    layer: CalibrationLayer, residual_rad: NDArray, slopes: tuple[Image, Image], rig: Rig, crop: Crop
+) -> Image:
+    """cos(theta) / r^2 in 1/m^2 that a matte surface receives from the projector, float32 (H, W); below 0: turned away.
+
+    ``residual_rad`` (H, W) of one candidate on the pixels ``crop`` of the image, ``slopes`` its change a px.
+    """
+    x, y = (axis[crop].astype(np.float32) for axis in rig.camera.rays())
+    z = (layer.depth_of_residual_mm(residual_rad) / MM_PER_M).astype(np.float32)
+    if layer.lens is None:
+        rate = -layer.gain / (residual_rad * residual_rad * layer.forward)
+    else:
+        rate = (layer.depth_of_residual_mm(residual_rad + 1e-3) / MM_PER_M - z) / 1e-3
+    zx, zy = (rate * slopes[0]).astype(np.float32), (rate * slopes[1]).astype(np.float32)
+    dx, dy = np.float32(1 / rig.camera.fx), np.float32(1 / rig.camera.fy)
+    # Tangents of the surface Z (x, y, 1) along the image's rows and columns, and their cross product.
+    ax, ay, az = zx * x + z * dx, zx * y, zx
+    bx, by, bz = zy * x, zy * y + z * dy, zy
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    cx, cy, cz = (np.float32(c) for c in -rig.R.T @ rig.t)
+    lx, ly, lz = cx - z * x, cy - z * y, cz - z
+    squared = lx * lx + ly * ly + lz * lz
+    length = np.sqrt((nx * nx + ny * ny + nz * nz) * squared)
+    return -(nx * lx + ny * ly + nz * lz) / (length * squared)
