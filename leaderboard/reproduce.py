@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import shorten
 from time import perf_counter
 
 from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.training.engine import TrainingRun, train
-from fpp_ml_bench.errors import SubmissionError, TrainingError
+from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.leaderboard.reproduce_data import the_dataset
 from fpp_ml_bench.leaderboard.reproduce_frames import all_frames_that_hold, score_all_frames, write_all_frames
 from fpp_ml_bench.leaderboard.reproduce_lines import MAIN_KEY, table_lines
@@ -31,6 +32,7 @@ from fpp_ml_bench.loaders.manifest import write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
 
 Say = Callable[[str], object]
+REASON_LENGTH = 400
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class Outcome:
 def reproduce(wish: Wish) -> Outcome:
     """Do what is missing of the tables, and write them. Interrupted at any time, the same call goes on.
 
-    A training that diverges leaves its row empty and does not keep the others from running (`Outcome.failed`).
+    A training that diverges, or whose predictions can't be scored, does not keep the others from running
+    (`Outcome.failed`).
     Raises TrainingError for a training folder of another recipe, or the paper's preset without a GPU; DatasetError for
     a dataset of another size or fingerprint; BuildError when another process works in the same folder; and what
     predicting and scoring raise.
@@ -98,14 +101,14 @@ def _work(wish: Wish, outcome: Outcome) -> None:
         began = perf_counter()
         try:
             run = train(job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=left, show=wish.show)
-        except TrainingError as error:
-            outcome.failed[job.recipe.name] = str(error)
-            wish.say(f"  failed, its row stays empty: {error}")
-            continue
-        if not run.finished:
-            outcome.stopped = job.recipe.name
-            return
-        _score(job, run, wish, outcome.opened)
+            if not run.finished:
+                outcome.stopped = job.recipe.name
+                return
+            _score(job, run, wish, outcome.opened)
+        except (TrainingError, PredictionError, WeightsError) as error:
+            # What is wrong with one training need not be wrong with the others, and they take hours.
+            outcome.failed[job.recipe.name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
+            wish.say(f"  failed, its rows stay as they are: {error}")
         if not trained:
             taken.append(perf_counter() - began)
 

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
-        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} trainings failed:\n{each}")
+        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
     if outcome.stopped is not None:
         print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Go on with: {command}")
         return CHECK_FAILED
