@@ -73,11 +73,11 @@ class Attention(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        batch, count, channels = tokens.shape
-        qkv = self.qkv(tokens).view(batch, count, 3, self.heads, channels // self.heads)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        count, channels = tokens.shape[1:]
+        qkv = self.qkv(tokens).reshape(-1, count, 3, self.heads, channels // self.heads)
+        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind()
         mixed = functional.scaled_dot_product_attention(query, key, value)
-        return self.out(mixed.transpose(1, 2).reshape(batch, count, channels))
+        return self.out(mixed.transpose(1, 2).reshape(-1, count, channels))
 
 
 class DropPath(nn.Module):

@@ -93,7 +93,8 @@ class Level(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         tokens = self.norm(self.layers(_last(x).flatten(1, 2)))
-        return _first(tokens.unflatten(1, x.shape[2:]))
+        channels, height, width = x.shape[1:]
+        return _first(tokens.reshape(-1, height, width, channels))
 
 
 class MergePatches(nn.Module):
@@ -109,7 +110,9 @@ class MergePatches(nn.Module):
         self.join = nn.Linear(4 * channels, 2 * channels)
 
     def forward(self, x: Tensor, branch: Tensor) -> Tensor:
-        patches = _last(x).unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).transpose(2, 3).flatten(3)
+        channels, height, width = x.shape[1:]
+        quads = _last(x).reshape(-1, height // 2, 2, width // 2, 2, channels)
+        patches = quads.transpose(2, 3).flatten(3)
         return _first(self.join(torch.cat((self.reduce(self.norm(patches)), _last(branch)), dim=-1)))
 
 
@@ -127,8 +130,9 @@ class ExpandPatches(nn.Module):
         self.level = Level(channels, heads, drop_paths, norm=False)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        quads = self.expand(_last(x)).unflatten(3, (2, 2, -1))
-        pixels = quads.transpose(2, 3).flatten(3, 4).flatten(1, 2)
+        channels, height, width = skip.shape[1:]
+        quads = self.expand(_last(x)).reshape(-1, height // 2, width // 2, 2, 2, channels)
+        pixels = quads.transpose(2, 3).reshape(-1, height, width, channels)
         return self.level(_first(self.join(torch.cat((self.norm(pixels), _last(skip)), dim=-1))))
 
 

@@ -39,7 +39,9 @@ class TokenBottleneck(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         tokens = self.embed(x).flatten(2).transpose(1, 2) + self.position
         patches = self.unembed(self.norm(self.layers(tokens)))
-        return functional.pixel_shuffle(patches.transpose(1, 2).unflatten(2, (self.grid, self.grid)), self.patch)
+        return functional.pixel_shuffle(
+            patches.transpose(1, 2).reshape(-1, patches.shape[2], self.grid, self.grid), self.patch
+        )
 
 
 class TransUNet(UShape):

@@ -1,0 +1,223 @@
+"""The networks: the paper's parameter counts, shapes, refusals, options, probe layers."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+from fpp_ml_bench.baselines.networks import NETWORKS, build, discriminator
+from fpp_ml_bench.baselines.networks.base import parameter_count
+from fpp_ml_bench.errors import NetworkError
+
+# Small networks and a size they take; TransUNet is built for 64 px: 4x4 map, 2x2 patches.
+SMALL: dict[str, dict[str, int | float]] = {
+    "unet": {"width": 4},
+    "transunet": {"width": 2, "map_size": 4, "patch": 2},
+    "resunet": {"width": 4},
+    "hformer": {"width": 8},
+    "pix2pix": {"width": 4},
+}
+SIZE = 64
+
+# The paper's table of architectures and the benchmark's published counts; TransUNet is printed as 116.2 M there.
+PARAMETERS = {
+    "unet": 31_036_481,
+    "transunet": 116_162_881,
+    "resunet": 88_941_841,
+    "hformer": 4_655_993,
+    "pix2pix": 182_430_721,
+}
+STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 16}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small maps: threads cost more than they bring
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_paper_parameter_counts(name):
+    with torch.device("meta"):
+        assert parameter_count(build(name)) == PARAMETERS[name]
+
+
+def test_discriminator_parameter_count():
+    with torch.device("meta"):
+        assert parameter_count(discriminator()) == 5_527_426
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_full_width_runs_at_960_px_on_the_meta_device(name):
+    with torch.device("meta"):
+        network = build(name)
+        seen = _probed(network, torch.empty(1, 1, 960, 960))
+    paper = {"unet": (1024, 60), "transunet": (1024, 60), "resunet": (960, 120), "hformer": (256, 30)}
+    channels, side = paper.get(name, (1024, 60))
+    assert seen["bottleneck"] == (1, channels, side, side)
+    assert seen[network.last_layer][2:] == (960, 960)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("training", [True, False])
+def test_shape_in_is_shape_out(name, training):
+    network = build(name, **SMALL[name]).train(training)
+    wide = SIZE if name == "transunet" else SIZE + 32
+    assert network(torch.rand(3, 1, SIZE, wide)).shape == (3, 1, SIZE, wide)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_options_build_the_same_network_again(name):
+    torch.manual_seed(3)
+    first = build(name, **SMALL[name])
+    torch.manual_seed(3)
+    again = build(first.name, **first.options)
+    assert first.options == again.options and set(SMALL[name]) <= set(first.options)
+    assert all(isinstance(value, int | float) for value in first.options.values())
+    ours, theirs = first.state_dict(), again.state_dict()
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    torch.manual_seed(4)
+    other = build(name, **SMALL[name]).state_dict()
+    assert any(not torch.equal(ours[key], other[key]) for key in ours)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_width_scales_every_layer(name):
+    with torch.device("meta"):
+        narrow, wide = (
+            parameter_count(build(name, **{**SMALL[name], "width": w * int(SMALL[name]["width"])})) for w in (4, 8)
+        )
+    assert 3.5 < wide / narrow < 4.1  # products of two widths make up nearly all parameters
+
+
+def _probed(network, x) -> dict[str, tuple[int, ...]]:
+    seen: dict[str, tuple[int, ...]] = {}
+    hooks = [
+        layer.register_forward_hook(lambda _m, _i, out, key=key: seen.__setitem__(key, tuple(out.shape)))
+        for key, layer in network.probe_layers.items()
+    ]
+    network(x)
+    for hook in hooks:
+        hook.remove()
+    return seen
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_probe_layers(name):
+    network = build(name, **SMALL[name])
+    width = int(SMALL[name]["width"])
+    seen = _probed(network, torch.rand(2, 1, SIZE, SIZE))
+    assert list(seen) == list(network.probe_layers)  # forward order
+    assert network.last_layer == list(seen)[-1]
+    assert seen[network.last_layer] == (2, width // 4 if name == "hformer" else width, SIZE, SIZE)
+    channels = {"resunet": 8 * width, "hformer": 8 * width}.get(name, 16 * width)
+    assert seen["bottleneck"] == (2, channels, SIZE // network.stride, SIZE // network.stride)
+
+
+def test_unet_probe_shapes():
+    seen = _probed(build("unet", width=4), torch.rand(1, 1, SIZE, SIZE))
+    for level in (1, 2, 3, 4):
+        shape = (1, 4 * 2 ** (level - 1), SIZE // 2 ** (level - 1), SIZE // 2 ** (level - 1))
+        assert seen[f"enc{level}"] == shape and seen[f"dec{level}"] == shape
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_sizes_that_the_strides_do_not_allow(name):
+    network = build(name, **SMALL[name])
+    assert network.stride == STRIDES[name]
+    with pytest.raises(NetworkError, match=f"{SIZE}x{SIZE + 4}"):
+        network(torch.rand(1, 1, SIZE, SIZE + 4))
+    with pytest.raises(NetworkError, match=f"{network.stride}x{network.stride}"):
+        network(torch.rand(1, 1, network.stride, network.stride))
+
+
+def test_a_refused_size_names_the_nearest():
+    network = build("unet", width=2)
+    with pytest.raises(NetworkError, match=r"multiples of 16, at least 32 px; it was given 100x17.*\(96 or 112\)x32"):
+        network(torch.rand(1, 1, 100, 17))
+
+
+def test_transunet_names_the_size_it_was_built_for():
+    with pytest.raises(NetworkError, match=r"64x64 px.*given 96x96"):
+        build("transunet", **SMALL["transunet"])(torch.rand(1, 1, 96, 96))
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize(
+    "fringe",
+    [
+        torch.zeros(1, 2, SIZE, SIZE),
+        torch.zeros(1, SIZE, SIZE),
+        torch.zeros(1, 1, SIZE, SIZE, dtype=torch.uint8),
+    ],
+    ids=["channels", "rank", "integer"],
+)
+def test_input_that_is_no_fringe_image(name, fringe):
+    with pytest.raises(NetworkError, match=name):
+        build(name, **SMALL[name])(fringe)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "match"),
+    [
+        ("vnet", {}, "unknown network 'vnet'; there are unet, transunet"),
+        ("unet", {"widht": 8}, "'unet' has no option 'widht'; there are: width .default 64.*dropout"),
+        ("unet", {"width": 0}, "width must be a whole number, at least 1; it was 0"),
+        ("unet", {"width": 8.5}, "width"),
+        ("unet", {"width": True}, "width"),
+        ("unet", {"width": "8"}, "width"),
+        ("unet", {"dropout": 1.0}, r"dropout must be a number in \[0, 1\)"),
+        ("unet", {"dropout": float("nan")}, "dropout"),
+        ("transunet", {"patch": 7}, "patch must divide map_size"),
+        ("transunet", {"map_size": 1}, "map_size"),
+        ("hformer", {"width": 6}, "multiple of 4"),
+        ("hformer", {"drop_path": -0.1}, "drop_path"),
+        ("pix2pix", {"dropout": 0.1}, "no option"),
+    ],
+)
+def test_refused_names_and_options(name, options, match):
+    with pytest.raises(NetworkError, match=match):
+        build(name, **options)
+
+
+def test_discriminator_features():
+    judge = discriminator(width=4)
+    scales = judge(torch.rand(2, 2, SIZE, SIZE))
+    assert [len(maps) for maps in scales] == [5, 5]
+    assert scales[0][0].shape == (2, 4, 33, 33) and scales[1][0].shape == (2, 4, 17, 17)
+    assert scales[0][-1].shape[:2] == (2, 1)
+    with pytest.raises(NetworkError, match="no option"):
+        discriminator(depth=3)
+    with pytest.raises(NetworkError, match="width"):
+        discriminator(width=-1)
+
+
+def test_importing_the_package_leaves_torch_out():
+    code = "import sys, fpp_ml_bench.baselines.networks; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_no_batch_or_sample_leaks_into_another():
+    """Networks with instance normalisation treat samples one by one, so a batch equals its samples."""
+    x = torch.rand(3, 1, SIZE, SIZE)
+    for name in ("unet", "transunet", "pix2pix"):
+        network = build(name, **SMALL[name])
+        torch.testing.assert_close(network(x)[1:2], network(x[1:2]), rtol=1e-4, atol=1e-4)
+
+
+def test_pix2pix_stays_between_zero_and_one():
+    network = build("pix2pix", width=4)
+    for parameter in network.parameters():
+        nn.init.normal_(parameter)
+    depth = network(torch.rand(1, 1, SIZE, SIZE))
+    assert depth.min() >= 0.0 and depth.max() <= 1.0 and depth.std() > 0.0
