@@ -228,10 +228,12 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
 
     try:
         with torch.device("meta"):
-            expected = build(config.network, **config.options).state_dict()
+            network = build(config.network, **config.options)
+        network.check_size(*config.image_size)
+        expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
         raise WeightsError(
-            f"{_shown(path)}: its configuration builds no network: {printable(str(error), 300)}"
+            f"{_shown(path)}: its configuration makes no network: {printable(str(error), 300)}"
         ) from None
     built = f"{config.network} with {_options(config)}"
     for name in tensors:

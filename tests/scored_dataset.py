@@ -1,5 +1,6 @@
 """A tiny real dataset folder with known depth, and predictions for it: what the evaluator's tests score."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,18 +41,30 @@ def disk_depth(size: tuple[int, int], seed: int) -> NDArray[np.float32]:
     return np.where(inside, depth, 0.0).astype(np.float32)
 
 
-def make_dataset(folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True) -> DatasetFolder:
-    """Write a `single_shot` dataset of eight samples; ``depth_exact`` is ``depth`` and 0.5 mm on the object."""
+Scene = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.float32]]]
+
+
+def make_dataset(
+    folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True, views: Sequence[str] = VIEWS,
+    scene: Scene | None = None,
+) -> DatasetFolder:  # fmt: skip
+    """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more than ``depth``.
+
+    ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
+    """
     scratch = folder / ".build"
     scratch.mkdir(parents=True)
     shards, samples = [], {}
     for number, (split, names) in enumerate(OBJECTS.items()):
-        objects = {name: [(f"{name}_{view}", name, view) for view in VIEWS] for name in names}
+        objects = {name: [(f"{name}_{view}", name, view) for view in views] for name in names}
         for plan in plan_shards(split, objects):
             rows = []
             for index, (sample, name, view) in enumerate(plan.samples):
-                depth = disk_depth(size, 10 * number + index)
-                frame = np.full(size, index, dtype=np.uint8)
+                seed = 10 * len(views) * number + index
+                if scene is None:
+                    frame, depth = np.full(size, index, dtype=np.uint8), disk_depth(size, 10 * number + index)
+                else:
+                    frame, depth = scene(seed)
                 rows.append(
                     Row(sample, name, view, {0: frame}, depth, depth + np.float32(0.5) * (depth > 0) if exact else None)
                 )

@@ -82,10 +82,11 @@ def test_training_layouts_are_saved_plainly(saved, tmp_path):
         ({"image_size": [32]}, "image_size"),
         ({"image_size": ["32", 48]}, "image_size.0"),
         ({"epoch": -1}, "epoch"),
+        ({"image_size": [32, 40]}, "makes no network.*multiples of 16.*given 32x40"),
         ({"data_config": "few"}, "unknown data_config 'few'; there are single_shot"),
         ({"dataset_fingerprint": "abc"}, "dataset_fingerprint"),
-        ({"network": "vnet"}, "builds no network.*unet"),
-        ({"options": {"depth_of_thought": 3}}, "builds no network.*depth_of_thought"),
+        ({"network": "vnet"}, "makes no network.*unet"),
+        ({"options": {"depth_of_thought": 3}}, "makes no network.*depth_of_thought"),
         ({"options": {"width": 5}}, r"tensor \S+: expected float32 \(5, .*, got float32 \(4, "),
     ],
 )

@@ -23,7 +23,7 @@ def config_of(network: torch.nn.Module, **changes: Any) -> ModelConfig:
     about: dict[str, Any] = {
         "name": "unet-individual-hybrid_l1_0.7",
         "title": "UNet, individual, hybrid l1 0.7",
-        "network": "unet",
+        "network": network.name,
         "options": network.options,
         "normalisation": "individual",
         "image_size": (32, 48),
