@@ -344,6 +344,10 @@ def test_scores_and_features_against_numpy():
     )
     assert gan_losses.feature_matching(generated, real).item() == pytest.approx(expected)
     assert gan_losses.feature_matching(real, real) == 0
+    generated[0][0].requires_grad_()
+    real[0][0].requires_grad_()
+    gan_losses.feature_matching(generated, real).backward()
+    assert generated[0][0].grad.any() and real[0][0].grad is None
 
 
 def test_gradient_l1_of_a_ramp_and_of_an_offset():

@@ -13,7 +13,7 @@ Before training, the engine may put wrapped networks (several processes, mixed p
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
@@ -143,16 +143,13 @@ def _detached(values: dict[str, Tensor]) -> dict[str, Tensor]:
 def _fixed(module: nn.Module) -> Iterator[nn.Module]:
     """Forward passes in here lead gradients through ``module`` but none into its parameters.
 
-    A graph remembers what needed a gradient when it was made, so the parameters are free again before the backward. A
-    module spread over processes is told that there is nothing to exchange (``no_sync``), or it would wait for it.
+    A graph remembers what needed a gradient when it was made, so the parameters are free again before the backward.
     """
     free = [parameter for parameter in module.parameters() if parameter.requires_grad]
-    no_sync = getattr(module, "no_sync", nullcontext)
     for parameter in free:
         parameter.requires_grad_(False)
     try:
-        with no_sync():
-            yield module
+        yield module
     finally:
         for parameter in free:
             parameter.requires_grad_(True)
