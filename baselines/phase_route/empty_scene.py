@@ -69,7 +69,9 @@ class EmptyScene:
         phase = layer.absolute_phase(rig.background_m * MM_PER_M)
         light = np.nan_to_num(fall_off(rig, rig.background_m) * (0.5 + 0.5 * np.cos(phase)))
         self._light = light
-        self._terms = [np.nan_to_num(light * term).astype(np.float32) for term in (np.ones_like(x), x, y, x * x, x * y, y * y)]
+        self._terms = [
+            np.nan_to_num(light * term).astype(np.float32) for term in (np.ones_like(x), x, y, x * x, x * y, y * y)
+        ]
         height, width = light.shape
         self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), height, width)
         self._mean, self._square = self._tiles(light), self._tiles(light * light)

@@ -52,9 +52,7 @@ def propagate(
     return np.ascontiguousarray(belief.transpose(2, 0, 1))
 
 
-def _sweep_rows(
-    rest: NDArray, phase: NDArray, link: Image, limit: np.float32, down: NDArray, up: NDArray
-) -> None:
+def _sweep_rows(rest: NDArray, phase: NDArray, link: Image, limit: np.float32, down: NDArray, up: NDArray) -> None:
     """Messages of one pass down and one up the rows of (H, W, K) costs, written into ``down`` and ``up``."""
     last = len(rest) - 1
     for here in range(last):

@@ -39,9 +39,7 @@ class Window:
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
         """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image."""
         kernels = self._kernels
-        return cv2.sepFilter2D(
-            image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT
-        )  # type: ignore[return-value]
+        return cv2.sepFilter2D(image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def refined(
     background: Background,
     predicted: NDArray[np.float32],
     grey: NDArray[np.float32],
-    fringe_noise: float,
+    fringe_noise: NDArray[np.float32],
     reach_px: float,
 ) -> NDArray[np.bool_]:
     """Mask (H, W) after the two predictions have competed within ``reach_px`` of the silhouette.

@@ -1,0 +1,58 @@
+"""The phase route as a method of ``fpp-bench predict``: one captured fringe, metric depth, nothing learned."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_route.measurement import Measurement
+from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.rig import Rig
+
+
+class PhaseMethod:
+    """Depth from the first sinusoid of one direction; options are those of `Settings`.
+
+    Raises `PredictionError` for an option that there is not or a value it can't have.
+    """
+
+    name = "phase"
+    uses_ground_truth_range = False
+    units = "mm"
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        try:
+            chosen = Settings(**options)
+        except TypeError as error:
+            raise PredictionError(f"phase: {error}; there are {', '.join(Settings.__dataclass_fields__)}") from None
+        self.rig, self.options, self.route = rig, chosen, PhaseRoute(rig, chosen)
+
+    @property
+    def frames_used(self) -> tuple[int, ...]:
+        """The one frame that must be captured."""
+        return (self.rig.sequence.sinusoids(self.options.direction)[0],)
+
+    @property
+    def title(self) -> str:
+        cues = ["range"] + ["shading"] * self.options.shading + ["standoff"] * (self.options.prior == "standoff")
+        return f"Phase route, one {self.options.direction} fringe, order by {' + '.join(cues)}, nothing learned"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return asdict(self.options)
+
+    def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
+        """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""
+        (index,) = self.frames_used
+        image = frames[index] if index < len(frames) else None
+        if image is None:
+            raise DecodeError(f"frame {index} is missing: the phase route needs that one fringe")
+        return self.route.measure(image)
+
+    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm
