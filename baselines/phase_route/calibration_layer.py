@@ -42,7 +42,7 @@ class Lens:
 class CalibrationLayer:
     """Constants of one rig and fringe direction for every pixel; float64 maps of the image's shape.
 
-    ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, split in wrapped
+    ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
     phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
     ``rad_per_unit``: phase of one normalised projector unit, 2 pi f_p / P.
     """

@@ -2,7 +2,7 @@
 
 The expected error adds three parts. Noise and misfit of the local fit: the window's rms misfit over brightness is a
 phase, and phase is depth by the calibration layer's slope. The rim: where half the window lies off the object, the fit
-carries on instead of averaging. The order: a margin of belief is a chance of being a whole period off, which is known in
+carries on instead of averaging. The order: a margin of belief is a chance of being a period off, which is known in
 mm. A confidence of 1 / (1 + error / 5 mm) puts it between 0 and 1.
 """
 
@@ -63,7 +63,7 @@ def reasons(
     grey: Image, fit: FringeFit, inside: NDArray[np.bool_], slopes: tuple[Image, Image], margin: Image,
     candidates: Candidates, sure: Image, settings: Settings, period_px: float, window: Window,
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """A `Reason` for every pixel (H, W), whether it is masked or not: `Reason.MEASURED` where nothing speaks against."""
+    """A `Reason` for every pixel (H, W), masked or not: `Reason.MEASURED` where nothing speaks against it."""
     clipped = window.moment(((grey >= GREY_LEVELS) & inside).astype(np.float32))
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.

@@ -36,7 +36,7 @@ class Measurement:
     """Maps (H, W) of one image; NaN or 0 where there is no object.
 
     ``wrapped_phase`` float32 rad in [-pi, pi]; ``modulation`` float32 grey levels; ``order`` int32; ``candidates``: the
-    orders that the working range allows; ``confidence`` float32, 0 to 1; ``expected_error_mm`` float32, what it was made
+    orders that the working range allows; ``confidence`` float32, 0 to 1; ``expected_error_mm`` float32, what it is made
     of; ``depth_mm`` float32, 0 = background or masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked
     or not; ``counts``: pixels per reason; ``background_share``: of the image that calibrated its own brightness;
     ``seconds`` per stage.

@@ -25,6 +25,19 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         choices=("horizontal", "vertical", "both"),
         help="fringes to use: one direction is enough for a depth (default: both)",
     )
+    phase = parser.add_argument_group("phase (one fringe, nothing learned)")
+    phase.add_argument("--fringe", choices=("horizontal", "vertical"), help="the one fringe (default: horizontal)")
+    phase.add_argument(
+        "--prior",
+        choices=("none", "standoff"),
+        help="standoff: tell it that objects stand near the rig's standoff, true of fixed placement (default: none)",
+    )
+    phase.add_argument(
+        "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
+    )
+    phase.add_argument(
+        "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
+    )
     network = parser.add_argument_group("trained networks")
     network.add_argument(
         "--range",
@@ -103,13 +116,15 @@ def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, A
 
 
 def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
-    return {}
+    chosen: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
+    chosen["shading"] = None if args.no_shading is None else False
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 _MAKERS = {"classical": _classical, "phase": _phase}
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction"),
-    "phase": (),
+    "phase": ("fringe", "prior", "no_shading", "min_confidence"),
     "network": ("depth_range", "frame", "device"),
 }
 """What belongs to one kind of method only, by its name in the parsed arguments."""
