@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from fpp_ml_bench.evaluation.numbers import signed
+from fpp_ml_bench.evaluation.numbers import percent
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.paper import paper_tables
@@ -22,33 +22,34 @@ _OTHER_TRACK = "*"
 
 @dataclass(frozen=True)
 class Column:
-    """``text`` makes the cell of a line; ``terminal`` says whether it is shown there too, where there is less room."""
+    """``text`` makes the cell of a line; ``short`` is the title in a terminal, None for what there is no room for."""
 
     title: str
+    short: str | None
     text: Callable[[Line], str]
     right: bool = True
-    terminal: bool = True
 
 
 def columns(preset: str) -> tuple[Column, ...]:
     """The table's columns."""
     here, paper = f"{HERE}, {preset} preset", BY_THE_PAPER
+    twin = f"object MAE / of its measured pixels / missing pixels, {HERE}"
     return (
-        Column("Row", lambda line: line.label, right=False),
-        Column("Track", lambda line: "-" if line.entry is None else line.entry.result.track, False, False),
-        Column(f"Object MAE / RMSE, {here}", lambda line: _pair(_ours(line), "object")),
-        Column(f"95% interval of the object MAE, {HERE}", _interval),
-        Column(f"Object MAE / RMSE, {paper}", lambda line: _pair(line.paper_mm, "object")),
-        Column(f"Overall MAE / RMSE, {here}", lambda line: _pair(_ours(line), "overall")),
-        Column(f"Overall MAE / RMSE, {paper}", lambda line: _pair(line.paper_mm, "overall")),
-        Column(f"Background MAE / RMSE, {here}", lambda line: _pair(_ours(line), "background"), terminal=False),
-        Column(f"Background MAE / RMSE, {paper}", lambda line: _pair(line.paper_mm, "background"), terminal=False),
-        Column(f"Object MAE, range predicted, {HERE}", _twin(PREDICTED)),
-        Column(f"Object MAE, range of the training mean, {HERE}", _twin(MEAN)),
-        Column("Parameters", _parameters, terminal=False),
-        Column("Epochs", lambda line: _setting(line, "epochs_trained")),
-        Column("Training, s", lambda line: _setting(line, "training_seconds")),
-        Column("Latency, ms", _latency),
+        Column("Row", "Row", lambda line: line.label, right=False),
+        Column("Track", None, lambda line: "-" if line.entry is None else line.entry.result.track, right=False),
+        Column(f"Object MAE / RMSE, {here}", "Object, here", lambda line: _pair(_ours(line), "object")),
+        Column(f"95% interval of the object MAE, {HERE}", "95% of MAE", _interval),
+        Column(f"Object MAE / RMSE, {paper}", "Object, paper", lambda line: _pair(line.paper_mm, "object")),
+        Column(f"Overall MAE / RMSE, {here}", "Overall, here", lambda line: _pair(_ours(line), "overall")),
+        Column(f"Overall MAE / RMSE, {paper}", "Overall, paper", lambda line: _pair(line.paper_mm, "overall")),
+        Column(f"Background MAE / RMSE, {here}", None, lambda line: _pair(_ours(line), "background")),
+        Column(f"Background MAE / RMSE, {paper}", None, lambda line: _pair(line.paper_mm, "background")),
+        Column(f"Range predicted: {twin}", "Range predicted", lambda line: _twin(line, PREDICTED)),
+        Column(f"Range of the training mean: {twin}", None, lambda line: _twin(line, MEAN)),
+        Column("Parameters", None, _parameters),
+        Column("Epochs", "Epochs", lambda line: _setting(line, "epochs_trained")),
+        Column("Training, s", "s", lambda line: _setting(line, "training_seconds")),
+        Column("Latency, ms", "ms", _latency),
     )
 
 
@@ -78,10 +79,16 @@ def table_rich(table: str, lines: Sequence[Line], preset: str) -> "Table":
     from rich.table import Table
     from rich.text import Text
 
-    shown = [column for column in columns(preset) if column.terminal]
-    made = Table(title=Text(f"{paper_tables()[table].title}; errors in mm"), title_justify="left")
+    shown = [column for column in columns(preset) if column.short is not None]
+    made = Table(
+        title=Text(
+            f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {HERE}, {preset} preset; paper: {BY_THE_PAPER}. "
+            "Range predicted: object MAE / of its measured pixels / missing pixels"
+        ),
+        title_justify="left",
+    )
     for column in shown:
-        made.add_column(Text(column.title), justify="right" if column.right else "left", overflow="fold")
+        made.add_column(Text(column.short or ""), justify="right" if column.right else "left", overflow="fold")
     for line in lines:
         made.add_row(*(Text(column.text(line)) for column in shown))
     return made
@@ -93,9 +100,9 @@ def orderings_said(found: Sequence[Ordering]) -> str:
         return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
     count = {word: sum(item.verdict == word for item in found) for word in ("holds", "within noise", "reversed")}
     return (
-        f"Of the paper's {len(found)} pairwise orderings by object MAE among the rows measured here, {count['holds']} "
-        f"hold, {count['within noise']} are within noise (the interval of the paired difference holds 0), "
-        f"{count['reversed']} are reversed."
+        f"The paper's pairwise orderings by object MAE, {len(found)} among the rows measured here: {count['holds']} "
+        f"hold, {count['within noise']} within noise (the 95% interval of the paired difference holds 0), "
+        f"{count['reversed']} reversed."
     )
 
 
@@ -135,7 +142,8 @@ def _twins_said(lines: Sequence[Line]) -> list[str]:
         said += [
             "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought "
             "to mm with a range predicted by a small head from the image, or with the mean range of the training "
-            "samples. What lies between them and the row's own object MAE is what the oracle was worth.",
+            "samples. What their object MAE exceeds the row's own by is what the oracle was worth: range and mask, for "
+            "a twin must also say where the object is, and an object pixel that it misses costs its whole depth.",
             "",
         ]
     if without:
@@ -154,9 +162,9 @@ def _orderings(found: Sequence[Ordering], lines: Sequence[Line]) -> list[str]:
         [
             markdown_text(item.better),
             markdown_text(item.worse) + ("" if item.same_track else f" \\{_OTHER_TRACK}"),
-            f"{item.paper_gap_mm:.2f}",
-            signed(item.gap_mm),
-            "-" if item.interval_mm is None else f"{signed(item.interval_mm[0])} to {signed(item.interval_mm[1])}",
+            f"{item.paper_gap_mm:+.2f}",
+            f"{item.gap_mm:+.2f}",
+            "-" if item.interval_mm is None else f"{item.interval_mm[0]:+.2f} to {item.interval_mm[1]:+.2f}",
             item.verdict,
         ]
         for item in found
@@ -194,13 +202,14 @@ def _interval(line: Line) -> str:
     return " - ".join(f"{end:.2f}" for end in line.scored.interval_mm)
 
 
-def _twin(variant: Variant) -> Callable[[Line], str]:
-    def text(line: Line) -> str:
-        entry = line.twins.get(variant.suffix)
-        value = None if entry is None else entry.value(MAIN_KEY)
-        return "-" if value is None else f"{value:.2f}"
-
-    return text
+def _twin(line: Line, variant: Variant) -> str:
+    """Object MAE, that of the pixels the twin measured, and the share that it did not."""
+    entry = line.twins.get(variant.suffix)
+    if entry is None:
+        return "-"
+    errors = (entry.value(key) for key in (MAIN_KEY, "object_valid_mae_mm"))
+    cells = ["-" if value is None else f"{value:.2f}" for value in errors]
+    return " / ".join([*cells, percent(entry.value("object_missing_share"))])
 
 
 def _setting(line: Line, key: str) -> str:
