@@ -29,7 +29,7 @@ RIDGE_STRENGTHS = tuple(10.0 ** (power / 2) for power in range(-8, 9))
 MASK_DECAY = 1e-6
 LOGIT_LIMIT, LOGIT_STEP = 20.0, 0.05
 _SEED = 42
-_PIXELS_AT_ONCE = 8 * 224 * 224
+_PIXELS_AT_ONCE = 4 * 224 * 224
 
 
 def fit_heads(
@@ -97,7 +97,7 @@ class _Pairs:
         self.device = next(network.parameters()).device
         height, width = source.size
         self.size = (height, width)
-        self.batch = max(1, min(8, _PIXELS_AT_ONCE // (height * width)))
+        self.batch = max(1, min(4, _PIXELS_AT_ONCE // (height * width)))
 
     def __len__(self) -> int:
         return len(self.order)

@@ -111,7 +111,7 @@ def test_every_network_comes_back_as_it_was(tmp_path, name):
     model = load(tmp_path / "net.safetensors", "cpu")
     image = np.random.default_rng(1).random(size, dtype=np.float32)
     with torch.no_grad():
-        expected = network(torch.from_numpy(image)[None, None])[0, 0].numpy()
+        expected = network.to(memory_format=torch.channels_last)(torch.from_numpy(image)[None, None])[0, 0].numpy()
     np.testing.assert_array_equal(model.predict(image), expected)
     assert model.parameters == sum(p.numel() for p in network.parameters())
     assert not model.network.training and not any(p.requires_grad for p in model.network.parameters())
