@@ -89,7 +89,8 @@ def reproduce(wish: Wish) -> Outcome:
 def _work(wish: Wish, outcome: Outcome) -> None:
     """Every job in turn, until the minutes run out."""
     jobs, folders = outcome.jobs, wish.folders
-    started, taken = perf_counter(), []
+    started = perf_counter()
+    taken: list[float] = []
     for number, job in enumerate(jobs, 1):
         left = None if wish.minutes is None else wish.minutes - (perf_counter() - started) / 60
         trained = is_trained(folders.training(job.recipe))

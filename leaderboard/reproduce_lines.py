@@ -8,6 +8,7 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.leaderboard.reproduce_frames import AllFrames, all_frames_that_hold
 from fpp_ml_bench.leaderboard.reproduce_plan import MEAN, PREDICTED, Folders, Job, Place, places, variants
 from fpp_ml_bench.leaderboard.reproduce_row import file_sha256, row_that_holds
+from fpp_ml_bench.leaderboard.reproduce_training import current_weights
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.store import DatasetFolder
 
@@ -54,8 +55,8 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
 
 
 def _lines_of(place: Place, job: Job, folders: Folders, opened: DatasetFolder) -> list[Line]:
-    recipe, weights = job.recipe, folders.weights(job.recipe)
-    if not weights.is_file():
+    recipe, weights = job.recipe, current_weights(job.recipe, folders)
+    if weights is None:
         return [Line(place, recipe, place.label, None, None, place.errors_mm)]
     sha256 = file_sha256(weights)
     main, *others = variants(recipe)

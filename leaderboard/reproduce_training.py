@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from fpp_ml_bench.baselines.training.engine import DONE, RECIPE, TrainingRun
+from fpp_ml_bench.baselines.training.engine import DONE, RECIPE, WEIGHTS, TrainingRun
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.leaderboard.reproduce_plan import PREDICTED, Folders, Job, variants
@@ -95,6 +95,14 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
     content = {"made_from_sha256": source, "sha256": file_sha256(target)}
     write_atomically(record, (json.dumps(content) + "\n").encode("utf-8"))
     return target
+
+
+def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
+    """What `finished_weights` made of the training as it is now; None while it is unfinished or not yet taken over."""
+    out, target = folders.training(recipe), folders.weights(recipe)
+    if not is_trained(out) or not (out / WEIGHTS).is_file():
+        return None
+    return target if _made_from(target.with_suffix(".json"), target, file_sha256(out / WEIGHTS)) else None
 
 
 def _add_heads(weights: Path, opened: DatasetFolder, target: Path) -> None:
