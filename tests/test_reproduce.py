@@ -1,12 +1,15 @@
 """`fpp-bench reproduce` from trainings to tables, with trainings that take no time: what is made, kept and refused."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
 
+from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import engine
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.setup import model_config
@@ -15,7 +18,7 @@ from fpp_ml_bench.commands import main
 from fpp_ml_bench.commands.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
 from fpp_ml_bench.evaluation.evaluator import evaluate
-from fpp_ml_bench.leaderboard import reproduce, reproduce_plan, reproduce_training
+from fpp_ml_bench.leaderboard import reproduce, reproduce_plan, reproduce_row, reproduce_training
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.reproduce_frames import (
     all_frames_that_hold,
@@ -31,8 +34,19 @@ NAMES = ("cpu-unet-raw-rmse", "cpu-unet-global-rmse", "cpu-unet-individual-rmse"
 TWINS = tuple(f"cpu-unet-individual-rmse-range-{source}" for source in ("predicted", "mean"))
 
 
+@cache
+def _timing(folder):
+    opened = DatasetFolder(folder)
+    return time_method(opened, ClassicalMethod(opened.rig, steps=3), repeats=1)
+
+
+def measured_once(opened, method, split, repeats):
+    """A timing of something else, for tests that are not about time."""
+    return _timing(opened.path).model_copy(update={"frames": len(method.frames_used)})
+
+
 @pytest.fixture(autouse=True)
-def small(monkeypatch, opened):
+def small(monkeypatch, opened, request):
     """Recipes at the tiny dataset's size, networks of width 1, 2 timed runs a method, heads of few pairs."""
 
     def tiny_recipe(name, preset="cpu"):
@@ -43,6 +57,8 @@ def small(monkeypatch, opened):
     monkeypatch.setattr("fpp_ml_bench.leaderboard.reproduce_row.REPEATS", 2)
     for what in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
         monkeypatch.setattr(f"fpp_ml_bench.baselines.range_heads.{what}", 4)
+    if "from_trainings" not in request.node.name:  # there the time is really measured
+        monkeypatch.setattr(reproduce_row, "time_method", measured_once)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -85,6 +101,12 @@ def trainer(monkeypatch):
     made = Trainer()
     monkeypatch.setattr(reproduce, "train", made)
     return made
+
+
+@pytest.fixture
+def unscored(monkeypatch):
+    """Trainings only: nothing is predicted or scored."""
+    monkeypatch.setattr(reproduce, "_score", lambda *arguments: None)
 
 
 @pytest.fixture
@@ -158,28 +180,28 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert before != after and len(trainer.trained) == 4
 
 
-def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, tmp_path, capsys):
+def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, tmp_path, capsys):
     trainer.says["unet-global-rmse"] = "out of time"
     assert run(TABLE, "--minutes", "5") == 1
     out = capsys.readouterr().out
     assert "Stopped at unet-global-rmse after 5 minutes. Go on with: fpp-bench reproduce normalization" in out
     assert "--only-missing --minutes 5" in out
     text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
-    assert "Not measured here: global, individual. To fill: `fpp-bench reproduce normalization" in text
+    assert "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization" in text
     trainer.says.clear()
     assert run(TABLE, "--only-missing", "--minutes", "5") == 0
 
 
-def test_a_training_that_fails_does_not_stop_the_others(run, trainer, tmp_path, capsys):
+def test_a_training_that_fails_does_not_stop_the_others(run, trainer, unscored, tmp_path, capsys):
     trainer.says["unet-global-rmse"] = TrainingError("training diverged: loss is not finite in batch 3")
     assert run(TABLE) == 2
     assert "1 of 3 rows could not be made:\n  unet-global-rmse: training diverged" in capsys.readouterr().err
     text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
-    assert "- global: training diverged" in text and "Not measured here: global." in text
+    assert "- global: training diverged" in text
     assert len(trainer.trained) == 2
 
 
-def test_ctrl_c_leaves_what_is_done_and_a_table(run, trainer, tmp_path):
+def test_ctrl_c_leaves_what_is_done_and_a_table(run, trainer, unscored, tmp_path):
     trainer.says["unet-global-rmse"] = KeyboardInterrupt()
     assert run(TABLE) == 130
     assert (tmp_path / "runs" / "cpu" / f"{TABLE}.md").is_file()
@@ -202,7 +224,7 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
 
 
-def test_the_papers_preset_needs_a_gpu(run, trainer, monkeypatch, capsys):
+def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
     monkeypatch.setattr(reproduce_training, "_gpu", lambda: False)
     assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2
     said = capsys.readouterr().err
