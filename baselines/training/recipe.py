@@ -120,6 +120,8 @@ class Recipe(StrictModel):
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
         if (self.loss.name == "gan") != (self.network == "pix2pix"):
             raise ValueError("loss gan and network pix2pix belong together")
+        if self.network == "pix2pix" and self.normalisation != "individual":
+            raise ValueError("network pix2pix answers in [0, 1], so its normalisation must be individual")
         return self
 
     @property
