@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background
 
-DIFFERENT_SIGMAS = 4.5
-"""A pixel this far from the empty scene is not background: one in 150,000 of a normal distribution."""
+DIFFERENT_SIGMAS = 3.5
+"""A pixel this far from the empty scene is not background: noise alone does it to one in 2,000, which stay alone."""
 CLOSING_PERIODS = 0.27
+OBJECT_BONUS = 4.0
+"""Added to the plane's squared misfit, in sigmas: a pixel that both explain is object."""
+UNLIT_PERIODS = 0.8
+UNLIT_SIGMAS = 4.0
+"""Brightest grey level, above ambient light, of what counts as unlit."""
 LEAST_AREA_PERIODS = 0.1
 """Smallest object, and largest hole that is closed, in squares of one period."""
 
@@ -48,6 +53,13 @@ def object_region(background: Background, period_px: float) -> NDArray[np.bool_]
     return found | ~without_small(~found, area)
 
 
+def unlit(grey: NDArray[np.float32], ambient: float, noise: float, period_px: float) -> NDArray[np.bool_]:
+    """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first."""
+    size = 2 * round(UNLIT_PERIODS * period_px / 2) + 1
+    filled = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return filled < ambient + UNLIT_SIGMAS * noise
+
+
 def refined(
     region: NDArray[np.bool_],
     background: Background,
@@ -65,7 +77,7 @@ def refined(
     as_plane = (background.residual / noise) ** 2
     with np.errstate(invalid="ignore"):
         as_object = (grey - predicted) ** 2 / (noise**2 + fringe_noise**2)
-        nearer = as_object < as_plane
+        nearer = as_object < as_plane + OBJECT_BONUS
     ring = cv2.dilate(region.astype(np.uint8), disk(reach_px)) > 0
     clear = different(background)
     # What differs stays; what does not is object where its fringe explains it better, background elsewhere at the rim.

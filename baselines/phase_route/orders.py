@@ -1,8 +1,8 @@
 """The question which order each pixel has, and its answer without learning.
 
 `Question` holds all that a chooser may look at, on a grid of every `STRIDE`-th pixel: for each candidate its residual
-phase, depth and the brightness it would mean, and what was seen. `by_shading_and_smoothness` answers it with belief
-propagation; a learned chooser with the same signature can take its place (`PhaseRoute(rig, settings, chooser)`).
+phase, depth and the brightness it would mean, and what was seen. `by_shading_and_smoothness` answers it with a least
+energy; a learned chooser with the same signature can take its place (`PhaseRoute(rig, settings, chooser)`).
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates
-from fpp_ml_bench.baselines.phase_route.labels import LARGE, best_and_margin, propagate
+from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.phase_route.shading import irradiance
@@ -21,7 +21,7 @@ from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
 
-STRIDE = 2
+STRIDE = 3
 LEAST_BRIGHTNESS = 1e-3
 """Least irradiance whose logarithm is taken, 1/m^2: a surface turned away."""
 
@@ -76,7 +76,7 @@ def ask(
 
 
 def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) -> tuple[NDArray[np.int32], Image]:
-    """The chooser without learning: brightness and prior as costs, smoothness by `propagate`."""
+    """The chooser without learning: brightness and prior as costs, smoothness by `least_energy`."""
     cost = np.zeros_like(question.residual_rad)
     if settings.shading:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -94,8 +94,7 @@ def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) 
     link_x, link_y = (
         (a & b).astype(np.float32) for a, b in ((inside[:, 1:], inside[:, :-1]), (inside[1:], inside[:-1]))
     )
-    belief = propagate(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
-    return best_and_margin(belief)
+    return least_energy(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
 
 
 def spread_over_pixels(

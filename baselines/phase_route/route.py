@@ -14,10 +14,11 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLaye
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background, EmptyScene
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, fringe_fit
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement, Reason
-from fpp_ml_bench.baselines.phase_route.object_mask import object_region, refined
+from fpp_ml_bench.baselines.phase_route.object_mask import object_region, refined, unlit
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.phase_route.shading import phase_slopes, wrapped
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decode_blocks import MIN_MODULATION
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.rig import Rig
 
@@ -29,6 +30,9 @@ RING_PERIODS = 0.14
 """How far from the first mask's silhouette a pixel may change sides."""
 FRINGE_NOISE = 0.03
 """Uncertainty of a fringe carried on beyond its window, as a share of its brightness."""
+
+DARKEST_GREY = MIN_MODULATION / 4
+"""What is object and darker than this has no fringe at all: it lies in shadow or faces away, and gets no depth."""
 
 
 class Stopwatch:
@@ -81,12 +85,17 @@ class PhaseRoute:
         if crop is None:
             return nothing(shape, background, watch)
         grey, inside = image[crop].astype(np.float32), region[crop]
+        if mask is None:
+            dark = unlit(grey, background.ambient_grey, background.noise_grey, self.period_px)
+            inside = inside & ~dark
+        watch.done("mask")
         layer = self.layer.at(crop)
         fit = self.fit_phase(grey, inside, self._carrier[crop], background)
         watch.done("phase")
         if mask is None:
             inside = self._refine(grey, inside, fit, background, crop)
             watch.done("mask")
+            inside &= ~dark & (fit.brightness > DARKEST_GREY)
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
