@@ -23,9 +23,10 @@ from fpp_ml_bench.rig import Rig
 Image = NDArray[np.float32]
 
 HALF_CONFIDENCE_MM = 5.0
-LEAST_MARGIN = 0.5
-"""Margin of belief at which the odds of two orders are e to 1, by convention, times `MARGIN_SCALE`."""
-MARGIN_SCALE = 1.0
+LEAST_MARGIN = 0.1
+"""How clearly an order must have won, of 1 for brightness that rules the rival out, not to be called ambiguous."""
+MARGIN_SCALE = 0.12
+"""Margin by which the odds of two orders grow e-fold."""
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
 """Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""

@@ -22,6 +22,9 @@ TILE_NOISE_GREY = 3.0
 """Largest misfit of a tile that may be background: three times the benchmark's noise."""
 LEAST_SHARE = 0.02
 """Of the image's tiles that must show background for the image to calibrate itself."""
+STRENGTH_TOLERANCE = 0.4
+"""Of the lamp's strength in one image against the calibrated one. A surface in range whose fringe happens to lie in
+phase with the plane's is two to four times as bright, and must not pass for it."""
 SAMPLE_STEP_PX = 5
 FLOOR_NOISE_GREY = 0.3
 """Rounding to whole grey levels alone."""
@@ -113,7 +116,8 @@ class EmptyScene:
             covariance = self._tiles(grey * self._light) - mean * self._mean
             slope = covariance / spread
             misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
-            good = (misfit < TILE_NOISE_GREY) & (slope > 0) & (spread > 1e-2 * spread.max())
+            good = (misfit < TILE_NOISE_GREY) & (spread > 1e-2 * spread.max())
+            good &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
         if not good.any():
             return good
         usual = float(np.median(slope[good]))

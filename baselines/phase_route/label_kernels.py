@@ -48,7 +48,7 @@ def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ign
                     continue
                 left = link_x[i, j - 1] if j > 0 else none
                 up = link_y[i - 1, j] if i > 0 else none
-                ahead, behind = (right > none) + (down > none), (left > none) + (up > none)
+                ahead, behind = int(right > none) + int(down > none), int(left > none) + int(up > none)
                 _gather(unary, messages, i, j, total)
                 for a in range(count):
                     total[a] = total[a] / np.float32(max(ahead, behind))
@@ -64,7 +64,7 @@ def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ign
                     continue
                 right = link_x[i, j] if j < width - 1 else none
                 down = link_y[i, j] if i < height - 1 else none
-                ahead, behind = (right > none) + (down > none), (left > none) + (up > none)
+                ahead, behind = int(right > none) + int(down > none), int(left > none) + int(up > none)
                 _gather(unary, messages, i, j, total)
                 for a in range(count):
                     total[a] = total[a] / np.float32(max(ahead, behind))

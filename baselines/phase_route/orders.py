@@ -1,6 +1,6 @@
 """The question which order each pixel has, and its answer without learning.
 
-`Question` holds all that a chooser may look at, on a grid of every `STRIDE`-th pixel: for each candidate its residual
+`Question` holds all that a chooser may look at, on a grid of every `stride`-th pixel: for each candidate its residual
 phase, depth and the brightness it would mean, and what was seen. `by_shading_and_smoothness` answers it with a least
 energy; a learned chooser with the same signature can take its place (`PhaseRoute(rig, settings, chooser)`).
 """
@@ -8,6 +8,7 @@ energy; a learned chooser with the same signature can take its place (`PhaseRout
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,10 @@ from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
 
-STRIDE = 3
+NODES_PER_PERIOD = 7.5
+"""Grid points along a period: every third pixel at 960 px."""
+EVIDENCE_PERIODS = 2.0
+"""Side of the square over which evidence for an order is averaged: one pixel's brightness alone proves nothing."""
 LEAST_BRIGHTNESS = 1e-3
 """Least irradiance whose logarithm is taken, 1/m^2: a surface turned away."""
 
@@ -30,7 +34,7 @@ LEAST_BRIGHTNESS = 1e-3
 class Question:
     """K candidates a pixel on the grid (h, w), nearest order first: ``residual_rad``, ``depth_mm``, ``exists`` and
     ``irradiance`` (1/m^2) are (K, h, w); ``brightness``: measured, in the same 1/m^2; ``trust`` 0 to 1: how much the
-    brightness says there (rims and dark slopes say little); ``inside``: object.
+    brightness says there (rims and dark slopes say little); ``inside``: object; ``stride``: image px a grid step.
     """
 
     residual_rad: Image
@@ -40,10 +44,12 @@ class Question:
     brightness: Image
     trust: Image
     inside: NDArray[np.bool_]
+    stride: int
+    period_px: float
 
 
 Chooser = Callable[[Question, Rig, Settings], tuple[NDArray[np.int32], Image]]
-"""Place of the chosen candidate int32 (h, w), and the margin to the second best, float32, larger is surer."""
+"""Place of the chosen candidate int32 (h, w), and how clearly it won, float32: 0 a tie, 1 or more beyond doubt."""
 
 
 def ask(
@@ -56,11 +62,13 @@ def ask(
     rig: Rig,
     crop: tuple[slice, slice],
     strength: float,
+    period_px: float,
 ) -> Question:
     """The question for a part of the image: arrays (H, W) of the pixels ``crop``; ``strength`` from `Background`."""
-    grid = (slice(None, None, STRIDE), slice(None, None, STRIDE))
+    stride = max(1, round(period_px / NODES_PER_PERIOD))
+    grid = (slice(None, None, stride), slice(None, None, stride))
     here = layer.at(grid)
-    where = tuple(slice(one.start, one.stop, STRIDE) for one in crop)
+    where = tuple(slice(one.start, one.stop, stride) for one in crop)
     count = np.maximum(candidates.count[grid], 1)
     first, phase = candidates.first[grid], phase_rad[grid]
     steps = range(int(count.max(initial=1)))
@@ -72,7 +80,7 @@ def ask(
     seen = fit.brightness[grid] / np.float32(strength / 2)
     trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * np.clip(seen * rig.standoff_m**2, 0.02, 1) ** 2
     exists = np.stack([k < count for k in steps])
-    return Question(residual, depth, exists, light, seen, trust.astype(np.float32), inside[grid])
+    return Question(residual, depth, exists, light, seen, trust.astype(np.float32), inside[grid], stride, period_px)
 
 
 def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) -> tuple[NDArray[np.int32], Image]:
@@ -88,13 +96,33 @@ def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) 
     if settings.prior == "standoff":
         off = np.abs(question.depth_mm - np.float32(rig.standoff_m * MM_PER_M)) / 100
         cost += np.float32(settings.prior_cost) * np.minimum(np.nan_to_num(off, nan=10.0), 10)
-    cost *= STRIDE * STRIDE
     inside = question.inside
+    proof = cost / np.float32(
+        max(settings.shading_cost * settings.shading_limit * settings.shading, settings.prior_cost)
+    )
+    proof[~question.exists] = 2.0
+    cost *= question.stride**2
     cost = np.where(inside, np.where(question.exists, cost, LARGE), np.float32(0)).astype(np.float32)
     link_x, link_y = (
         (a & b).astype(np.float32) for a, b in ((inside[:, 1:], inside[:, :-1]), (inside[1:], inside[:-1]))
     )
-    return least_energy(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
+    choice, margin = least_energy(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
+    return choice, np.minimum(margin / np.float32(settings.jump_rad), _evidence(proof, choice, question))
+
+
+def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Image:
+    """By how much the nearest rival's cost exceeds the choice's own, averaged over the object's pixels around."""
+    if len(proof) == 1:
+        return np.full(choice.shape, 2.0, np.float32)
+    own = np.take_along_axis(proof, choice[None].astype(np.intp), axis=0)[0]
+    rivals = proof.copy()
+    np.put_along_axis(rivals, choice[None].astype(np.intp), np.inf, axis=0)
+    lead = ((rivals.min(axis=0) - own) * question.inside).astype(np.float32)
+    side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
+    mean = cv2.blur(lead, (side, side), borderType=cv2.BORDER_CONSTANT)
+    return mean / np.maximum(
+        cv2.blur(question.inside.astype(np.float32), (side, side), borderType=cv2.BORDER_CONSTANT), 1e-3
+    )
 
 
 def spread_over_pixels(
@@ -112,5 +140,5 @@ def spread_over_pixels(
         chosen, margin = chosen[y, x], margin[y, x]
     height, width = residual_at_zero.shape
     fine = [chosen, margin]
-    fine = [one.repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width] for one in fine]
+    fine = [one.repeat(question.stride, axis=0).repeat(question.stride, axis=1)[:height, :width] for one in fine]
     return np.rint((fine[0] - residual_at_zero) / TAU).astype(np.int32), fine[1]

@@ -102,7 +102,9 @@ class PhaseRoute:
         near, far = self.rig.working_range_mm
         slack = self.settings.slack_mm
         candidates = orders_in_range(layer, phase, (near - slack, far + slack))
-        question = orders.ask(phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength)
+        question = orders.ask(
+            phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px
+        )
         watch.done("candidates")
         choice, margin = self.chooser(question, self.rig, self.settings)
         order, margin = orders.spread_over_pixels(question, choice, margin, layer.residual_phase(phase, 0.0))
