@@ -19,7 +19,7 @@ SIZE = 96
 
 
 def toed_in() -> Rig:
-    """Another baseline, pitch and range, the projector turned by four degrees about y, ahead of the camera, distorted."""
+    """Another baseline, pitch and range; the projector turned by four degrees, ahead of the camera, distorted."""
     base = paper_rig(SIZE)
     angle = np.deg2rad(4.0)
     rotation = ((np.cos(angle), 0.0, np.sin(angle)), (0.0, 1.0, 0.0), (-np.sin(angle), 0.0, np.cos(angle)))
@@ -36,7 +36,8 @@ def toed_in() -> Rig:
     )
 
 
-RIGS = {"paper": paper_rig(SIZE), "straight": replace(toed_in(), projector=paper_rig(SIZE).projector), "lens": toed_in()}
+STRAIGHT = replace(toed_in(), projector=paper_rig(SIZE).projector)
+RIGS = {"paper": paper_rig(SIZE), "straight": STRAIGHT, "lens": toed_in()}
 
 
 @pytest.fixture(params=RIGS)

@@ -1,6 +1,6 @@
 """The calibration layer as a torch module: the same lines on tensors, with nothing to learn.
 
-Its maps are buffers, so that they move with the module and are saved with it; gradients flow through depth to the phase.
+Its maps are buffers that move with the module; gradients flow through depth to the phase.
 """
 
 import numpy as np

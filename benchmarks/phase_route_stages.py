@@ -1,0 +1,188 @@
+"""What each stage of the phase route adds to the error and the time, and the pictures of docs/phase_route.md.
+
+    python benchmarks/phase_route_stages.py DATASET --split test [--fringe vertical] [--pictures docs/pictures]
+
+Needs a generated dataset (depth_exact) at the size in question, with the frame of the chosen fringe stored:
+``fpp-bench build DATASET --preset full --frames sinusoidal``. One thread.
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route.measurement import Measurement
+from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.pixel_sets import object_mask
+
+SHOWN = ("container_bottle_A60", "large_clamp_A120", "wooden_boards_A0")
+VARIANTS: dict[str, dict] = {
+    "range + shading": {},
+    "range + shading + standoff": {"prior": "standoff"},
+    "range + standoff, no shading": {"prior": "standoff", "shading": False},
+    "range alone": {"shading": False},
+}
+
+
+def compare(found: Measurement, route, target: np.ndarray, exact: np.ndarray) -> dict[str, float]:
+    """Scores of one sample, by stage; mm, rad and percent of object pixels."""
+    inside = object_mask(target)
+    both = inside & (found.depth_mm > 0)
+    layer = route.layer.at(both)
+    residual = layer.residual_phase(found.wrapped_phase[both].astype(np.float64), found.order[both])
+    true = layer.absolute_phase(exact[both]) - layer.infinity_rad - TAU * layer.infinity_order
+    off = residual - true
+    wrong = np.rint(off / TAU)
+    floor = np.abs(layer.depth_of_residual_mm(residual - TAU * wrong) - target[both])
+    error = np.abs(found.depth_mm - target)
+    return {
+        "object MAE mm": error[inside].mean(),
+        "object median mm": np.median(error[inside]),
+        "phase error rad": np.abs(off - TAU * wrong).mean(),
+        "wrong order %": 100 * np.count_nonzero(wrong) / inside.sum(),
+        "right-order MAE mm": error[both][wrong == 0].mean(),
+        "floor (order given) mm": floor.mean(),
+        "missed object %": 100 * np.count_nonzero(inside & ~both) / inside.sum(),
+        "background MAE mm": found.depth_mm[~inside].mean(),
+        "seconds": sum(found.seconds.values()),
+    }
+
+
+def fourier_floor(image: np.ndarray, route, target: np.ndarray, exact: np.ndarray, masked: bool) -> float:
+    """MAE with the order given of Gabor filtering (one Gaussian in frequency at the carrier), for comparison, mm."""
+    inside = object_mask(target)
+    carrier = route.layer.absolute_phase(route.rig.standoff_m * 1000)
+    light = image - image[inside].mean()
+    weight = inside.astype(float) if masked else np.ones(inside.shape)
+    sigma = 0.5 * route.period_px
+    size = 2 * int(3 * sigma) + 1
+    parts = [cv2.GaussianBlur(light * weight * f, (size, size), sigma) for f in (np.cos(carrier), np.sin(carrier))]
+    phase = carrier + np.arctan2(-parts[1], parts[0])
+    layer = route.layer.at(inside)
+    true = layer.absolute_phase(exact[inside]) - layer.infinity_rad - TAU * layer.infinity_order
+    off = phase[inside] - layer.infinity_rad - true
+    off -= TAU * np.rint(off / TAU)
+    return float(np.abs(layer.depth_of_residual_mm(true + off) - target[inside]).mean())
+
+
+def sparsification(samples: list[tuple[np.ndarray, np.ndarray]], shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """MAE of the surest ``shares`` of all pixels by confidence, and by the true error (the best any order can do)."""
+    error = np.concatenate([e for e, _ in samples])
+    sure = np.concatenate([c for _, c in samples])
+    curves = []
+    for key in (-sure, error):
+        running = np.cumsum(error[np.argsort(key, kind="stable")]) / np.arange(1, error.size + 1)
+        curves.append(running[np.maximum((shares * error.size).astype(int) - 1, 0)])
+    return curves[0], curves[1]
+
+
+def run(opened: DatasetFolder, split: str, options: dict) -> tuple[list[dict], list[tuple], dict[str, float]]:
+    method = PhaseMethod(opened.rig, **options)
+    (frame,) = method.frames_used
+    rows, sparse, stages = [], [], {}
+    samples = opened.samples(split)
+    method.route.measure(np.array(opened.frame(samples[0], frame)))  # compiles
+    for sample in samples:
+        found = method.route.measure(np.array(opened.frame(sample, frame)))
+        target, exact = opened.depth_mm(sample), np.maximum(opened.depth_mm(sample, "depth_exact"), 1.0)
+        rows.append(compare(found, method.route, target, exact))
+        inside = object_mask(target) & (found.depth_mm > 0)
+        sparse.append((np.abs(found.depth_mm - target)[inside][::7], found.confidence[inside][::7]))
+        for stage, seconds in found.seconds.items():
+            stages.setdefault(stage, []).append(seconds)
+    return rows, sparse, {stage: float(np.median(seconds)) for stage, seconds in stages.items()}
+
+
+def pictures(opened: DatasetFolder, options: dict, folder: Path, sparse: list[tuple]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    method = PhaseMethod(opened.rig, **options)
+    (frame,) = method.frames_used
+    for sample in SHOWN:
+        image, target = np.array(opened.frame(sample, frame)), opened.depth_mm(sample)
+        found = method.route.measure(image)
+        shown = object_mask(target) | (found.depth_mm > 0)
+        rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+        box = (slice(max(rows[0] - 8, 0), rows[-1] + 8), slice(max(columns[0] - 8, 0), columns[-1] + 8))
+        none = np.where(found.depth_mm > 0, 1.0, np.nan)[box]
+        limits = np.percentile(target[object_mask(target)], [1, 99])
+        panels = (
+            ("fringe, grey levels", image[box], {"cmap": "gray"}),
+            ("wrapped phase, rad", found.wrapped_phase[box], {"cmap": "twilight"}),
+            ("order", found.order[box] * none, {"cmap": "viridis"}),
+            ("depth, mm", found.depth_mm[box] * none, {"vmin": limits[0], "vmax": limits[1]}),
+            (
+                "error, mm",
+                np.where(shown, found.depth_mm - target, np.nan)[box],
+                {"cmap": "RdBu", "vmin": -20, "vmax": 20},
+            ),
+            ("confidence", found.confidence[box] * none, {"vmin": 0, "vmax": 1}),
+        )
+        height, width = image[box].shape
+        figure, axes = plt.subplots(1, 6, figsize=(18, 18 / 6 * height / width + 0.9), layout="constrained")
+        for axis, (title, values, style) in zip(axes, panels, strict=True):
+            drawn = axis.imshow(values, interpolation="nearest", **style)
+            axis.set_title(title, fontsize=11)
+            axis.set_axis_off()
+            figure.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.05)
+        figure.suptitle(f"{sample}, one {method.options.direction} fringe")
+        figure.savefig(folder / f"phase_{sample}.png", dpi=60)
+        plt.close(figure)
+    shares = np.linspace(0.02, 1, 99)
+    by_confidence, best = sparsification(sparse, shares)
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    axis.plot(100 * shares, by_confidence, label="surest first, by confidence")
+    axis.plot(100 * shares, best, "--", label="best possible order")
+    axis.set(xlabel="object pixels kept, %", ylabel="MAE of the kept, mm", ylim=(0, None), xlim=(0, 100))
+    axis.legend()
+    axis.grid(alpha=0.3)
+    figure.savefig(folder / "phase_sparsification.png", dpi=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also write the pictures there")
+    parser.add_argument("--variants", action="store_true", help="also without shading, and with the standoff prior")
+    parser.add_argument("--fourier", action="store_true", help="also the floor of Gabor filtering")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    opened = DatasetFolder(args.dataset)
+    for title, options in VARIANTS.items() if args.variants else list(VARIANTS.items())[:1]:
+        options = {"direction": args.fringe, **options}
+        rows, sparse, stages = run(opened, args.split, options)
+        print(f"\n{args.dataset.name}, {args.split}, {args.fringe} fringe, order by {title}: {len(rows)} samples")
+        print("| stage | mean | median |\n|---|---|---|")
+        for key in rows[0]:
+            values = [row[key] for row in rows]
+            print(f"| {key} | {np.mean(values):.3f} | {np.median(values):.3f} |")
+        print("seconds by stage, median:", ", ".join(f"{stage} {seconds:.3f}" for stage, seconds in stages.items()))
+        if title == "range + shading":
+            shares = np.array([0.5, 0.75, 0.9, 1.0])
+            kept, best = sparsification(sparse, shares)
+            print("MAE mm of the surest 50, 75, 90, 100%:", np.round(kept, 2), "best possible:", np.round(best, 2))
+            if args.pictures:
+                pictures(opened, options, args.pictures, sparse)
+    if args.fourier:
+        route = PhaseMethod(opened.rig, direction=args.fringe).route
+        (frame,) = PhaseMethod(opened.rig, direction=args.fringe).frames_used
+        for masked in (False, True):
+            values = []
+            for sample in opened.samples(args.split):
+                image = np.array(opened.frame(sample, frame), dtype=float)
+                exact = np.maximum(opened.depth_mm(sample, "depth_exact"), 1.0)
+                values.append(fourier_floor(image, route, opened.depth_mm(sample), exact, masked))
+            where = "inside the true mask" if masked else "across edges"
+            print(f"Gabor filter {where}, order given: {np.mean(values):.2f} mm (median {np.median(values):.2f})")
+
+
+if __name__ == "__main__":
+    main()
