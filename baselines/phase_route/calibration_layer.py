@@ -89,8 +89,9 @@ class CalibrationLayer:
         lens = self.lens
         if lens is not None:
             lens = replace(lens, rays=(lens.rays[0][where], lens.rays[1][where], lens.rays[2][where]))
-        maps = (self.infinity_rad, self.infinity_order, self.gain, self.forward)
-        return CalibrationLayer(*(one[where] for one in maps), self.back_m, self.rad_per_unit, lens)
+        infinity, order = self.infinity_rad[where], self.infinity_order[where]
+        gain, forward = self.gain[where], self.forward[where]
+        return CalibrationLayer(infinity, order, gain, forward, self.back_m, self.rad_per_unit, lens)
 
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
         """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole

@@ -118,4 +118,5 @@ def fringe_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: Image, ambie
     g, gx, gy, s = solve_symmetric(matrix, right)
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
     scale = np.float32(1 / window.sigma_px)
-    return FringeFit(carrier_rad + step, g, gx * scale, gy * scale, m(weight))
+    phase = (carrier_rad + step).astype(np.float32)
+    return FringeFit(phase, g, gx * scale, gy * scale, m(weight))

@@ -163,7 +163,7 @@ class PhaseRoute:
         """Maps of the whole image from those of the crop."""
 
         def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
-            whole = np.full(shape, outside, dtype=dtype)
+            whole: NDArray = np.full(shape, outside, dtype=dtype)
             whole[crop] = np.where(inside, part, outside)
             return whole
 

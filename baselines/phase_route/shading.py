@@ -32,9 +32,9 @@ def phase_slopes(residual_rad: Image, inside: NDArray[np.bool_], smooth_px: floa
     size = 2 * int(np.ceil(2.5 * smooth_px)) + 1
     weight = cv2.erode(inside.astype(np.float32), np.ones((3, 3), np.uint8))
     total = np.maximum(cv2.GaussianBlur(weight, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT), 1e-3)
-    slopes = []
+    slopes: list[Image] = []
     for axis in (1, 0):
-        change = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
+        change: NDArray = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
         change = np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
         slopes.append(cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT) / total)
     return slopes[0], slopes[1]
@@ -53,7 +53,11 @@ def irradiance(
         rate = -layer.gain / (residual_rad * residual_rad * layer.forward)
     else:
         rate = (layer.depth_of_residual_mm(residual_rad + 1e-3) / MM_PER_M - z) / 1e-3
-    zx, zy = (rate * slopes[0]).astype(np.float32), (rate * slopes[1]).astype(np.float32)
+    # At a fixed psi depth still changes with the pixel where the projector is turned against the camera.
+    zx, zy = (
+        (rate * slope + _drift(layer, residual_rad, z, axis, crop)).astype(np.float32)
+        for axis, slope in ((1, slopes[0]), (0, slopes[1]))
+    )
     dx, dy = np.float32(1 / rig.camera.fx), np.float32(1 / rig.camera.fy)
     # Tangents of the surface Z (x, y, 1) along the image's rows and columns, and their cross product.
     ax, ay, az = zx * x + z * dx, zx * y, zx
@@ -64,3 +68,14 @@ def irradiance(
     squared = lx * lx + ly * ly + lz * lz
     length = np.sqrt((nx * nx + ny * ny + nz * nz) * squared)
     return -(nx * lx + ny * ly + nz * lz) / (length * squared)
+
+
+def _drift(layer: CalibrationLayer, residual_rad: NDArray, z: Image, axis: int, crop: Crop) -> NDArray | float:
+    """Change of depth in m a px along ``axis`` at a fixed residual phase."""
+    if min(layer.gain.shape) < 2:
+        return 0.0
+    step = crop[axis].step or 1
+    gain, forward = (np.gradient(one, axis=axis) / step for one in (layer.gain, layer.forward))
+    if not gain.any() and not forward.any():
+        return 0.0
+    return (gain / residual_rad - z * forward) / layer.forward

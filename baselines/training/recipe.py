@@ -178,7 +178,9 @@ def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
     if network not in NETWORKS:
         raise RecipeError(f"{path}: network: expected one of {', '.join(NETWORKS)}, got {printable(repr(network), 60)}")
     scale = _preset(preset)
-    merged = _merge(_merge(content, scale["every"], pick=True), scale["networks"].get(network, {}))
+    merged = _merge(content, scale["every"], pick=True)
+    merged = _merge(merged, scale["normalisations"].get(content.get("normalisation"), {}), pick=True)
+    merged = _merge(merged, scale["networks"].get(network, {}))
     return recipe_from_dict({"preset": preset, "size": scale["size"], **merged}, path)
 
 
