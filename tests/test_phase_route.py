@@ -32,6 +32,14 @@ OTHER_RIG = replace(
 )
 
 
+ANGLE = np.deg2rad(5.0)
+TURNED_RIG = replace(
+    RIG,
+    rotation=((np.cos(ANGLE), 0.0, np.sin(ANGLE)), (0.0, 1.0, 0.0), (-np.sin(ANGLE), 0.0, np.cos(ANGLE))),
+    translation_m=(-0.02, -0.14, 0.03),
+)
+
+
 @cache
 def route(direction: str, rig: Rig = RIG, **options: object) -> PhaseRoute:
     return PhaseRoute(rig, Settings(direction=direction, **options))  # type: ignore[arg-type]
@@ -59,6 +67,14 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
         error = np.abs(found.depth_mm - exact_m * 1000)[lit]
         assert error.mean() < 1.0
         assert (found.depth_mm[lit] > 0).all()
+
+
+def test_a_projector_that_is_turned_and_ahead() -> None:
+    exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
+    found = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
+    lit = found.modulation > 5
+    assert lit.mean() > 0.7
+    assert np.abs(found.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
 def test_plane_noise_is_what_the_window_leaves_of_it() -> None:

@@ -36,7 +36,8 @@ def phase_slopes(residual_rad: Image, inside: NDArray[np.bool_], smooth_px: floa
     for axis in (1, 0):
         change: NDArray = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
         change = np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
-        slopes.append(cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT) / total)
+        smooth = cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT)
+        slopes.append((smooth / total).astype(np.float32))
     return slopes[0], slopes[1]
 
 
