@@ -25,7 +25,7 @@ Image = NDArray[np.float32]
 HALF_CONFIDENCE_MM = 5.0
 LEAST_MARGIN = 0.1
 """How clearly an order must have won, of 1 for brightness that rules the rival out, not to be called ambiguous."""
-MARGIN_SCALE = 0.12
+MARGIN_SCALE = 0.04
 """Margin by which the odds of two orders grow e-fold."""
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
