@@ -60,6 +60,18 @@ def fit_heads(
         network.train(was_training)
 
 
+def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str | Path) -> None:
+    """The network of the file ``weights`` with heads fitted on the data it learnt from, as the file ``target``.
+
+    Raises as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written.
+    """
+    from fpp_ml_bench.baselines.model import load
+    from fpp_ml_bench.baselines.weights_file import save_weights
+
+    model = load(weights)
+    save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
+
+
 @dataclass
 class _Batch:
     values: Tensor

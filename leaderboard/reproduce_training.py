@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from fpp_ml_bench.baselines.range_heads import save_with_heads
 from fpp_ml_bench.baselines.training.engine import DONE, RECIPE, WEIGHTS, TrainingRun
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.errors import TrainingError
@@ -87,7 +88,7 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
     if PREDICTED in variants(job.recipe):
-        _add_heads(run.weights, opened, target)
+        save_with_heads(run.weights, opened.path, target)
     else:
         partial = target.with_suffix(".partial")
         shutil.copyfile(run.weights, partial)
@@ -103,15 +104,6 @@ def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
     if not is_trained(out) or not (out / WEIGHTS).is_file():
         return None
     return target if _made_from(target.with_suffix(".json"), target, file_sha256(out / WEIGHTS)) else None
-
-
-def _add_heads(weights: Path, opened: DatasetFolder, target: Path) -> None:
-    from fpp_ml_bench.baselines.model import load
-    from fpp_ml_bench.baselines.range_heads import fit_heads
-    from fpp_ml_bench.baselines.weights_file import save_weights
-
-    model = load(weights)
-    save_weights(target, model.network, model.config, fit_heads(model.network, model.config, opened.path))
 
 
 def _made_from(record: Path, target: Path, source: str) -> bool:

@@ -142,11 +142,11 @@ class _Training:
                 losses = self._train_epoch(display)
                 self._finish_epoch(losses, began)
                 display.epoch_done(self.history[-1])
-        seconds = self.before + perf_counter() - started
+        seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process:
             history.draw_curve(self.out, self.history, self.recipe.title)
             if self.over:
-                summary = {"epochs": self.epoch, "best_epoch": self.best["epoch"], "seconds": round(seconds, 1)}
+                summary = {"epochs": self.epoch, "best_epoch": self.best["epoch"], "seconds": seconds}
                 write_atomically(self.out / DONE, json.dumps(summary).encode())
         self.accelerator.wait_for_everyone()
         best = self.best["epoch"] if self.history else 0

@@ -169,18 +169,21 @@ def table_rows(table: str) -> tuple[str, ...]:
 def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
     """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset.
 
+    The preset scales what the shipped recipes say; what a file of yours says is taken as it stands.
+
     Raises RecipeError for a recipe or preset that there is not, an unknown key, an impossible value, a chain of
     ``extends`` that does not end.
     """
     path = _recipe_path(name_or_path)
-    content = _resolved(path, 0)
+    shipped, own = _resolved(path, 0)
+    content = _merge(shipped, own)
     network = content.get("network")
     if network not in NETWORKS:
         raise RecipeError(f"{path}: network: expected one of {', '.join(NETWORKS)}, got {printable(repr(network), 60)}")
     scale = _preset(preset)
-    merged = _merge(content, scale["every"], pick=True)
+    merged = _merge(shipped, scale["every"], pick=True)
     merged = _merge(merged, scale["normalisations"].get(content.get("normalisation"), {}), pick=True)
-    merged = _merge(merged, scale["networks"].get(network, {}))
+    merged = _merge(_merge(merged, scale["networks"].get(network, {})), own)
     return recipe_from_dict({"preset": preset, "size": scale["size"], **merged}, path)
 
 
@@ -213,20 +216,20 @@ def _recipe_path(name_or_path: str | Path) -> Path:
     return path
 
 
-def _resolved(path: Path, depth: int) -> dict[str, Any]:
-    """Content of a recipe over that of the one it extends."""
+def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Content of a recipe over that of those it extends: of the shipped ones, and of files of the user's."""
     if depth > _LONGEST_CHAIN:
         raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
     content = _read(path)
     parent = content.pop(_EXTENDS, None)
+    mine = not path.resolve().is_relative_to(RECIPES)
     if parent is None:
-        return content
+        return ({}, content) if mine else (content, {})
     if not isinstance(parent, str):
-        raise RecipeError(
-            f"{path}: extends: expected the name of a recipe, like base, got {printable(repr(parent), 60)}"
-        )
+        raise RecipeError(f"{path}: extends: expected a recipe's name, like base, got {printable(repr(parent), 60)}")
     beside = path.parent / parent
-    return _merge(_resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1), content)
+    shipped, own = _resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1)
+    return (shipped, _merge(own, content)) if mine else (_merge(shipped, content), own)
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:

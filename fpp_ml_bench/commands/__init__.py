@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "verify": ("verify", "prove a dataset intact: checksums, missing and foreign files, split leaks"),
     "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),
     "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
+    "train": ("train", "train one recipe, a shipped one or yours, into a weights file"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
     "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
     "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),

@@ -10,9 +10,11 @@ if TYPE_CHECKING:
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (single-shot phase), the name of weights that "
-    "come with the package, a .safetensors file, or a .yaml recipe that has been trained"
+    "come with the package, a .safetensors file, or a recipe that has been trained (loss/l1, mine.yaml)"
 )
 _RECIPE_SUFFIXES = (".yaml", ".yml")
+_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture")
+"""First part of a shipped recipe's name; a test holds it to `fpp_ml_bench.baselines.training.recipe.TABLES`."""
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +61,7 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     kind = args.method if args.method in METHODS else "network"
-    weights = _weights(args.method) if kind == "network" else None
+    weights = _weights(args.method, opened.size[1]) if kind == "network" else None
     for other, options in _OPTIONS.items():
         given = [option for option in options if getattr(args, option) is not None]
         if other != kind and given:
@@ -71,21 +73,36 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
     return method(kind, opened.rig, **_MAKERS[kind](args, opened))
 
 
-def weights_of_recipe(recipe: Path) -> Path:
-    """The weights file that training ``recipe`` left. Raises FppBenchError where there is none."""
+def weights_of_recipe(recipe: str, size: int) -> Path:
+    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
+    wide. Raises FppBenchError where there are none."""
+    from fpp_ml_bench.baselines.training.recipe import PRESETS, load_recipe
     from fpp_ml_bench.errors import RecipeError
+    from fpp_ml_bench.leaderboard.reproduce_plan import RUNS, Folders
+    from fpp_ml_bench.leaderboard.reproduce_training import current_weights
 
-    raise RecipeError(f"{recipe}: a recipe has no weights of its own; train it, and give the .safetensors file")
+    resolved = [load_recipe(recipe, preset) for preset in PRESETS]
+    looked = []
+    for candidate in resolved:
+        below = RUNS / candidate.preset
+        found = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
+        if found is not None and candidate.size == size:
+            return found
+        looked.append(f"{below / candidate.name} ({candidate.size} px)")
+    raise RecipeError(
+        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(looked)}; train it "
+        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
+    )
 
 
-def _weights(name: str) -> Path:
+def _weights(name: str, size: int) -> Path:
     """The weights file that METHOD means, where it is no method of its own."""
     from fpp_ml_bench.baselines.methods import METHODS
     from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
     from fpp_ml_bench.errors import PredictionError, WeightsError
 
-    if name.endswith(_RECIPE_SUFFIXES):
-        return weights_of_recipe(Path(name))
+    if name.endswith(_RECIPE_SUFFIXES) or name.split("/")[0] in _TABLES:
+        return weights_of_recipe(name, size)
     try:
         return weights_path(name)
     except WeightsError:

@@ -1,0 +1,50 @@
+"""``fpp-bench train``: one recipe, one weights file."""
+
+import argparse
+from pathlib import Path
+
+SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
+EXAMPLES = (
+    "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
+    "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
+    "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
+    "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
+)
+MODEL = "model.safetensors"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), or a .yaml")
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to go on with")
+    parser.add_argument(
+        "--preset", choices=("cpu", "paper"), default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
+    )
+    parser.add_argument(
+        "--minutes", type=float, metavar="M", help="stop after the epoch in which they run out, everything saved"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, make the weights usable on their own, say what came out. Raises FppBenchError for what can't be done."""
+    from fpp_ml_bench.baselines.range_heads import save_with_heads
+    from fpp_ml_bench.baselines.training.engine import train
+    from fpp_ml_bench.baselines.training.recipe import load_recipe
+    from fpp_ml_bench.commands import CHECK_FAILED
+    from fpp_ml_bench.errors import RecipeError
+
+    if args.minutes is not None and not 0 < args.minutes < 1e6:
+        raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
+    recipe = load_recipe(args.recipe, args.preset)
+    done = train(recipe, args.dataset, args.out, minutes=args.minutes)
+    if not done.finished:
+        print(f"{args.out}: stopped after {done.epochs} epochs, everything saved; the same command goes on")
+        return CHECK_FAILED
+    weights = done.weights
+    if recipe.normalisation == "individual" and not recipe.background_removed:
+        weights = args.out / MODEL
+        save_with_heads(done.weights, args.dataset, weights)
+    print(f"{weights}: {recipe.title}, epoch {done.best_epoch} of {done.epochs}, {done.seconds:.0f} s")
+    print(f"curve: {done.curve}")
+    print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
+    return 0

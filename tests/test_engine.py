@@ -1,0 +1,237 @@
+"""The training engine: same bits again, same bits after a kill, and a stop where there must be one."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY_SIZE
+
+from fpp_ml_bench.baselines.model import load
+from fpp_ml_bench.baselines.training import engine
+from fpp_ml_bench.baselines.training.display import Display
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, DONE, WEIGHTS, train
+from fpp_ml_bench.baselines.training.history import CURVE_FILE
+from fpp_ml_bench.baselines.training.pairs import epoch_order, spread
+from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
+from fpp_ml_bench.baselines.training.schedules import Schedule
+from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.evaluation.torch_metric import DepthScores
+from fpp_ml_bench.normalisation import denormalise
+
+
+def small(name="normalization/individual", **changes):
+    """A shipped recipe cut down to seconds."""
+    content = load_recipe(name, "cpu").to_dict()
+    content |= {"size": TINY_SIZE, "width": 2, "max_epochs": 3, "pairs_per_epoch": 4, "validation_pairs": 2, "batch": 2}
+    return recipe_from_dict({**content, **changes})
+
+
+def curve_of(run):
+    """The log without what depends on the clock."""
+    records = [json.loads(line) for line in run.log.read_text().splitlines()]
+    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tiny, tmp_path_factory):
+    return train(small(), tiny, tmp_path_factory.mktemp("training") / "run", show=False)
+
+
+def test_what_a_training_leaves(uninterrupted, tiny):
+    assert uninterrupted.finished and uninterrupted.epochs == 3
+    names = {path.name for path in uninterrupted.weights.parent.iterdir()}
+    assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
+    records = curve_of(uninterrupted)
+    assert [record["epoch"] for record in records] == [1, 2, 3]
+    best = min(records, key=lambda record: record["validation_loss"])
+    assert uninterrupted.best_epoch == best["epoch"]
+    model = load(uninterrupted.weights)
+    assert model.config.epoch == best["epoch"]
+    assert model.config.recipe == small().to_dict()
+    assert uninterrupted.curve.read_bytes().startswith(b"\x89PNG")
+    assert train(small(), tiny, uninterrupted.weights.parent, show=False) == uninterrupted
+
+
+def test_the_same_bits_again(uninterrupted, tiny, tmp_path):
+    again = train(small(), tiny, tmp_path / "run", show=False)
+    assert again.weights.read_bytes() == uninterrupted.weights.read_bytes()
+    assert curve_of(again) == curve_of(uninterrupted)
+    other = train(small(seed=43, max_epochs=1), tiny, tmp_path / "other", show=False)
+    assert curve_of(other) != curve_of(uninterrupted)[:1]
+
+
+@pytest.mark.parametrize("batch_of_the_kill", [0, 3])
+def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monkeypatch, batch_of_the_kill):
+    seen = []
+
+    def kill(self):
+        seen.append(1)
+        if len(seen) == batch_of_the_kill + 1:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Display, "step", kill)
+        train(small(), tiny, tmp_path / "run", show=False)
+    resumed = train(small(), tiny, tmp_path / "run", show=False)
+    assert resumed.weights.read_bytes() == uninterrupted.weights.read_bytes()
+    assert curve_of(resumed) == curve_of(uninterrupted)
+
+
+def test_a_gan_paused_is_the_same_too(tiny, tmp_path):
+    recipe = small("architecture/pix2pix", max_epochs=2)
+    whole = train(recipe, tiny, tmp_path / "whole", show=False)
+    with pytest.MonkeyPatch.context() as patch:
+        ticks = iter([0.0, 0.0, 0.0, 0.0, *[3600.0] * 99])
+        patch.setattr(engine, "perf_counter", lambda: next(ticks))
+        paused = train(recipe, tiny, tmp_path / "paused", minutes=1, show=False)
+    assert not paused.finished and paused.epochs == 1 and not (tmp_path / "paused" / DONE).exists()
+    resumed = train(recipe, tiny, tmp_path / "paused", show=False)
+    assert resumed.finished and resumed.weights.read_bytes() == whole.weights.read_bytes()
+    assert curve_of(resumed) == curve_of(whole)
+    assert {"discriminator", "feature_matching"} <= set(curve_of(whole)[0])
+
+
+@pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
+def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation):
+    """Against the torchmetrics metric, fed with what the kept weights predict."""
+    recipe = small(f"normalization/{normalisation}", max_epochs=1, validation_pairs=None)
+    run = train(recipe, tiny, tmp_path / "run", show=False)
+    from fpp_ml_bench.loaders.training import FringeDepthDataset
+
+    data = FringeDepthDataset(tiny, "validation", "single_shot", normalisation)
+    model, metric, losses = load(run.weights), DepthScores(), []
+    for item in data:
+        values = model.predict_representation(item.fringe.numpy())[0]
+        sample = data.samples[int(item.row)]
+        target = data.source.depth_mm(sample).astype(np.float64)
+        low, high = (float(v) for v in item.depth_range_mm)
+        if normalisation == "individual":
+            inside = item.depth[0].numpy() > 0
+            prediction = denormalise(values, "individual", low, high) - low
+            target = np.where(inside, target - low, 0.0)
+        else:
+            prediction = denormalise(values, normalisation, low, high)
+        metric.update(torch.from_numpy(prediction)[None], torch.from_numpy(target)[None])
+        losses.append(math.sqrt(float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8))
+    logged = curve_of(run)[0]
+    found = metric.compute()
+    for key in ("object_mae_mm", "background_mae_mm", "overall_mae_mm"):
+        assert logged[key] == pytest.approx(float(found[key]), rel=1e-5), key
+    assert logged["validation_loss"] == pytest.approx(np.mean(losses), rel=1e-5)
+
+
+def test_many_frames_and_bf16(tiny, tmp_path):
+    recipe = small("multi_frame/vertical", precision="bf16", max_epochs=1)
+    run = train(recipe, tiny, tmp_path / "run", show=True)
+    assert run.finished and math.isfinite(curve_of(run)[0]["training_loss"])
+    assert load(run.weights).config.data_config == "vertical"
+
+
+def test_divergence_names_the_batch(tiny, tmp_path):
+    rule = {"name": "rmsprop", "learning_rate": 1e30, "alpha": 0.99, "weight_decay": 1e-5}
+    with pytest.raises(TrainingError, match=r"training diverged: loss .* in epoch 1, batch 2, samples \w+_A\d+"):
+        train(small(optimizer=rule), tiny, tmp_path / "run", show=False)
+
+
+def test_nothing_that_is_not_finite_is_kept(tiny, tmp_path, monkeypatch):
+    """A network whose training looks sound and whose answer in validation is not."""
+    from fpp_ml_bench.baselines.networks.unet import UNet
+
+    forward = UNet.forward
+    monkeypatch.setattr(UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan))
+    with pytest.raises(TrainingError, match=r"the network's answer to \w+_A\d+ is not finite"):
+        train(small(), tiny, tmp_path / "run", show=False)
+    assert not (tmp_path / "run" / WEIGHTS).exists()
+
+
+def test_refusals(uninterrupted, tiny, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(uninterrupted.weights.parent, folder)
+    with pytest.raises(TrainingError, match="differs in normalisation, optimizer; give another folder"):
+        train(small("normalization/raw"), tiny, folder, show=False)
+    with pytest.raises(TrainingError, match=rf"{TINY_SIZE} px, recipe .* expects 192 x 192; build the size"):
+        train(small(size=192), tiny, tmp_path / "other", show=False)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("precious")
+    with pytest.raises(TrainingError, match=r"holds files but no recipe\.json"):
+        train(small(), tiny, tmp_path / "mine", show=False)
+    (folder / DONE).write_text("{")
+    with pytest.raises(TrainingError, match="is damaged; delete it"):
+        train(small(), tiny, folder, show=False)
+    (folder / DONE).unlink()
+    content = bytearray((folder / CHECKPOINT).read_bytes())
+    content[-100] ^= 1
+    (folder / CHECKPOINT).write_bytes(content)
+    with pytest.raises(TrainingError, match="does not match its own checksum"):
+        train(small(), tiny, folder, show=False)
+    (folder / CHECKPOINT).write_bytes(content[:1000])
+    with pytest.raises(TrainingError, match=r"can't be read .*delete .* to train again"):
+        train(small(), tiny, folder, show=False)
+    shutil.copy(uninterrupted.weights, folder / CHECKPOINT)
+    with pytest.raises(TrainingError, match="expected 'fpp-ml-bench training 1'"):
+        train(small(), tiny, folder, show=False)
+
+
+def test_an_epoch_is_a_permutation_and_rounds_are_fair():
+    assert sorted(epoch_order(12, None, 42, 3)) == list(range(12))
+    assert epoch_order(12, None, 42, 3) != epoch_order(12, None, 42, 4)
+    assert epoch_order(12, None, 42, 3) == epoch_order(12, None, 42, 3)
+    for pairs, drawn in ((12, 4), (12, 5), (7, 7), (5, 9)):
+        walked = [index for epoch in range(24) for index in epoch_order(pairs, drawn, 42, epoch)]
+        counts = np.bincount(walked, minlength=pairs)
+        assert counts.max() - counts.min() <= 1
+        assert len(walked) == 24 * min(pairs, drawn)
+
+
+def test_validation_pairs_come_evenly_from_views_and_frames():
+    for frames in (1, 18, 36, 52):
+        chosen = spread(30 * frames, 30)
+        assert [index // frames for index in chosen] == list(range(30))
+        assert len({index % frames for index in chosen}) >= min(frames, 15)
+    assert spread(5, None) == spread(5, 9) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.1])
+def test_training_ends_when_the_rate_is_at_its_minimum(factor):
+    """1e-4 x 0.1 x 0.1 is 1.0000000000000002e-06: a plain comparison with 1e-6 would never be true."""
+    rule = Plateau(name="plateau", factor=factor, patience=10, minimum=1e-6)
+    schedule, epochs = Schedule(rule, 1e-4), 0
+    while not schedule.finished:
+        schedule.step(1.0)
+        epochs += 1
+        assert epochs < 200
+    # The first epoch sets the best; every 11 bad ones after it lower the rate.
+    assert epochs == 1 + 11 * math.ceil(math.log(1e-2) / math.log(factor) - 1e-9)
+
+
+def test_a_restored_schedule_goes_on():
+    losses = np.random.default_rng(0).uniform(0.5, 1.0, 60).tolist()
+    for rule in (
+        Plateau(name="plateau", factor=0.5, patience=2, minimum=1e-6),
+        Linear(name="linear", constant=20, decay=30),
+    ):
+        whole, rates = Schedule(rule, 1e-4), []
+        for loss in losses:
+            whole.step(loss)
+            rates.append(whole.rate)
+        for stop in (0, 1, 17, 40):
+            first = Schedule(rule, 1e-4)
+            for loss in losses[:stop]:
+                first.step(loss)
+            second = Schedule(rule, 1e-4)
+            second.restore(json.loads(json.dumps(first.state())))
+            for loss, rate in zip(losses[stop:], rates[stop:], strict=True):
+                second.step(loss)
+                assert second.rate == rate
+
+
+def test_a_linear_schedule_is_constant_and_then_falls_to_zero():
+    schedule = Schedule(Linear(name="linear", constant=2, decay=4), 1e-4)
+    rates = []
+    while not schedule.finished:
+        rates.append(schedule.rate)
+        schedule.step(0.0)
+    assert rates == pytest.approx([1e-4, 1e-4, 1e-4, 0.75e-4, 0.5e-4, 0.25e-4])

@@ -1,0 +1,132 @@
+"""Recipes: one a row, each a difference; nothing unknown passes."""
+
+import pytest
+
+from fpp_ml_bench.baselines.training.recipe import (
+    PRESETS,
+    RECIPES,
+    TABLES,
+    Linear,
+    Plateau,
+    load_recipe,
+    recipe_from_dict,
+    table_rows,
+)
+from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.leaderboard.paper import paper_tables
+
+NAMES = [f"{table}/{row}" for table in TABLES for row in table_rows(table)]
+
+
+def test_every_row_of_the_paper_has_a_recipe():
+    assert {table: len(table_rows(table)) for table in TABLES} == {
+        "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 5,
+    }  # fmt: skip
+    for name, table in paper_tables().items():
+        assert [row.row for row in table.rows] == [row for row in table_rows(name) if row != "hformer"]
+    shipped = sorted(str(path.relative_to(RECIPES).with_suffix("")) for path in RECIPES.glob("*/*.yaml"))
+    assert shipped == sorted([*NAMES, *(f"presets/{preset}" for preset in PRESETS)])
+
+
+def test_the_papers_recipe():
+    """Section 5.3: RMSprop 0.99, 1e-4, 1e-5; batch 4; plateau 0.5, 10, 1e-6; seed 42."""
+    recipe = load_recipe("normalization/individual", "paper")
+    rule = recipe.optimizer
+    assert (rule.alpha, rule.learning_rate, rule.weight_decay) == (0.99, 1e-4, 1e-5)
+    assert recipe.schedule == Plateau(name="plateau", factor=0.5, patience=10, minimum=1e-6)
+    assert (recipe.batch, recipe.seed, recipe.size, recipe.width) == (4, 42, 960, 64)
+    assert recipe.pairs_per_epoch is None and recipe.validation_pairs is None
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("table", TABLES)
+def test_rows_of_a_table_differ_in_what_the_table_is_about(table, preset):
+    about = {
+        "normalization": {"normalisation"}, "background_removed": {"normalisation"}, "multi_frame": {"frames"},
+        "loss": {"loss"}, "architecture": {"network", "width", "options", "loss", "schedule"},
+    }[table]  # fmt: skip
+    about |= {"optimizer"} if preset == "cpu" and table in ("normalization", "background_removed") else set()
+    rows = [load_recipe(f"{table}/{row}", preset).to_dict() for row in table_rows(table)]
+    differing = {key for row in rows for key in row if row[key] != rows[0][key]}
+    assert differing <= about
+    assert len({load_recipe(f"{table}/{row}", preset).digest for row in table_rows(table)}) == len(rows)
+
+
+def test_rows_that_are_one_training():
+    digest = load_recipe("normalization/individual").digest
+    assert load_recipe("loss/rmse").digest == load_recipe("multi_frame/frame0").digest == digest
+    assert load_recipe("architecture/unet").digest == load_recipe("loss/hybrid_l1_0.7").digest
+    assert len({load_recipe(name).name for name in NAMES}) == len({load_recipe(name).digest for name in NAMES}) == 23
+
+
+def test_background_is_removed_in_its_table_alone():
+    removed = [name for name in NAMES if load_recipe(name).background_removed]
+    assert removed == [f"background_removed/{row}" for row in table_rows("background_removed")]
+
+
+def test_the_gan_has_its_own_schedule():
+    assert load_recipe("architecture/pix2pix", "paper").schedule == Linear(name="linear", constant=100, decay=100)
+
+
+def test_a_recipe_of_yours(tmp_path):
+    (tmp_path / "parent.yaml").write_text("extends: loss/l1\noptimizer: {learning_rate: 1e-3}\n")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("extends: parent.yaml\nseed: 7\nschedule: {patience: 3}\n")
+    recipe = load_recipe(mine, "paper")
+    assert load_recipe(mine, "cpu").optimizer.learning_rate == 1e-3
+    assert load_recipe(mine, "cpu").width == 8
+    assert (recipe.seed, recipe.loss.name, recipe.optimizer.learning_rate) == (7, "l1", 1e-3)
+    assert recipe.optimizer.weight_decay == 1e-5
+    assert recipe.schedule == Plateau(name="plateau", factor=0.5, patience=3, minimum=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("learning_rat: 1e-3", "learning_rat: is not a key"),
+        ("optimizer: {momentum: 0.9}", "optimizer.momentum: is not a key"),
+        ("batch: 0", "batch: .*greater than or equal to 1"),
+        ("batch: '4'", "batch: .*valid integer"),
+        ("frames: diagonal", "frames: expected one of single_shot"),
+        ("network: vgg", "network: expected one of unet"),
+        ("normalisation: log", "normalisation: "),
+        ("loss: {name: hybrid_l1}", "hybrid_l1 needs alpha"),
+        ("loss: {name: l1, alpha: 0.5}", "l1 takes no alpha"),
+        ("loss: {name: hybrid_l1, alpha: 1.5}", "loss.alpha: "),
+        ("loss: {name: gan}", "belong together"),
+        ("network: pix2pix\nloss: {name: gan}\nnormalisation: raw", r"answers in \[0, 1\]"),
+        ("schedule: {name: cosine}", "schedule: "),
+        ("optimizer: {learning_rate: .nan}", "learning_rate: "),
+        ("precision: fp8", "precision: "),
+        ("seed: -1", "seed: "),
+        ("extends: mine.yaml", "does one extend itself"),
+        ("extends: 3", "expected a recipe's name"),
+        ("extends: loss/l2", "no recipe 'loss/l2'; near it: loss/l1"),
+        ("- a\n- list", "expected keys and values like 'normalisation: raw'"),
+        ("batch: 4\nbatch: 5", "stands twice"),
+    ],
+)
+def test_refused(tmp_path, text, said):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(text if "extends" in text or text.startswith("-") else f"extends: base\n{text}")
+    with pytest.raises(RecipeError, match=said):
+        load_recipe(mine)
+
+
+def test_unknown_names():
+    with pytest.raises(RecipeError, match="expected a table out of normalization"):
+        table_rows("normalisation")
+    with pytest.raises(RecipeError, match="near it: normalization/raw"):
+        load_recipe("normalisation/raw")
+    with pytest.raises(RecipeError, match="expected a preset out of cpu, paper"):
+        load_recipe("base", "gpu")
+    with pytest.raises(RecipeError, match="there is no such recipe file"):
+        load_recipe("nowhere.yaml")
+    with pytest.raises(RecipeError, match="no recipe"):
+        load_recipe("../recipes/base")
+
+
+def test_a_recipe_survives_its_dictionary():
+    for name in NAMES:
+        recipe = load_recipe(name)
+        assert recipe_from_dict(recipe.to_dict()).digest == recipe.digest
