@@ -21,11 +21,16 @@ from fpp_ml_bench.evaluation.result_io import read_result
 from fpp_ml_bench.loaders.store import DatasetFolder
 
 ROWS = Path(__file__).resolve().parent.parent / "leaderboard" / "rows"
-METHODS = (
+CLASSICAL = (
     (18, "both"), (18, "vertical"), (18, "horizontal"), (9, "both"), (9, "vertical"), (6, "vertical"), (4, "vertical"),
     (3, "vertical"),
 )  # fmt: skip
 """Steps and directions of the classical method; 18 is divisible by all but 4, whose phases are not evenly spaced."""
+METHODS: dict[str, tuple[object, ...]] = {
+    **{f"classical-{n:02d}-{way}": ("classical", "--steps", n, "--direction", way) for n, way in CLASSICAL},
+    **{f"phase-{way}": ("phase", "--fringe", way) for way in ("horizontal", "vertical")},
+}
+"""File name of a row: method and options."""
 
 
 def run(command: str, *words: object) -> None:
@@ -37,11 +42,11 @@ def run(command: str, *words: object) -> None:
         sys.exit(status)
 
 
-def make_row(dataset: Path, work: Path, out: Path, steps: int, direction: str, repeats: int) -> None:
+def make_row(dataset: Path, work: Path, out: Path, name: str, repeats: int) -> None:
     """Predictions, time, result, row and picture of one setting."""
-    name = f"classical-{steps:02d}-{direction}"
     predictions, result = work / name, work / f"{name}.json"
-    settings = ["classical", dataset, "--steps", steps, "--direction", direction]
+    method, *options = METHODS[name]
+    settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
     run("fpp-eval", predictions, "--dataset", dataset, "--target", "depth_exact", "--json", result)
@@ -56,14 +61,15 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, help="dataset folder with all frames")
     parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
+    parser.add_argument("--only", nargs="+", choices=METHODS, metavar="NAME", help="these rows alone")
     parser.add_argument("--repeats", type=int, default=40, help="timed runs a method")
     args = parser.parse_args()
     if args.work.exists() and any(args.work.iterdir()):
         parser.error(f"{args.work} is not empty")
     args.work.mkdir(parents=True, exist_ok=True)
     args.out.mkdir(parents=True, exist_ok=True)
-    for steps, direction in METHODS:
-        make_row(args.dataset, args.work, args.out, steps, direction, args.repeats)
+    for name in args.only or METHODS:
+        make_row(args.dataset, args.work, args.out, name, args.repeats)
 
 
 if __name__ == "__main__":

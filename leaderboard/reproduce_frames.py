@@ -91,7 +91,9 @@ def score_all_frames(
             }
     rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
     objects = [split_sample_name(sample)[0] for sample in samples]
-    ends = {key: [None, None] if e is None else list(e) for key, e in _intervals(rows, objects).items()}
+    ends: dict[str, list[float | None]] = {
+        key: [None, None] if e is None else list(e) for key, e in _intervals(rows, objects).items()
+    }
     return AllFrames(
         schema_version="1.0.0",
         protocol_version=PROTOCOL_VERSION,

@@ -65,7 +65,7 @@ def refined(
     background: Background,
     predicted: NDArray[np.float32],
     grey: NDArray[np.float32],
-    fringe_noise: NDArray[np.float32],
+    fringe_noise: NDArray[np.floating],
     reach_px: float,
 ) -> NDArray[np.bool_]:
     """Mask (H, W) after the two predictions have competed within ``reach_px`` of the silhouette.
