@@ -101,9 +101,16 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
 def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
     """What `finished_weights` made of the training as it is now; None while it is unfinished or not yet taken over."""
     out, target = folders.training(recipe), folders.weights(recipe)
-    if not is_trained(out) or not (out / WEIGHTS).is_file():
+    if not is_trained(out) or not (out / WEIGHTS).is_file() or not _is_of(recipe, out / RECIPE):
         return None
     return target if _made_from(target.with_suffix(".json"), target, file_sha256(out / WEIGHTS)) else None
+
+
+def _is_of(recipe: Recipe, record: Path) -> bool:
+    try:
+        return bool(json.loads(record.read_text(encoding="utf-8"))["recipe"] == recipe.to_dict())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _made_from(record: Path, target: Path, source: str) -> bool:

@@ -99,6 +99,8 @@ def test_a_recipe_of_yours(tmp_path):
         ("optimizer: {learning_rate: .nan}", "learning_rate: "),
         ("precision: fp8", "precision: "),
         ("seed: -1", "seed: "),
+        ("normalisation: [raw]", "normalisation: "),
+        ("options: {width: 3}", "options: width and network are keys of their own"),
         ("extends: mine.yaml", "does one extend itself"),
         ("extends: 3", "expected a recipe's name"),
         ("extends: loss/l2", "no recipe 'loss/l2'; near it: loss/l1"),

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor, nn
 
 from fpp_ml_bench.errors import NetworkError
@@ -59,6 +60,16 @@ class FringeNetwork(nn.Module, ABC):
                 f"{self.name} takes heights and widths that are multiples of {stride}, at least {least} px; it was "
                 f"given {height}x{width}; the nearest it takes: {near}; crop, pad or build the dataset at such a size"
             )
+
+
+def in_full_precision(layer: nn.Module, features: Tensor) -> Tensor:
+    """``layer`` of ``features`` outside of autocast, in float32 where that was a half precision: bfloat16 has steps of
+    8 mm at 1.8 m, and the last layer is where mm come out."""
+    kind = features.device.type
+    if not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
+        return layer(features)
+    with torch.autocast(kind, enabled=False):
+        return layer(features.float())
 
 
 def _nearest(side: int, stride: int, least: int) -> str:

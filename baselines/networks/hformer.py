@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.networks.base import (
     FringeNetwork,
+    in_full_precision,
     initialise_convolutions,
     initialise_tokens,
     rate,
@@ -197,4 +198,4 @@ class Hformer(FringeNetwork):
         skips.pop()
         for expand in self.decoder:
             x = expand(x, skips.pop())
-        return self.head(self.up2(self.up1(x)))
+        return in_full_precision(self.head, self.up2(self.up1(x)))

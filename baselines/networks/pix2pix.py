@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, initialise_normal, whole
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_normal, whole
 from fpp_ml_bench.baselines.networks.instance_norm import InstanceNorm
 
 DOWNSAMPLINGS = 4
@@ -53,6 +53,11 @@ class Generator(nn.Sequential):
             *(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, output_padding=1), c) for c in reversed(widths[:-1]))
         )
         self.head = nn.Sequential(_convolution(width, 1, 7, reflect=True), nn.Tanh())
+
+    def forward(self, x: Tensor) -> Tensor:
+        for name, layer in self.named_children():
+            x = in_full_precision(layer, x) if name == "head" else layer(x)
+        return x
 
 
 class Pix2Pix(FringeNetwork):

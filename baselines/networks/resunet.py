@@ -2,7 +2,7 @@
 
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, initialise_convolutions, whole
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_convolutions, whole
 from fpp_ml_bench.baselines.networks.blocks import Join, ResidualBlock
 
 
@@ -53,4 +53,4 @@ class ResUNet(FringeNetwork):
         x = self.bottleneck(skips.pop())
         for block in self.decoder:
             x = block(x, skips.pop())
-        return self.head(x)
+        return in_full_precision(self.head, x)

@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, initialise_convolutions, rate, whole
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_convolutions, rate, whole
 from fpp_ml_bench.baselines.networks.blocks import DoubleConvolution, Join
 
 
@@ -44,7 +44,7 @@ class UShape(FringeNetwork):
         x = self.bottleneck(x)
         for block in self.decoder:
             x = block(x, skips.pop())
-        return self.head(x)
+        return in_full_precision(self.head, x)
 
 
 class UNet(UShape):

@@ -5,7 +5,7 @@
 A training folder holds, after every epoch, all that is needed to go on: ``checkpoint.safetensors`` (everything),
 ``weights.safetensors`` (the epoch of the lowest validation loss), ``log.jsonl``, ``recipe.json``; at the end also
 ``curve.png`` and ``done.json``. On one processor type and number of threads, the same recipe and data give the same
-bits, stopped and resumed or not.
+bits on the CPU, stopped and resumed or not.
 
 The recipe is the paper's (Section 5.3): the rate falls on a plateau of the validation loss, training ends when it has
 reached its minimum, and the weights kept are those of the lowest validation loss. A validation loss is the mean over
@@ -20,8 +20,8 @@ from time import perf_counter
 from typing import Any
 
 import torch
-from accelerate import Accelerator
-from accelerate.utils import gather_object, set_seed
+from accelerate import Accelerator, PartialState
+from accelerate.utils import broadcast_object_list, gather_object, set_seed
 from torch import Tensor
 from torch.optim import RMSprop
 from torch.utils.data import DataLoader
@@ -70,7 +70,8 @@ def train(
 ) -> TrainingRun:
     """Train ``recipe`` on a dataset folder into ``out``, from where ``out`` stands; returns at once if that is the end.
 
-    ``minutes``: stop, with everything saved, after the epoch in which they run out. ``show``: progress on stderr.
+    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one epoch is always
+    trained. ``show``: progress on stderr.
 
     Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a dataset of another image
     size, a loss that is not finite or has diverged (the batch's samples are named); what else recipe, dataset or
@@ -92,10 +93,13 @@ class _Training:
 
     def __init__(self, recipe: Recipe, training: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
         self.recipe, self.out, self.training, self.validation = recipe, out, training, validation
-        self.accelerator = Accelerator(mixed_precision="no" if recipe.precision == "fp32" else recipe.precision)
+        precision = "no" if recipe.precision == "fp32" else recipe.precision
+        self.accelerator = Accelerator(mixed_precision=precision, gradient_accumulation_steps=1)
         on_gpu = self.accelerator.device.type == "cuda"
         set_seed(recipe.seed)
         self.objective: Objective = objective_of(recipe)
+        # The networks themselves, whatever compiles or distributes them: they are validated, saved and restored.
+        self.bare = dict(self.objective.modules)
         if on_gpu:
             for module in self.objective.modules.values():
                 module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -119,6 +123,8 @@ class _Training:
         self.before = 0.0  # seconds of earlier calls
         if (out / CHECKPOINT).exists():
             self._resume()
+        if len(set(gather_object([self.epoch]))) > 1:
+            raise TrainingError(f"{out}: processes found different checkpoints; give a folder that all machines share")
 
     @property
     def epoch(self) -> int:
@@ -137,13 +143,16 @@ class _Training:
         with Display(self.recipe, len(self.loader), show and self.accelerator.is_main_process) as display:
             for record in self.history:
                 display.epoch_done(record)
-            while not self.over and (minutes is None or perf_counter() - started < 60 * minutes):
+            took = 0.0
+            while not self.over and self._goes_on(took == 0 or _fits(started, took, minutes)):
                 began = perf_counter()
                 losses = self._train_epoch(display)
                 self._finish_epoch(losses, began)
                 display.epoch_done(self.history[-1])
+                took = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process:
+            history.write_log(self.out, self.history)
             history.draw_curve(self.out, self.history, self.recipe.title)
             if self.over:
                 summary = {"epochs": self.epoch, "best_epoch": self.best["epoch"], "seconds": seconds}
@@ -152,11 +161,15 @@ class _Training:
         best = self.best["epoch"] if self.history else 0
         return _run(self.out, self.epoch, best, seconds, self.over)
 
+    def _goes_on(self, wish: bool) -> bool:
+        """What the first process wishes: clocks differ, and all processes must take the same epochs."""
+        return bool(broadcast_object_list([wish])[0])
+
     def _train_epoch(self, display: Display) -> dict[str, float]:
         """One pass; the mean over batches of everything the objective logs."""
         recipe = self.recipe
         # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
-        set_seed(recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index)
+        set_seed((recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index) % 2**32)
         self.sampler.epoch = self.epoch
         for module in self.objective.modules.values():
             module.train()
@@ -208,8 +221,9 @@ class _Training:
 
     def _finish_epoch(self, losses: dict[str, float], began: float) -> None:
         """Validate, set the rate of the next epoch, keep the best weights, save everything."""
-        mine = validate(self.objective, self.validation, self.recipe, self.accelerator, self.out)
+        mine = validate(self.bare["network"], self.objective, self.validation, self.recipe, self.accelerator, self.out)
         scores = mine.mean(gather_object(mine.rows) if self.accelerator.num_processes > 1 else mine.rows)
+        self._check_validation(scores["validation_loss"])
         rate = self.schedule.rate
         loss = losses.pop("loss")
         record = {
@@ -226,16 +240,23 @@ class _Training:
             history.write_log(self.out, self.history)
         self.accelerator.wait_for_everyone()
 
+    def _check_validation(self, loss: float | None) -> None:
+        limit = DIVERGED * (self.first_loss or math.inf)
+        if loss is None or not math.isfinite(loss) or loss > limit:
+            raise TrainingError(
+                f"{self.out}: training diverged: the validation loss after epoch {self.epoch + 1} is {loss}. The last "
+                f"good state is kept ({self.epoch} epochs); lower the learning rate"
+            )
+
     def _keep_weights(self, record: history.Record) -> None:
-        network = self.accelerator.unwrap_model(self.objective.modules["network"], keep_torch_compile=False)
+        network = self.bare["network"]
         scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
         config = model_config(self.recipe, network, self.training.source.fingerprint, record["epoch"], scores)
         save_weights(self.out / WEIGHTS, network, config)
 
     def _save(self) -> None:
         tensors: dict[str, Tensor] = {}
-        for name, module in self.objective.modules.items():
-            bare = self.accelerator.unwrap_model(module, keep_torch_compile=False)
+        for name, bare in self.bare.items():
             tensors |= {f"module.{name}.{key}": value for key, value in bare.state_dict().items()}
             tensors |= optimizer_tensors(self.optimizers[name], f"optimizer.{name}")
         seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
@@ -251,8 +272,7 @@ class _Training:
         tensors, state = read_checkpoint(self.out / CHECKPOINT)
         if (state["recipe"], state["fingerprint"]) != (self.recipe.digest, self.training.source.fingerprint):
             raise TrainingError(f"{self.out / CHECKPOINT}: belongs to another recipe or dataset; give a new folder")
-        for name, module in self.objective.modules.items():
-            bare = self.accelerator.unwrap_model(module, keep_torch_compile=False)
+        for name, bare in self.bare.items():
             prefix = f"module.{name}."
             bare.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
             restore_optimizer(self.optimizers[name], tensors, f"optimizer.{name}")
@@ -261,8 +281,18 @@ class _Training:
         self.resumed_at = len(self.history)
 
 
+def _fits(started: float, took: float, minutes: float | None) -> bool:
+    """Whether another epoch like the last one ends in time."""
+    return minutes is None or perf_counter() - started + took < 60 * minutes
+
+
 def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
-    """Make ``out`` this recipe's folder, or see that it is."""
+    """Make ``out`` this recipe's folder, or see that it is. One process of a machine first, then the others."""
+    with PartialState().local_main_process_first():
+        _claim_or_check(out, recipe, data)
+
+
+def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
     path = out / RECIPE
     content = {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint}
     try:
@@ -271,7 +301,8 @@ def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
     except (OSError, ValueError) as error:
         raise TrainingError(f"{out}: expected a training folder, or a new one ({error})") from None
     if found is None:
-        if any(out.iterdir()):
+        # A process that was killed while it wrote the recipe leaves a hidden temporary file.
+        if any(not path.name.startswith(f".{RECIPE}.") for path in out.iterdir()):
             raise TrainingError(f"{out}: holds files but no {RECIPE}; give a new or empty folder")
         write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
     elif found != content:

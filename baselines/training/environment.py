@@ -1,4 +1,4 @@
-"""What a training sets in its process, and puts back: reproducible kernels, and memory that is kept."""
+"""What a training sets in its process, and puts back: reproducible kernels. Memory that is kept stays so."""
 
 import ctypes
 import sys

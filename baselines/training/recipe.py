@@ -116,6 +116,8 @@ class Recipe(StrictModel):
     def _consistent(self) -> "Recipe":
         if self.network not in NETWORKS:
             raise ValueError(f"network: expected one of {', '.join(NETWORKS)}, got {self.network!r}")
+        if {"width", "name"} & set(self.options):
+            raise ValueError("options: width and network are keys of their own, and no options")
         if self.frames not in CONFIGS:
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
         if (self.loss.name == "gan") != (self.network == "pix2pix"):
@@ -178,13 +180,13 @@ def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
     shipped, own = _resolved(path, 0)
     content = _merge(shipped, own)
     network = content.get("network")
-    if network not in NETWORKS:
+    if not isinstance(network, str) or network not in NETWORKS:
         raise RecipeError(f"{path}: network: expected one of {', '.join(NETWORKS)}, got {printable(repr(network), 60)}")
     scale = _preset(preset)
     merged = _merge(shipped, scale["every"], pick=True)
-    merged = _merge(merged, scale["normalisations"].get(content.get("normalisation"), {}), pick=True)
+    merged = _merge(merged, scale["normalisations"].get(str(content.get("normalisation")), {}), pick=True)
     merged = _merge(_merge(merged, scale["networks"].get(network, {})), own)
-    return recipe_from_dict({"preset": preset, "size": scale["size"], **merged}, path)
+    return recipe_from_dict({"size": scale["size"], **merged, "preset": preset}, path)
 
 
 def recipe_from_dict(content: dict[str, Any], path: Path = Path("recipe")) -> Recipe:

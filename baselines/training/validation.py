@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
+from torch import nn
 
 from fpp_ml_bench.baselines.training.objectives import Objective
 from fpp_ml_bench.baselines.training.pairs import spread
@@ -45,15 +46,20 @@ class Validated:
 
 
 def validate(
-    objective: Objective, data: FringeDepthDataset, recipe: Recipe, accelerator: Accelerator, out: Path
-) -> Validated:
-    """Loss and scores of this process's share of the validation pairs, each pair for itself.
+    network: nn.Module,
+    objective: Objective,
+    data: FringeDepthDataset,
+    recipe: Recipe,
+    accelerator: Accelerator,
+    out: Path,
+) -> Validated:  # fmt: skip
+    """Loss and scores of ``network`` (not distributed, not compiled) on this process's share of the validation
+    pairs, each pair for itself.
 
     Raises `TrainingError` when the network answers with NaN or infinity, naming the sample.
     """
     indices = spread(len(data), recipe.validation_pairs)[accelerator.process_index :: accelerator.num_processes]
     units, mode = SCORING[recipe.normalisation]
-    network = objective.modules["network"]
     network.eval()
     rows: list[Row] = []
     with torch.inference_mode(), accelerator.autocast():

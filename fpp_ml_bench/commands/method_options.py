@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (single-shot phase), the name of weights that "
-    "come with the package, a .safetensors file, or a recipe that has been trained (loss/l1, mine.yaml)"
+    "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _RECIPE_SUFFIXES = (".yaml", ".yml")
 _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture")
@@ -98,10 +98,11 @@ def weights_of_recipe(recipe: str, size: int) -> Path:
 def _weights(name: str, size: int) -> Path:
     """The weights file that METHOD means, where it is no method of its own."""
     from fpp_ml_bench.baselines.methods import METHODS
-    from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
+    from fpp_ml_bench.baselines.weights_file import SUFFIX, shipped_names, weights_path
     from fpp_ml_bench.errors import PredictionError, WeightsError
 
-    if name.endswith(_RECIPE_SUFFIXES) or name.split("/")[0] in _TABLES:
+    named = name.split("/")[0] in _TABLES and not name.endswith(SUFFIX)
+    if name.endswith(_RECIPE_SUFFIXES) or named:
         return weights_of_recipe(name, size)
     try:
         return weights_path(name)

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--minutes", type=_minutes, metavar="M",
-        help="stop after the epoch in which they run out, everything saved; exit status 1, the same command goes on",
+        help="stop before an epoch that would outlast them, everything saved; exit status 1, the same command goes on",
     )  # fmt: skip
     parser.add_argument("--anyway", action="store_true", help="train preset paper without a GPU all the same")
     parser.add_argument("--list", action="store_true", help="show rows, recipes and what is done, and stop")

@@ -21,12 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset", choices=("cpu", "paper"), default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
     )
     parser.add_argument(
-        "--minutes", type=float, metavar="M", help="stop after the epoch in which they run out, everything saved"
+        "--minutes", type=float, metavar="M", help="stop before an epoch that would outlast them, everything saved"
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, make the weights usable on their own, say what came out. Raises FppBenchError for what can't be done."""
+    from accelerate import PartialState
+
     from fpp_ml_bench.baselines.range_heads import save_with_heads
     from fpp_ml_bench.baselines.training.engine import train
     from fpp_ml_bench.baselines.training.recipe import load_recipe
@@ -37,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     recipe = load_recipe(args.recipe, args.preset)
     done = train(recipe, args.dataset, args.out, minutes=args.minutes)
+    if not PartialState().is_main_process:
+        return 0 if done.finished else CHECK_FAILED
     if not done.finished:
         print(f"{args.out}: stopped after {done.epochs} epochs, everything saved; the same command goes on")
         return CHECK_FAILED
