@@ -38,7 +38,7 @@ class TorchCalibrationLayer(nn.Module):
             rays = (self.get_buffer("ray_0"), self.get_buffer("ray_1"), self.get_buffer("ray_2"))
             lens = Lens(rays, lens.t, lens.axis, lens.coefficients)
         maps = (self.get_buffer(name) for name in ("infinity_rad", "infinity_order", "gain", "forward_part"))
-        return CalibrationLayer(*maps, numbers.back_m, numbers.rad_per_unit, lens)
+        return CalibrationLayer(*maps, numbers.back_m, numbers.rad_per_unit, lens)  # type: ignore[arg-type, call-arg]
 
     def residual_phase(self, phase_rad: Tensor, order: Tensor) -> Tensor:
         """psi in rad; see `CalibrationLayer.residual_phase`."""

@@ -70,5 +70,5 @@ def _seal(tensors: State, text: str) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(name.encode())
-        digest.update(memoryview(tensors[name].numpy().reshape(-1).view("uint8")))
+        digest.update(tensors[name].numpy().reshape(-1).view("uint8").data)
     return digest.hexdigest()

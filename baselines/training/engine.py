@@ -294,7 +294,8 @@ def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
 
 def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
     path = out / RECIPE
-    content = {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint}
+    ours = recipe.to_dict()
+    content = {"recipe": ours, "fingerprint": data.source.fingerprint}
     try:
         out.mkdir(parents=True, exist_ok=True)
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
@@ -307,7 +308,7 @@ def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None
         write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
     elif found != content:
         theirs = found.get("recipe", {}) if isinstance(found, dict) else {}
-        differs = [key for key, value in content["recipe"].items() if theirs.get(key) != value] or ["dataset"]
+        differs = [key for key, value in ours.items() if theirs.get(key) != value] or ["dataset"]
         raise TrainingError(
             f"{path}: was made for another training, which differs in {', '.join(differs)}; give another folder, or "
             f"remove {out} to train anew"

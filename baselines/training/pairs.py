@@ -5,6 +5,7 @@ stopped, whatever was drawn before.
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
@@ -70,7 +71,8 @@ class EpochSampler(Sampler[int]):
         return iter(epoch_order(self.pairs, self.drawn, self.seed, self.epoch))
 
 
-def _as_read(batch: FringeDepth) -> FringeDepth:
+def _as_read(batch: Any) -> FringeDepth:
+    """`BatchRead` gives whole batches: nothing is left to collate."""
     return batch
 
 

@@ -97,7 +97,7 @@ class Recipe(StrictModel):
     size: Annotated[int, Field(ge=16)]
     network: Text
     width: Annotated[int, Field(ge=1)]
-    options: dict[Text, bool | int | float | Text] = Field(default_factory=dict)
+    options: dict[Text, int | float] = Field(default_factory=dict)
     normalisation: Normalisation
     background_removed: bool
     frames: Text
