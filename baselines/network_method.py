@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.model import Model
+from fpp_ml_bench.baselines.training.recipe import Loss
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.frames import PAPER_SEQUENCE
@@ -158,7 +159,4 @@ def _checked_range(model: Model, depth_range: str | None) -> Any:
 
 def _loss(loss: Any) -> str | None:
     """The recipe's loss in one word, as in the names of runs: ``hybrid_l1_0.7``."""
-    if isinstance(loss, dict):
-        alpha = loss.get("alpha")
-        return f"{loss.get('name')}" if alpha is None else f"{loss.get('name')}_{alpha:g}"
-    return None if loss is None else str(loss)
+    return Loss.model_validate(loss).label if isinstance(loss, dict) else loss

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from fpp_ml_bench.baselines.training.tables import TABLES
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.text import printable
 
 PAPER_FILE = Path(__file__).resolve().parent / "paper_rows.json"
 PAPER_HEADING = "reported by the paper (not measured here)"
-PAPER_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture")
+PAPER_TABLES = TABLES
 SHOWN_BY_DEFAULT = ("architecture", "normalization")
 
 

@@ -12,6 +12,7 @@ from time import perf_counter
 
 from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.training.engine import TrainingRun, train
+from fpp_ml_bench.baselines.training.validation import SCORING
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.leaderboard.reproduce_data import the_dataset
 from fpp_ml_bench.leaderboard.reproduce_frames import all_frames_that_hold, score_all_frames, write_all_frames
@@ -148,8 +149,7 @@ def _score_all_frames(job: Job, model: Model, wish: Wish, opened: DatasetFolder)
         opened,
         lambda frame: model.predict_representation([frame])[0],
         opened.sequence.config(job.recipe.data_config),
-        "normalised",
-        "paper-individual",
+        *SCORING[job.recipe.normalisation],
         job.recipe.name,
         model.sha256,
     )

@@ -5,20 +5,13 @@ import sys
 
 import pytest
 import torch
+from tiny_network import SMALL, one_thread  # noqa: F401
 from torch import nn
 
 from fpp_ml_bench.baselines.networks import NETWORKS, build, discriminator
 from fpp_ml_bench.baselines.networks.base import parameter_count
 from fpp_ml_bench.errors import NetworkError
 
-# Small networks and a size they take; TransUNet is built for 64 px: 4x4 map, 2x2 patches.
-SMALL: dict[str, dict[str, int | float]] = {
-    "unet": {"width": 4},
-    "transunet": {"width": 2, "map_size": 4, "patch": 2},
-    "resunet": {"width": 4},
-    "hformer": {"width": 8},
-    "pix2pix": {"width": 4},
-}
 SIZE = 64
 
 # The paper's table of architectures and the benchmark's published counts; TransUNet is printed as 116.2 M there.
@@ -30,14 +23,6 @@ PARAMETERS = {
     "pix2pix": 182_430_721,
 }
 STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 16}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # small maps: threads cost more than they bring
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(autouse=True)

@@ -2,28 +2,13 @@
 
 import pytest
 import torch
+from tiny_network import SMALL, one_thread  # noqa: F401
 from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import NETWORKS, build
 from fpp_ml_bench.baselines.networks.blocks import Attention, DoubleConvolution, DropPath, Join
 from fpp_ml_bench.baselines.networks.instance_norm import InstanceNorm
-
-SMALL: dict[str, dict[str, int | float]] = {
-    "unet": {"width": 4},
-    "transunet": {"width": 2, "map_size": 4, "patch": 2},
-    "resunet": {"width": 4},
-    "hformer": {"width": 8},
-    "pix2pix": {"width": 4},
-}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(autouse=True)

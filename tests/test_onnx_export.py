@@ -4,31 +4,14 @@ import importlib.util
 from types import SimpleNamespace
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
+from tiny_network import SMALL, one_thread  # noqa: F401
 
 from fpp_ml_bench.baselines.networks import NETWORKS, build
 from fpp_ml_bench.baselines.onnx_export import INPUT, OUTPUT, export_onnx
 from fpp_ml_bench.errors import FppBenchError, NetworkError
-
-onnxruntime = pytest.importorskip("onnxruntime")
-pytest.importorskip("onnx")
-
-SMALL: dict[str, dict[str, int | float]] = {
-    "unet": {"width": 4},
-    "transunet": {"width": 2, "map_size": 4, "patch": 2},
-    "resunet": {"width": 4},
-    "hformer": {"width": 8},
-    "pix2pix": {"width": 4},
-}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def _run(path, fringe: torch.Tensor) -> np.ndarray:

@@ -32,7 +32,7 @@ def folders(tmp_path, preset="cpu"):
 
 
 def test_the_command_knows_the_recipes_tables_and_presets():
-    assert PAPER_TABLES == TABLES and command._PRESETS == PRESETS
+    assert PAPER_TABLES == TABLES and command.PRESETS == PRESETS
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -2,11 +2,20 @@
 
 from typing import Any
 
+import pytest
 import torch
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.weights_file import ModelConfig
 
+# Small networks and a size they take, 64 px; TransUNet is built for it: 4x4 map, 2x2 patches.
+SMALL: dict[str, dict[str, int | float]] = {
+    "unet": {"width": 4},
+    "transunet": {"width": 2, "map_size": 4, "patch": 2},
+    "resunet": {"width": 4},
+    "hformer": {"width": 8},
+    "pix2pix": {"width": 4},
+}
 RECIPE: dict[str, Any] = {
     "preset": "cpu", "seed": 42, "max_epochs": 3, "loss": {"name": "hybrid_l1", "alpha": 0.7}, "batch": 4,
 }  # fmt: skip
@@ -33,3 +42,12 @@ def config_of(network: torch.nn.Module, **changes: Any) -> ModelConfig:
         "validation": {"object_mae_mm": 12.5},
     }
     return ModelConfig(**{**about, **changes})
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """For every test of a module that imports it: on small maps threads cost more than they bring."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

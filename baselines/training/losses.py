@@ -31,14 +31,12 @@ hybrid_l1    alpha masked_l1 + (1 - alpha) l1
 
 from collections.abc import Callable
 from functools import partial
-from numbers import Real
 
 import torch
 from torch import Tensor
 
-from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.baselines.training.tables import check_loss
 
-LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 EPSILON = 1e-8
 
 LossFunction = Callable[[Tensor, Tensor], Tensor]
@@ -61,17 +59,6 @@ def sample_losses(name: str, alpha: float | None, prediction: Tensor, target: Te
     """The loss ``name`` of every sample for itself, (B,), float32 or float64; all else as in `loss_function`."""
     check_loss(name, alpha)
     return _loss(name, alpha, prediction, target, per_sample=True)
-
-
-def check_loss(name: str, alpha: float | None) -> None:
-    """Raise `RecipeError` unless ``name`` is one of `LOSSES` and ``alpha`` is given exactly where it has a meaning."""
-    if name not in LOSSES:
-        raise RecipeError(f"unknown loss {name!r}; there are {', '.join(LOSSES)}")
-    hybrid = name.startswith("hybrid_")
-    if not hybrid and alpha is not None:
-        raise RecipeError(f"loss {name} takes no alpha, got {alpha!r}; leave it out, or name hybrid_rmse or hybrid_l1")
-    if hybrid and (isinstance(alpha, bool) or not isinstance(alpha, Real) or not 0 <= alpha <= 1):
-        raise RecipeError(f"loss {name} needs alpha, the weight of the object's part, from 0 to 1, got {alpha!r}")
 
 
 def _loss(name: str, alpha: float | None, prediction: Tensor, target: Tensor, *, per_sample: bool) -> Tensor:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from fpp_ml_bench.baselines.networks import NETWORKS
+from fpp_ml_bench.baselines.training.tables import GAN, PRESETS, ROWS, TABLES, check_loss
 from fpp_ml_bench.errors import RecipeError, SubmissionError
 from fpp_ml_bench.evaluation.schema import Positive, StrictModel, Text, problems_of
 from fpp_ml_bench.evaluation.submission_file import read_plain_file
@@ -21,19 +22,6 @@ from fpp_ml_bench.frames import CONFIGS
 from fpp_ml_bench.normalisation import Normalisation
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-PRESETS = ("cpu", "paper")
-_ROWS: dict[str, tuple[str, ...]] = {
-    "normalization": ("raw", "global", "individual"),
-    "background_removed": ("raw", "global", "individual"),
-    "multi_frame": ("frame0", "horizontal", "vertical", "sinusoidal", "all"),
-    "loss": (
-        "rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse_0.5", "hybrid_rmse_0.7", "hybrid_rmse_0.9",
-        "hybrid_l1_0.5", "hybrid_l1_0.7", "hybrid_l1_0.9",
-    ),
-    "architecture": ("unet", "transunet", "resunet", "pix2pix", "hformer"),
-}  # fmt: skip
-"""The paper's order; ``hformer`` is the conference version's."""
-TABLES = tuple(_ROWS)
 _EXTENDS = "extends"
 _LONGEST_CHAIN = 8
 _NETWORK_TITLES = {
@@ -68,16 +56,15 @@ class Linear(StrictModel):
 
 
 class Loss(StrictModel):
-    """A name of `fpp_ml_bench.baselines.training.losses.LOSSES` or ``gan``; hybrids need ``alpha``."""
+    """A name of `fpp_ml_bench.baselines.training.tables.LOSSES` or ``gan``; hybrids need ``alpha``."""
 
-    name: Literal["rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1", "gan"]
+    name: Text
     alpha: Annotated[float, Field(ge=0, le=1)] | None = None
 
     @model_validator(mode="after")
-    def _alpha(self) -> "Loss":
-        hybrid = self.name.startswith("hybrid")
-        if hybrid != (self.alpha is not None):
-            raise ValueError(f"{self.name} {'needs' if hybrid else 'takes no'} alpha")
+    def _known(self) -> "Loss":
+        if self.name != GAN or self.alpha is not None:
+            check_loss(self.name, self.alpha)
         return self
 
     @property
@@ -120,7 +107,7 @@ class Recipe(StrictModel):
             raise ValueError("options: width and network are keys of their own, and no options")
         if self.frames not in CONFIGS:
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
-        if (self.loss.name == "gan") != (self.network == "pix2pix"):
+        if (self.loss.name == GAN) != (self.network == "pix2pix"):
             raise ValueError("loss gan and network pix2pix belong together")
         if self.network == "pix2pix" and self.normalisation != "individual":
             raise ValueError("network pix2pix answers in [0, 1], so its normalisation must be individual")
@@ -130,10 +117,6 @@ class Recipe(StrictModel):
     def data_config(self) -> str:
         """Which frames are training pairs of their own: a name of `fpp_ml_bench.frames.CONFIGS`."""
         return self.frames
-
-    @property
-    def alpha(self) -> float | None:
-        return self.loss.alpha
 
     @property
     def name(self) -> str:
@@ -163,9 +146,9 @@ class Recipe(StrictModel):
 
 def table_rows(table: str) -> tuple[str, ...]:
     """Row names of a table in the paper's order. RecipeError for an unknown table."""
-    if table not in _ROWS:
+    if table not in ROWS:
         raise RecipeError(f"expected a table out of {', '.join(TABLES)}, got {printable(table)!r}")
-    return _ROWS[table]
+    return ROWS[table]
 
 
 def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
@@ -209,7 +192,7 @@ def _recipe_path(name_or_path: str | Path) -> Path:
     if ".." in Path(text).parts or Path(text).is_absolute() or not path.is_file():
         from difflib import get_close_matches
 
-        names = [*(f"{table}/{row}" for table in TABLES for row in _ROWS[table]), "base"]
+        names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
         near = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
         raise RecipeError(
             f"no recipe {printable(text, 100)!r}; near it: {', '.join(near)}. Give one of the shipped names (see "

@@ -8,6 +8,7 @@ from torch import nn
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.training.objectives import Adversarial, Objective, Regression
 from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.baselines.training.tables import GAN
 from fpp_ml_bench.baselines.weights_file import ModelConfig
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -34,7 +35,7 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
 def objective_of(recipe: Recipe) -> Objective:
     """The recipe's networks, freshly initialised, and what they minimise. Seed torch first."""
     network = networks.build(recipe.network, width=recipe.width, **recipe.options)
-    if recipe.loss.name == "gan":
+    if recipe.loss.name == GAN:
         return Adversarial(network, networks.discriminator(width=recipe.width))
     return Regression(network, recipe.loss.name, recipe.loss.alpha)
 

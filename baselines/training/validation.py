@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from accelerate import Accelerator
 from torch import nn
@@ -70,7 +71,7 @@ def validate(
             values = prediction[:, 0].cpu().numpy()
             for loss, value, row in zip(losses, values, read.row.tolist(), strict=True):
                 sample = data.samples[row]
-                if not torch.isfinite(torch.from_numpy(value)).all():
+                if not np.isfinite(value).all():
                     raise TrainingError(f"{out}: the network's answer to {sample} is not finite; it has diverged")
                 overall, inside, outside = headline_scores(
                     *scored_pair(value, data.source.depth_mm(sample), units, mode, sample)

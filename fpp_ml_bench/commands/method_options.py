@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
+
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.methods import Method
     from fpp_ml_bench.loaders.store import DatasetFolder
@@ -13,8 +15,6 @@ METHOD_HELP = (
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _RECIPE_SUFFIXES = (".yaml", ".yml")
-_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture")
-"""First part of a shipped recipe's name; a test holds it to `fpp_ml_bench.baselines.training.recipe.TABLES`."""
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +76,7 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
 def weights_of_recipe(recipe: str, size: int) -> Path:
     """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
     wide. Raises FppBenchError where there are none."""
-    from fpp_ml_bench.baselines.training.recipe import PRESETS, load_recipe
+    from fpp_ml_bench.baselines.training.recipe import load_recipe
     from fpp_ml_bench.errors import RecipeError
     from fpp_ml_bench.leaderboard.reproduce_plan import RUNS, Folders
     from fpp_ml_bench.leaderboard.reproduce_training import current_weights
@@ -101,7 +101,7 @@ def _weights(name: str, size: int) -> Path:
     from fpp_ml_bench.baselines.weights_file import SUFFIX, shipped_names, weights_path
     from fpp_ml_bench.errors import PredictionError, WeightsError
 
-    named = name.split("/")[0] in _TABLES and not name.endswith(SUFFIX)
+    named = name.split("/")[0] in TABLES and not name.endswith(SUFFIX)
     if name.endswith(_RECIPE_SUFFIXES) or named:
         return weights_of_recipe(name, size)
     try:

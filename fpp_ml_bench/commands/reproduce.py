@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fpp_ml_bench.baselines.training.tables import PRESETS
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ EXAMPLES = (
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
-_PRESETS = ("cpu", "paper")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "table", nargs="?", choices=(*PAPER_TABLES, ALL), metavar="TABLE", help=f"{', '.join(PAPER_TABLES)} or {ALL}"
     )
     parser.add_argument(
-        "--preset", choices=_PRESETS, default="cpu",
+        "--preset", choices=PRESETS, default="cpu",
         help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
     )  # fmt: skip
     parser.add_argument(

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from fpp_ml_bench.baselines.training.tables import PRESETS
+
 SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
 EXAMPLES = (
     "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
@@ -18,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to go on with")
     parser.add_argument(
-        "--preset", choices=("cpu", "paper"), default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
+        "--preset", choices=PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
     )
     parser.add_argument(
         "--minutes", type=float, metavar="M", help="stop before an epoch that would outlast them, everything saved"
