@@ -15,6 +15,7 @@ from fpp_ml_bench.frames import PAPER_SEQUENCE
 from fpp_ml_bench.frames import Sequence as FrameSequence
 
 DepthRange = Literal["oracle", "predicted", "mean"]
+Setting = str | int | float | bool | None
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
 _TITLES = {"oracle": "oracle range", "predicted": "predicted range", "mean": "mean range", None: ""}
 
@@ -27,10 +28,10 @@ class NetworkMethod:
     or ``predicted`` or ``mean`` (the range heads of the weights file make mm). None takes ``predicted`` where the file
     holds heads, else ``oracle``.
 
-    ``frame`` is the index of the frame, by default the first of those that the network was trained on. ``threads`` are
-    torch's, for the whole process. A network trained with the background removed needs frames that are 0 outside the
-    object (``uses_ground_truth_mask``): `fpp_ml_bench.baselines.prediction.captured_frames` sees to that.
-
+    ``frame`` is the index of the frame, by default the first of those that the network was trained on. ``threads``
+    are torch's, for the whole process. ``remark`` is added to the title, ``about`` to the settings. A network
+    trained with the background removed needs frames that are 0 outside the object (``uses_ground_truth_mask``):
+    `fpp_ml_bench.baselines.prediction.captured_frames` sees to that.
     Raises `PredictionError` for a range or a frame that there is not.
     """
 
@@ -38,9 +39,9 @@ class NetworkMethod:
 
     def __init__(
         self, model: Model, depth_range: DepthRange | None = None, frame: int | None = None, threads: int = 1,
-        sequence: FrameSequence = PAPER_SEQUENCE,
+        sequence: FrameSequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
     ) -> None:  # fmt: skip
-        self.model = model
+        self.model, self.remark, self.about = model, remark, dict(about or {})
         self.depth_range = _checked_range(model, depth_range)
         trained_on = sequence.config(model.config.data_config)
         self.frame = trained_on[0] if frame is None else frame
@@ -59,7 +60,7 @@ class NetworkMethod:
     @property
     def title(self) -> str:
         parts = [self.model.config.title, _TITLES[self.depth_range], "" if self._usual_frame else f"frame {self.frame}"]
-        return ", ".join(part for part in parts if part)
+        return ", ".join(part for part in parts if part) + (f" ({self.remark})" if self.remark else "")
 
     @property
     def units(self) -> Units:
@@ -94,9 +95,9 @@ class NetworkMethod:
         return self.model.parameters
 
     @property
-    def settings(self) -> Mapping[str, str | int | float | bool | None]:
+    def settings(self) -> Mapping[str, Setting]:
         config = self.model.config
-        found: dict[str, str | int | float | bool | None] = {
+        found: dict[str, Setting] = {
             "weights_sha256": self.model.sha256,
             "network": config.network,
             "width": config.options.get("width"),
@@ -112,7 +113,7 @@ class NetworkMethod:
             "threads": self.threads,
             "device": self.device,
         }
-        return {key: value for key, value in found.items() if value is not None}
+        return {key: value for key, value in found.items() if value is not None} | self.about
 
     @property
     def seeds(self) -> Mapping[str, int]:

@@ -19,14 +19,14 @@ from fpp_ml_bench.leaderboard.rows import Entry, read_entry, write_row
 from fpp_ml_bench.loaders.store import DatasetFolder
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.leaderboard.reproduce_method import NamedMethod
+    from fpp_ml_bench.baselines.network_method import NetworkMethod
 
 SPLIT, TARGET = "test", "depth"
 REPEATS = 20
 PROVENANCE = "measured here"
 
 
-def make_row(opened: DatasetFolder, method: "NamedMethod", name: str, folders: Folders) -> Entry:
+def make_row(opened: DatasetFolder, method: "NetworkMethod", name: str, folders: Folders) -> Entry:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), write the row.
 
     Whatever an earlier run left under this name is replaced at the end, not before; an interrupted one leaves nothing
