@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.measurement import Reason
 from fpp_ml_bench.baselines.phase_route.object_mask import disk
+from fpp_ml_bench.baselines.phase_route.observation import Observation
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decode_blocks import MIN_MODULATION
-from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
 
@@ -33,11 +33,11 @@ SLOWEST, FASTEST = 0.35, 2.2
 THIN_PERIODS = 0.5
 
 
-def expected_error_mm(
-    grey: Image, fit: FringeFit, inside: NDArray[np.bool_], slopes: tuple[Image, Image], margin: Image,
-    layer: CalibrationLayer, depth_mm: NDArray, rig: Rig, settings: Settings, background: Background, window: Window,
+def phase_uncertainty_rad(
+    grey: Image, fit: FringeFit, inside: NDArray[np.bool_], slopes: tuple[Image, Image], background: Background,
+    window: Window,
 ) -> Image:  # fmt: skip
-    """Expected absolute error of ``depth_mm`` (H, W) in mm, float32; 0 outside the mask."""
+    """Expected error of the phase of a local fit to ``grey`` (h, w), in rad, float32; order aside."""
     bright = np.maximum(fit.brightness, 0.5)
     misfit = (grey - background.ambient_grey - bright * (1 + np.cos(fit.phase_rad))) * inside
     power = window.moment((misfit * misfit).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
@@ -47,12 +47,23 @@ def expected_error_mm(
     sigma_phase = np.sqrt(averaged + systematic) / bright
     steep = np.hypot(slopes[0], slopes[1])
     rim = np.clip(1 - fit.weight, 0, 1)
-    sigma_phase = sigma_phase * (0.3 + rim) + steep * rim
+    return sigma_phase * (0.3 + rim) + steep * rim
+
+
+def clipped_share(grey: Image, fit: FringeFit, inside: NDArray[np.bool_], window: Window) -> Image:
+    """Saturated share of the window's weight on the object, float32 (h, w)."""
+    clipped = window.moment(((grey >= GREY_LEVELS) & inside).astype(np.float32))
+    return clipped / np.maximum(fit.weight, 1e-3)
+
+
+def expected_error_mm(seen: Observation, margin: Image, depth_mm: NDArray) -> Image:
+    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32; 0 outside the mask."""
+    layer = seen.layer
     z = np.maximum(depth_mm, 1.0) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     wrong = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    return np.where(inside, mm_per_rad * (sigma_phase + TAU * wrong), 0).astype(np.float32)
+    return np.where(seen.inside, mm_per_rad * (seen.uncertainty_rad + TAU * wrong), 0).astype(np.float32)
 
 
 def confidence_of(error_mm: Image) -> Image:
@@ -60,28 +71,25 @@ def confidence_of(error_mm: Image) -> Image:
     return (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)
 
 
-def reasons(
-    grey: Image, fit: FringeFit, inside: NDArray[np.bool_], slopes: tuple[Image, Image], margin: Image,
-    candidates: Candidates, sure: Image, settings: Settings, period_px: float, window: Window,
-) -> NDArray[np.uint8]:  # fmt: skip
-    """A `Reason` for every pixel (H, W), masked or not: `Reason.MEASURED` where nothing speaks against it."""
-    clipped = window.moment(((grey >= GREY_LEVELS) & inside).astype(np.float32))
+def reasons(seen: Observation, margin: Image, sure: Image, settings: Settings, period_px: float) -> NDArray[np.uint8]:
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` where nothing speaks against it."""
+    slopes = seen.slopes
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
     along = np.abs(TAU / period_px + slopes[axis]) * period_px / TAU
     across = np.abs(slopes[1 - axis]) * period_px / TAU
     frequency = np.hypot(along, across)
-    wide = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, disk(THIN_PERIODS / 2 * period_px)) > 0
-    code = np.full(inside.shape, Reason.MEASURED, np.uint8)
+    wide = cv2.morphologyEx(seen.inside.astype(np.uint8), cv2.MORPH_OPEN, disk(THIN_PERIODS / 2 * period_px)) > 0
+    code = np.full(seen.inside.shape, Reason.MEASURED, np.uint8)
     checks = (
         (sure < settings.min_confidence, Reason.UNSURE),
         (margin < LEAST_MARGIN, Reason.AMBIGUOUS),
         ((frequency < SLOWEST) | (frequency > FASTEST), Reason.TOO_STEEP),
         (~wide, Reason.THIN),
-        (candidates.count == 0, Reason.OUT_OF_RANGE),
-        (clipped > SATURATED_SHARE * np.maximum(fit.weight, 1e-3), Reason.SATURATED),
-        (fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
-        (~inside, Reason.BACKGROUND),
+        (seen.candidates.count == 0, Reason.OUT_OF_RANGE),
+        (seen.clipped > SATURATED_SHARE, Reason.SATURATED),
+        (seen.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
+        (~seen.inside, Reason.BACKGROUND),
     )
     for where, reason in checks:
         code[where] = reason

@@ -4,8 +4,6 @@ Each stage is a function of its own module; this one hands arrays from one to th
 the rig alone is made once.
 """
 
-from time import perf_counter
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,14 +13,13 @@ from fpp_ml_bench.baselines.phase_route.empty_scene import Background, EmptyScen
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, fringe_fit
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement, Reason
 from fpp_ml_bench.baselines.phase_route.object_mask import object_region, refined, unlit
+from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation, Stopwatch
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.phase_route.shading import phase_slopes, wrapped
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decode_blocks import MIN_MODULATION
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.rig import Rig
-
-Crop = tuple[slice, slice]
 
 MARGIN_PERIODS = 0.5
 """Of the crop around the object: no window is needed beyond, the mask may grow into it."""
@@ -33,19 +30,6 @@ FRINGE_NOISE = 0.03
 
 DARKEST_GREY = MIN_MODULATION / 4
 """What is object and darker than this has no fringe at all: it lies in shadow or faces away, and gets no depth."""
-
-
-class Stopwatch:
-    """Seconds of each stage since the last."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._since = perf_counter()
-
-    def done(self, stage: str) -> None:
-        now = perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
-        self._since = now
 
 
 class PhaseRoute:
@@ -70,6 +54,15 @@ class PhaseRoute:
 
         ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
         """
+        seen = self.observe(image, mask)
+        choice, margin = self.chooser(seen.question, self.rig, self.settings)
+        order, margin = orders.spread_over_pixels(
+            seen.question, choice, margin, seen.layer.residual_phase(seen.phase_rad, 0.0)
+        )
+        return self.conclude(seen, order, margin)
+
+    def observe(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Observation:
+        """Mask, phase and candidate orders of one captured fringe, uint8 (H, W); arguments as of `measure`."""
         shape = (self.rig.camera.height, self.rig.camera.width)
         if np.asarray(image).dtype != np.uint8 or np.shape(image) != shape:
             raise DecodeError(
@@ -80,10 +73,7 @@ class PhaseRoute:
         background = self._scene.fit(image)
         watch.done("background")
         region = object_region(background, self.period_px) if mask is None else mask
-        watch.done("mask")
         crop = self._crop(region)
-        if crop is None:
-            return nothing(shape, background, watch)
         grey, inside = image[crop].astype(np.float32), region[crop]
         if mask is None:
             dark = unlit(grey, background.ambient_grey, background.noise_grey, self.period_px)
@@ -94,8 +84,8 @@ class PhaseRoute:
         watch.done("phase")
         if mask is None:
             inside = self._refine(grey, inside, fit, background, crop)
-            watch.done("mask")
             inside &= ~dark & (fit.brightness > DARKEST_GREY)
+            watch.done("mask")
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
@@ -106,23 +96,34 @@ class PhaseRoute:
             phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px
         )
         watch.done("candidates")
-        choice, margin = self.chooser(question, self.rig, self.settings)
-        order, margin = orders.spread_over_pixels(question, choice, margin, layer.residual_phase(phase, 0.0))
-        watch.done("order")
-        depth_mm = np.where(inside, layer.depth_mm(phase, order), 0.0)
-        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
-        watch.done("depth")
-        error_mm = confidence.expected_error_mm(
-            grey, fit, inside, slopes, margin, layer, depth_mm, self.rig, self.settings, background, self._windows[1]
-        )
-        sure = confidence.confidence_of(error_mm)
-        reason = confidence.reasons(
-            grey, fit, inside, slopes, margin, candidates, sure, self.settings, self.period_px, self._windows[1]
-        )
+        window = self._windows[1]
+        uncertainty = confidence.phase_uncertainty_rad(grey, fit, inside, slopes, background, window)
+        clipped = confidence.clipped_share(grey, fit, inside, window)
         watch.done("confidence")
-        return self._whole(
-            shape, crop, inside, phase, fit, order, candidates, sure, error_mm, depth_mm, reason, background, watch
-        )
+        return Observation(
+            shape, crop, background, grey, inside, layer, fit, phase, residual, slopes, uncertainty, clipped,
+            candidates, question, watch,
+        )  # fmt: skip
+
+    def conclude(self, seen: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
+        """The measurement that an ``order`` int32 for each pixel of the observation's crop (h, w) makes of it;
+        ``margin`` (h, w): how clearly that order won, 0 a tie, 1 or more beyond doubt (see `orders.Chooser`).
+
+        Raises `DecodeError` for shapes that are not the crop's."""
+        if np.shape(order) != seen.inside.shape or np.shape(margin) != seen.inside.shape:
+            raise DecodeError(
+                f"expected an order and a margin for each of the {seen.inside.shape} pixels (h, w) around the object, "
+                f"got {np.shape(order)} and {np.shape(margin)}"
+            )
+        seen.watch.done("order")
+        depth_mm = np.where(seen.inside, seen.layer.depth_mm(seen.phase_rad, order), 0.0)
+        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
+        seen.watch.done("depth")
+        error_mm = confidence.expected_error_mm(seen, margin, depth_mm)
+        sure = confidence.confidence_of(error_mm)
+        reason = confidence.reasons(seen, margin, sure, self.settings, self.period_px)
+        seen.watch.done("confidence")
+        return self._whole(seen, order, sure, error_mm, depth_mm, reason)
 
     def fit_phase(
         self, grey: NDArray[np.float32], inside: NDArray[np.bool_], carrier: NDArray, background: Background
@@ -131,10 +132,10 @@ class PhaseRoute:
         first = carrier_fit(grey, inside, carrier, self._windows[0])
         return fringe_fit(grey, inside, first, background.ambient_grey, self._windows[1])
 
-    def _crop(self, region: NDArray[np.bool_]) -> Crop | None:
+    def _crop(self, region: NDArray[np.bool_]) -> Crop:
         rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
         if not rows.size:
-            return None
+            return slice(0, 1), slice(0, 1)
         pad = int(np.ceil(MARGIN_PERIODS * self.period_px))
         height, width = region.shape
         return (
@@ -156,44 +157,32 @@ class PhaseRoute:
         )
 
     def _whole(
-        self, shape: tuple[int, int], crop: Crop, inside: NDArray[np.bool_], phase: NDArray, fit: FringeFit,
-        order: NDArray[np.int32], candidates: Candidates, sure: NDArray, error_mm: NDArray, depth_mm: NDArray,
-        reason: NDArray[np.uint8], background: Background, watch: Stopwatch,
+        self, seen: Observation, order: NDArray[np.int32], sure: NDArray, error_mm: NDArray, depth_mm: NDArray,
+        reason: NDArray[np.uint8],
     ) -> Measurement:  # fmt: skip
         """Maps of the whole image from those of the crop."""
 
         def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
-            whole: NDArray = np.full(shape, outside, dtype=dtype)
-            whole[crop] = np.where(inside, part, outside)
+            whole: NDArray = np.full(seen.shape, outside, dtype=dtype)
+            whole[seen.crop] = np.where(seen.inside, part, outside)
             return whole
 
         kept = depth_mm if self.settings.min_confidence == 0 else depth_mm * (sure >= self.settings.min_confidence)
         reasons = paste(reason, np.uint8, Reason.BACKGROUND)
         counts = np.bincount(reasons.ravel(), minlength=len(Reason))
+        allowed = seen.candidates
         measured = Measurement(
-            wrapped_phase=paste(phase, np.float32, np.nan),
-            modulation=paste(fit.brightness, np.float32, 0),
+            wrapped_phase=paste(seen.phase_rad, np.float32, np.nan),
+            modulation=paste(seen.fit.brightness, np.float32, 0),
             order=paste(order, np.int32, 0),
-            candidates=Candidates(paste(candidates.first, np.int32, 0), paste(candidates.count, np.int32, 0)),
+            candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
             confidence=paste(sure, np.float32, 0),
             expected_error_mm=paste(error_mm, np.float32, 0),
             depth_mm=paste(kept, np.float32, 0),
             reason=reasons,
             counts={one.name.lower(): int(counts[one]) for one in Reason},
-            background_share=background.share,
-            seconds=watch.seconds,
+            background_share=seen.background.share,
+            seconds=seen.watch.seconds,
         )
-        watch.done("depth")
+        seen.watch.done("depth")
         return measured
-
-
-def nothing(shape: tuple[int, int], background: Background, watch: Stopwatch) -> Measurement:
-    """The measurement of an image without an object."""
-    zeros = np.zeros(shape, np.float32)
-    whole = np.zeros(shape, np.int32)
-    reason = np.full(shape, Reason.BACKGROUND, np.uint8)
-    counts = {one.name.lower(): reason.size if one == Reason.BACKGROUND else 0 for one in Reason}
-    return Measurement(
-        np.full(shape, np.nan, np.float32), zeros, whole, Candidates(whole, whole), zeros, zeros, zeros, reason, counts,
-        background.share, watch.seconds,
-    )  # fmt: skip
