@@ -15,6 +15,7 @@
     ├── RecipeError               a recipe with an unknown key or an impossible value
     ├── TrainingError             a training that diverged, or that can't start or go on
     ├── WeightsError              a weights file that is damaged, foreign or made for other data
+    ├── DiagnosisError            a model that can't be looked into as asked, a probe or a layer that there is not
     └── PublishError              something that can't be published: no token, no network, refused by the Hub
 
 A message says what was expected, what came, in which file or sample, and what to do.
@@ -75,6 +76,10 @@ class TrainingError(FppBenchError):
 
 class WeightsError(FppBenchError):
     """A weights file that is damaged, foreign, or made for other data."""
+
+
+class DiagnosisError(FppBenchError, ValueError):
+    """A model that can't be looked into as asked, or a probe or a layer that there is not."""
 
 
 class PublishError(FppBenchError):
