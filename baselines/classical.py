@@ -58,10 +58,13 @@ class ClassicalMethod:
     def settings(self) -> dict[str, str | int]:
         return {"direction": self.direction, "steps": self.steps, "threads": self.threads}
 
-    def decode(self, frames: Sequence[NDArray[np.uint8] | None]) -> Decoded:
-        """Full result of a captured sequence; frames that are not in `frames_used` may be None."""
-        return decode_stack(frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads)
+    def decode(self, frames: Sequence[NDArray[np.uint8] | None], reasons: bool = True) -> Decoded:
+        """Full result of a captured sequence; frames that are not in `frames_used` may be None. ``reasons`` False is
+        faster where only the depth is wanted: see `decode_stack`."""
+        return decode_stack(
+            frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads, reasons=reasons
+        )
 
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background or not measured."""
-        return self.decode(frames).depth_mm
+        return self.decode(frames, reasons=False).depth_mm

@@ -1,6 +1,7 @@
 """One block of pixels through the decoder: the stages, each compiled or in NumPy, and the verdict on every pixel.
 
-`fpp_ml_bench.decoding` cuts the image into blocks that fit the processor's cache and calls `decode` here.
+`fpp_ml_bench.decoding` cuts the image into blocks that fit the processor's cache and calls `decode_direction` and
+`verdict` here.
 """
 
 from dataclasses import dataclass
@@ -111,6 +112,10 @@ class Coordinates:
     phase: NDArray[np.float64]
     reason: NDArray[np.uint8]
 
+    def at(self, kept: NDArray[np.intp]) -> "Coordinates":
+        """Those of some of the pixels."""
+        return Coordinates(self.coordinate_px[kept], self.modulation[kept], self.phase[kept], self.reason[kept])
+
 
 _STAGE_REASONS = (
     Reason.LOW_MODULATION,
@@ -190,11 +195,10 @@ def _depth_both(
     return depth_mm, disagreement
 
 
-def decode(
-    grey: dict[Direction, NDArray[np.uint8]], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], dict[Direction, Coordinates]]:
-    """Depth in mm float32 (n,), 0 = none, reason uint8 (n,), and the coordinates of each direction, of one block."""
-    found = {plan.direction: decode_direction(grey[plan.direction], plan, limits) for plan in plans}
+def verdict(
+    found: dict[Direction, Coordinates], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth in mm float32 (n,), 0 = none, and reason uint8 (n,) of a block from the coordinates of each direction."""
     first = found[plans[0].direction]
     if len(plans) == 1:
         reason = first.reason.copy()
@@ -211,4 +215,4 @@ def decode(
         outside = ~missing & ((depth_mm < near) | (depth_mm > far))
     reason[(reason == 0) & outside] = Reason.OUTSIDE_RANGE
     reason[((reason == 0) & missing) | np.isnan(rays[0])] = Reason.NO_RAY
-    return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason, found
+    return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason

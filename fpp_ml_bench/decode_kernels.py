@@ -167,3 +167,25 @@ def depth_both(  # type: ignore[no-untyped-def]
             z = 1.0 / inverse[i]
             good = (z > 0.0) & (z < np.inf) & (forward[i] * z + tz > 0.0)
             depth_mm[start + i] = z * 1000.0 if good else np.nan
+
+
+@njit
+def reach(  # type: ignore[no-untyped-def]
+    x, y, coordinate, rotation, translation, axis, focal, centre, depths, disagreement, slack, reached
+):
+    """`decode_reach.within_reach`: fills ``reached`` bool (n,). ``focal``, ``centre`` and ``depths`` (m) are pairs."""
+    other = 1 - axis
+    f, c = focal[axis], centre[axis]
+    g = focal[other]
+    tx, ty, tz = translation[axis], translation[other], translation[2]
+    near, far = depths
+    for i in range(len(x)):
+        a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
+        b = rotation[other, 0] * x[i] + rotation[other, 1] * y[i] + rotation[other, 2]
+        forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
+        first, last = near * forward + tz, far * forward + tz
+        begin, end = f * (near * a + tx) / first + c, f * (far * a + tx) / last + c
+        along, across = end - begin, g * (far * b + ty) / last - g * (near * b + ty) / first
+        margin = disagreement * math.sqrt(along * along + across * across) / abs(across) + slack
+        outside = (coordinate[i] < min(begin, end) - margin) | (coordinate[i] > max(begin, end) + margin)
+        reached[i] = not (outside & (first > 0.0) & (last > 0.0))

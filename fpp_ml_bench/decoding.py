@@ -13,15 +13,28 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decode_blocks import Coordinates, DirectionPlan, Limits, Reason, decode, plan_direction
+from fpp_ml_bench.decode_blocks import (
+    Coordinates,
+    DirectionPlan,
+    Limits,
+    Reason,
+    decode_direction,
+    plan_direction,
+    verdict,
+)  # fmt: skip
+from fpp_ml_bench.decode_reach import reach_is_bounded, within_reach
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.frames import DIRECTIONS, Direction
 from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.skipping import skipping_enabled
 
 Directions = Literal["horizontal", "vertical", "both"]
 
 BLOCK_PX = 1 << 15
 """Pixels worked off at a time: the grey levels of a block, 0.8 MB a direction, and its results stay in the cache."""
+WORTH_PICKING = 0.6
+"""Up to this part of a block, its pixels are picked out one by one for the second direction; beyond, reading the whole
+block in order is faster."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +58,9 @@ class Decoded:
     counts: dict[str, int]
     frames_used: tuple[int, ...]
     details: dict[Direction, Measured] = field(default_factory=dict)
+    second_px: int = 0
+    """Pixels of which the second direction's frames were read; fewer than were asked for where `decode_stack` was told
+    that nobody asks for reasons."""
 
 
 def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
@@ -98,6 +114,7 @@ def decode_stack(
     limits: Limits | None = None,
     details: bool = False,
     threads: int = 1,
+    reasons: bool = True,
 ) -> Decoded:
     """Depth in mm from a captured sequence.
 
@@ -116,6 +133,10 @@ def decode_stack(
     is the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return coordinates,
     modulation and wrapped phase.
 
+    ``reasons`` False: depth is all that is asked for. Then a pixel that one direction already shows to lie outside the
+    working range (`fpp_ml_bench.decode_reach`), or to have no coordinate, is not looked at in the other direction:
+    depth is the same bit by bit, and its reason is the first direction's, or OUTSIDE_RANGE.
+
     Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane
     leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit.
     """
@@ -132,14 +153,15 @@ def decode_stack(
     flat = _used_frames(frames, used, rig)
     shape = (rig.camera.height, rig.camera.width)
     chosen = _checked_mask(mask, shape)
-    image = _Image(flat, rig, plans, limits, chosen, details)
-    starts = range(0, image.pixels, BLOCK_PX)
+    depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
+    image = _Image(flat, rig, plans, limits, chosen, details, depth_alone)
+    starts, second_px = range(0, image.pixels, BLOCK_PX), 0
     if threads == 1 or len(starts) < 2:
         for start in starts:
-            image.decode_from(start)
+            second_px += image.decode_from(start)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(image.decode_from, starts))
+            second_px = sum(pool.map(image.decode_from, starts))
     counts = np.bincount(image.reason, minlength=len(Reason))
     return Decoded(
         depth_mm=image.depth_mm.reshape(shape),
@@ -147,6 +169,7 @@ def decode_stack(
         counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
         frames_used=used,
         details={one: image.measured(one, shape) for one in asked} if details else {},
+        second_px=second_px if len(plans) == 2 else 0,
     )
 
 
@@ -161,9 +184,11 @@ class _Image:
         limits: Limits,
         chosen: NDArray[np.intp] | None,
         details: bool,
+        depth_alone: bool,
     ) -> None:
         size = rig.camera.height * rig.camera.width
         self.frames, self.rig, self.plans, self.limits, self.chosen = frames, rig, plans, limits, chosen
+        self.depth_alone = depth_alone
         self.pixels = size if chosen is None else len(chosen)
         self.depth_mm = np.zeros(size, dtype=np.float32)
         self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
@@ -174,22 +199,42 @@ class _Image:
                 u, b, phi = (np.full(size, np.nan) for _ in range(3))
                 self.details[plan.direction] = Coordinates(u, b, phi, reason=np.zeros(size, dtype=np.uint8))
 
-    def decode_from(self, start: int) -> None:
+    def decode_from(self, start: int) -> int:
+        """Decode one block; returns of how many of its pixels every direction was looked at."""
         stop = min(start + BLOCK_PX, self.pixels)
         where = slice(start, stop) if self.chosen is None else self.chosen[start:stop]
-        grey = {}
-        for plan in self.plans:
-            levels = np.empty((len(plan.frames), stop - start), dtype=np.uint8)
-            for row, index in zip(levels, plan.frames, strict=True):
-                row[:] = self.frames[index][where]
-            grey[plan.direction] = levels
+        first = self._coordinates(self.plans[0], where, stop - start)
+        if self.depth_alone:
+            rays = self.rays[0][where], self.rays[1][where]
+            open_yet = within_reach(first.coordinate_px, rays, self.plans[0], self.rig, self.limits)
+            kept = np.flatnonzero(open_yet & (first.reason == 0))
+            if len(kept) <= WORTH_PICKING * (stop - start):
+                self.reason[where] = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
+                where = kept + start if self.chosen is None else self.chosen[start:stop][kept]
+                first, stop = first.at(kept), start + len(kept)
+        if stop == start:
+            return 0
+        found = {self.plans[0].direction: first}
+        for plan in self.plans[1:]:
+            found[plan.direction] = self._coordinates(plan, where, stop - start)
         rays = self.rays[0][where], self.rays[1][where]
-        depth_mm, reason, found = decode(grey, rays, self.plans, self.rig, self.limits)
-        self.depth_mm[where], self.reason[where] = depth_mm, reason
-        for direction, kept in self.details.items():
+        self.depth_mm[where], self.reason[where] = verdict(found, rays, self.plans, self.rig, self.limits)
+        for direction, kept_details in self.details.items():
             one = found[direction]
-            kept.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
-            kept.modulation[where], kept.phase[where] = one.modulation, one.phase
+            kept_details.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
+            kept_details.modulation[where], kept_details.phase[where] = one.modulation, one.phase
+        return stop - start
+
+    def _coordinates(self, plan: DirectionPlan, where: slice | NDArray[np.intp], count: int) -> Coordinates:
+        """One direction at ``count`` pixels, its frames' grey levels gathered first."""
+        levels = np.empty((len(plan.frames), count), dtype=np.uint8)
+        for row, index in zip(levels, plan.frames, strict=True):
+            if isinstance(where, slice):
+                row[:] = self.frames[index][where]
+            else:
+                # Every index is one of the image's: "clip" only saves the check, and a copy with it.
+                self.frames[index].take(where, out=row, mode="clip")
+        return decode_direction(levels, plan, self.limits)
 
     def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
         kept = self.details[direction]
