@@ -16,6 +16,7 @@
     ├── TrainingError             a training that diverged, or that can't start or go on
     ├── WeightsError              a weights file that is damaged, foreign or made for other data
     ├── DiagnosisError            a model that can't be looked into as asked, a probe or a layer that there is not
+    ├── StabilityError            a group of stability cases that there is not
     └── PublishError              something that can't be published: no token, no network, refused by the Hub
 
 A message says what was expected, what came, in which file or sample, and what to do.
@@ -80,6 +81,10 @@ class WeightsError(FppBenchError):
 
 class DiagnosisError(FppBenchError, ValueError):
     """A model that can't be looked into as asked, or a probe or a layer that there is not."""
+
+
+class StabilityError(FppBenchError, ValueError):
+    """A group of stability cases that there is not."""
 
 
 class PublishError(FppBenchError):

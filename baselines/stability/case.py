@@ -1,0 +1,159 @@
+"""What a stability case is, and the one place that says whether it passed.
+
+A case computes something that the benchmark computes, where that is hard, and compares it with a reference nobody can
+doubt: 50-digit arithmetic, a closed form, or exact sums. Next to the measured error stands the bound that theory
+predicts for it: a condition number times the unit round-off, or the propagation of noise and quantisation. The bound
+comes from the derivation that the case states, never from the measured error.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+Scalar = float | int | str
+Expects = Literal["number", "refusal", "either"]
+
+
+class Verdict(StrEnum):
+    """WITHIN: the error is within its bound. FLAGGED: honestly refused, by an error or an invalid mask."""
+
+    WITHIN = "within"
+    FLAGGED = "flagged"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a case measured, at its worst element: the one with the largest error / bound.
+
+    ``error`` is None where nothing was computed because the code refused, with ``note`` saying how. ``flagged`` is the
+    share of elements that were refused and ``may_flag`` the largest share that theory allows. ``condition`` is the
+    condition number behind the bound, where there is one.
+    """
+
+    error: float | None
+    bound: float = 0.0
+    flagged: float = 0.0
+    may_flag: float = 0.0
+    note: str = ""
+    condition: float | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Error as a part of its bound; 0 where both are 0, None where nothing was computed."""
+        if self.error is None:
+            return None
+        if self.error == 0:
+            return 0.0
+        return self.error / self.bound if self.bound > 0 else math.inf
+
+
+@dataclass(frozen=True)
+class Case:
+    """One stiff or extreme case.
+
+    ``run()`` gives the `Outcome`; ``computes``, ``reference`` and ``predicts`` say in a line each what is computed,
+    what it is compared with, and where the bound comes from. ``expects``: a number, a refusal, or either of them.
+    ``heavy`` cases take seconds or gigabytes and are left out of a quick run.
+    """
+
+    group: str
+    family: str
+    parameters: Mapping[str, Scalar]
+    computes: str
+    reference: str
+    predicts: str
+    unit: str
+    run: Callable[[], Outcome] = field(repr=False)
+    expects: Expects = "number"
+    heavy: bool = False
+
+    @property
+    def name(self) -> str:
+        """``family, parameter value, ...``"""
+        return ", ".join([self.family, *(f"{key} {shown(value)}" for key, value in self.parameters.items())])
+
+
+def shown(value: Scalar) -> str:
+    """A parameter as people write it."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def family(
+    group: str,
+    name: str,
+    run: Callable[..., Outcome],
+    grid: Mapping[str, Iterable[Scalar]],
+    *,
+    computes: str,
+    reference: str,
+    predicts: str,
+    unit: str,
+    expects: Expects | Callable[..., Expects] = "number",
+    heavy: Callable[..., bool] = lambda **_: False,
+) -> list[Case]:
+    """Cases of one kind, one for every combination of the grid's values, which ``run`` and ``expects`` get by name."""
+    cases = []
+    for values in product(*grid.values()):
+        parameters = dict(zip(grid, values, strict=True))
+        wanted = expects(**parameters) if callable(expects) else expects
+        cases.append(
+            Case(
+                group, name, parameters, computes, reference, predicts, unit,
+                lambda parameters=parameters: run(**parameters), wanted, heavy(**parameters),
+            )  # fmt: skip
+        )
+    return cases
+
+
+def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
+    """The verdict on a case, and what speaks against it where it failed."""
+    if outcome.error is None:
+        if case.expects == "number":
+            return Verdict.FAIL, f"refused what can be computed: {outcome.note}"
+        return Verdict.FLAGGED, ""
+    if case.expects == "refusal":
+        return Verdict.FAIL, "gave a number where there is none"
+    if not math.isfinite(outcome.bound):
+        return Verdict.FAIL, "theory predicts no finite error, so the number says nothing and should be refused"
+    if not outcome.error <= outcome.bound:  # NaN is not
+        return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
+    if outcome.flagged > outcome.may_flag:
+        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {outcome.may_flag:.2%}"
+    return Verdict.WITHIN, ""
+
+
+def worst(
+    errors: ArrayLike,
+    bounds: ArrayLike,
+    flagged: ArrayLike | None = None,
+    may_flag: float = 0.0,
+    condition: float | None = None,
+    note: str = "",
+) -> Outcome:
+    """The outcome of many elements: the worst that was not flagged. NaN errors that were not flagged stay NaN."""
+    error, bound = (np.ravel(part) for part in np.broadcast_arrays(np.abs(np.asarray(errors, float)), bounds))
+    refused = np.zeros(error.shape, bool) if flagged is None else np.ravel(np.broadcast_to(flagged, error.shape))
+    share = float(refused.mean()) if refused.size else 0.0
+    kept = np.flatnonzero(~refused)
+    if not kept.size:
+        return Outcome(None, flagged=1.0, may_flag=may_flag, note=note or "every element is masked", condition=condition)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(error[kept] == 0, 0.0, error[kept] / bound[kept])
+    place = kept[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
+    return Outcome(float(error[place]), float(bound[place]), share, may_flag, note, condition)
+
+
+def refusal(call: Callable[[], object], *errors: type[BaseException]) -> Outcome:
+    """Outcome of a call that should refuse: its message where one of ``errors`` comes, else a number (exactly 0)."""
+    try:
+        call()
+    except errors as error:
+        return Outcome(None, flagged=1.0, note=str(error))
+    return Outcome(0.0, 0.0)

@@ -1,0 +1,61 @@
+"""Running cases: the list, one after the other, and what came of each."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+
+from fpp_ml_bench.baselines.stability.case import Case, Outcome, Verdict, judge
+from fpp_ml_bench.errors import StabilityError
+
+GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes")
+"""Groups of cases, each in a module ``cases_{group}`` beside this one; only ``networks`` imports torch."""
+
+# A crash is a finding about the code under test and not the end of the run; these are what numerical code throws.
+_CRASHES = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case with its outcome and verdict; ``against`` says what speaks against it where it failed."""
+
+    case: Case
+    outcome: Outcome
+    verdict: Verdict
+    against: str
+    seconds: float
+
+
+def all_cases(groups: Iterable[str] = GROUPS, quick: bool = False) -> list[Case]:
+    """The cases of ``groups``, without the heavy ones when ``quick``. Raises `StabilityError`."""
+    found: list[Case] = []
+    for group in groups:
+        if group not in GROUPS:
+            raise StabilityError(f"unknown group {group!r}; there are {', '.join(GROUPS)}")
+        found += import_module(f"{__package__}.cases_{group}").cases()
+    return [case for case in found if not (quick and case.heavy)]
+
+
+def run_case(case: Case) -> Row:
+    """Run one case. A crash of the code under test, even a refusal that the case did not name, is a FAIL."""
+    started = time.perf_counter()
+    try:
+        with np.errstate(all="ignore"):
+            outcome = case.run()
+    except _CRASHES as error:
+        outcome = Outcome(None, note=f"{type(error).__name__}: {error}")
+        verdict, against = Verdict.FAIL, f"ended in {outcome.note}"
+    else:
+        verdict, against = judge(case, outcome)
+    return Row(case, outcome, verdict, against, time.perf_counter() - started)
+
+
+def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
+    """Run cases in order; ``done`` hears of each."""
+    rows = []
+    for case in cases:
+        rows.append(run_case(case))
+        done(rows[-1])
+    return rows
