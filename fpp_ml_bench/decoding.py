@@ -24,6 +24,7 @@ from fpp_ml_bench.decode_blocks import (
 )  # fmt: skip
 from fpp_ml_bench.decode_reach import reach_is_bounded, within_reach
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.frame_check import check_frames
 from fpp_ml_bench.frames import DIRECTIONS, Direction
 from fpp_ml_bench.rig import Rig
 from fpp_ml_bench.skipping import skipping_enabled
@@ -138,7 +139,8 @@ def decode_stack(
     depth is the same bit by bit, and its reason is the first direction's, or OUTSIDE_RANGE.
 
     Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane
-    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit.
+    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose
+    capture failed (`fpp_ml_bench.frame_check`).
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
@@ -153,6 +155,8 @@ def decode_stack(
     flat = _used_frames(frames, used, rig)
     shape = (rig.camera.height, rig.camera.width)
     chosen = _checked_mask(mask, shape)
+    for plan in plans:
+        check_frames(flat, plan, chosen, rig.sequence)
     depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
     image = _Image(flat, rig, plans, limits, chosen, details, depth_alone)
     starts, second_px = range(0, image.pixels, BLOCK_PX), 0

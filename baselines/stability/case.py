@@ -105,8 +105,16 @@ def family(
         wanted = expects(**parameters) if callable(expects) else expects
         cases.append(
             Case(
-                group, name, parameters, computes, reference, predicts, unit,
-                lambda parameters=parameters: run(**parameters), wanted, heavy(**parameters),
+                group,
+                name,
+                parameters,
+                computes,
+                reference,
+                predicts,
+                unit,
+                lambda parameters=parameters: run(**parameters),
+                wanted,
+                heavy(**parameters),
             )  # fmt: skip
         )
     return cases
@@ -138,12 +146,15 @@ def worst(
     note: str = "",
 ) -> Outcome:
     """The outcome of many elements: the worst that was not flagged. NaN errors that were not flagged stay NaN."""
-    error, bound = (np.ravel(part) for part in np.broadcast_arrays(np.abs(np.asarray(errors, float)), bounds))
-    refused = np.zeros(error.shape, bool) if flagged is None else np.ravel(np.broadcast_to(flagged, error.shape))
+    masked = False if flagged is None else np.asarray(flagged)
+    parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), masked)
+    error, bound, refused = (np.ravel(part) for part in parts)
     share = float(refused.mean()) if refused.size else 0.0
     kept = np.flatnonzero(~refused)
     if not kept.size:
-        return Outcome(None, flagged=1.0, may_flag=may_flag, note=note or "every element is masked", condition=condition)
+        return Outcome(
+            None, flagged=1.0, may_flag=may_flag, note=note or "every element is masked", condition=condition
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error[kept] == 0, 0.0, error[kept] / bound[kept])
     place = kept[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]

@@ -197,7 +197,7 @@ def close_steps(spread_rad: float) -> Outcome:
     singular = np.linalg.svd(model, compute_uv=False)
     condition = float(singular[0] / singular[-1])
     strength = float(np.linalg.norm(frames[:, 0], axis=0).max())
-    bound = 8 * 3 * U64 * condition * strength / float(singular[-1]) / 100.0
+    bound = 8 * 3 * U64 * condition * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / float(singular[-1]) / 100.0
     return worst(difference(found, exact), bound, condition=condition)
 
 
