@@ -72,7 +72,7 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     rays = rig.camera.rays()
     hits = traced.primary(*rays)
     lit = lit_object(hits, rig, studio.lighting, traced)
-    whole = studio._background.patched(hits.pixels, lit)
+    whole = studio.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
     row = studio.photograph(mesh, "A60")
     frames = [row.frames[i] for i in range(len(rig.sequence))]
     seen = np.zeros(row.depth_mm.shape, dtype=bool)
@@ -101,7 +101,9 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
     vertices_m, _ = place(mesh, "A60", rig, "fixed", settings.seed)
     traced = TracedObject(mesh, vertices_m)
     hits = traced.primary(*rig.camera.rays())
-    lit = studio._background.patched(hits.pixels, lit_object(hits, rig, studio.lighting, traced))
+    lit = studio.backdrop.behind(traced, hits.pixels).patched(
+        hits.pixels, lit_object(hits, rig, studio.lighting, traced)
+    )
     shape = (rig.camera.height, rig.camera.width)
     x, y = rig.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * rig.background_m

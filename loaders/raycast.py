@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.scene import SolidMesh
+from fpp_ml_bench.skipping import skipping_enabled
 
 _SHADOW_OFFSET_M = 1e-4
 
@@ -19,7 +20,7 @@ class Hits:
     """Pixels that see the object: flat ``pixels`` int64 (n,), ``depth_m`` float64 (n,), ``normals`` float64 (n, 3).
 
     Normals are unit vectors turned toward the camera, so a mesh with flipped triangles shades like one without.
-    ``rays`` counts the primary rays that were traced.
+    ``rays`` counts the primary rays that may hit the object: those that are traced, unless skipping is switched off.
     """
 
     pixels: NDArray[np.int64]
@@ -59,6 +60,9 @@ class TracedObject:
         """Trace the camera's rays, undistorted normalised coordinates (H, W); NaN rays see nothing."""
         x, y = rays_x.ravel(), rays_y.ravel()
         wanted = self._may_hit(x, y)
+        rays = int(wanted.size)
+        if not skipping_enabled():
+            wanted = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
         directions = np.column_stack([x[wanted], y[wanted], np.ones(wanted.size)])
         triangle = self._first(np.zeros((wanted.size, 3), dtype=np.float32), directions.astype(np.float32))
         seen = triangle >= 0
@@ -71,7 +75,7 @@ class TracedObject:
         lowest, highest = self._depth_bounds[0][triangle], self._depth_bounds[1][triangle]
         depth_m = np.where(np.isfinite(depth_m), np.clip(depth_m, lowest, highest), lowest)
         normals = np.where((facing > 0)[:, None], -normals, normals)
-        return Hits(pixels=pixels, depth_m=depth_m, normals=normals, rays=int(wanted.size))
+        return Hits(pixels=pixels, depth_m=depth_m, normals=normals, rays=rays)
 
     def _may_hit(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
         """Flat indices of rays inside the object's bounding box in normalised coordinates: the others can't hit it."""
@@ -83,6 +87,21 @@ class TracedObject:
             for rays, across in ((x, self._vertices_m[:, 0] / z), (y, self._vertices_m[:, 1] / z)):
                 usable &= (rays >= across.min() - slack) & (rays <= across.max() + slack)
         return np.flatnonzero(usable)
+
+    def may_shadow(self, from_light_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points the object can hide from the light at ``light_m`` (3,); bool (n,).
+
+        ``from_light_m`` float64 (3, n): from the light to each point, along the camera's axes. Points outside the
+        object's bounding box as the light sees it lie on lines that miss the object.
+        """
+        x, y, z = from_light_m
+        around = self._vertices_m - light_m
+        if around[:, 2].min() <= 0:
+            return np.ones(z.size, dtype=bool)
+        possible, slack = z > 0, 1e-5  # Embree's float32 moves a ray by about a micrometre
+        for along, across in ((x, around[:, 0] / around[:, 2]), (y, around[:, 1] / around[:, 2])):
+            possible &= (along >= (across.min() - slack) * z) & (along <= (across.max() + slack) * z)
+        return possible
 
     def shadowed(self, points_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which surface points (n, 3) the object itself hides from the light at ``light_m`` (3,); bool (n,)."""

@@ -8,15 +8,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.frames import Sequence
+from fpp_ml_bench.loaders.backdrop import Backdrop
 from fpp_ml_bench.loaders.camera import Exposure
-from fpp_ml_bench.loaders.illumination import (
-    Lighting,
-    LitPixels,
-    background_plane,
-    hit_points_m,
-    light_surface,
-    lit_object,
-)  # fmt: skip
+from fpp_ml_bench.loaders.illumination import Lighting, LitPixels, lit_object
 from fpp_ml_bench.loaders.raycast import Hits, TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place
 from fpp_ml_bench.loaders.schema import stored_frames
@@ -24,6 +19,7 @@ from fpp_ml_bench.loaders.sensor import Noise
 from fpp_ml_bench.loaders.settings import BuildSettings
 from fpp_ml_bench.loaders.shards import Row
 from fpp_ml_bench.pixel_sets import object_mask, object_near_edge
+from fpp_ml_bench.skipping import skipping_enabled
 
 INTERIOR_PX = 3
 """Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
@@ -42,16 +38,18 @@ class Studio:
         rig, settings = self.settings.rig, self.settings
         self.lighting = Lighting(shadows=settings.shadows)
         self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
-        self._background = background_plane(rig, self.lighting)
+        self.backdrop = Backdrop(rig, self.lighting)
         self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
         self._stored = stored_frames(rig.sequence, settings.stored)
+        self._unstored = unstored_frames(rig.sequence, self._stored)
         self._frames = np.zeros((len(rig.sequence), rig.camera.height, rig.camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
         """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
 
         Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
-        pixels alone: the bytes there, and so the decoded depth, are the same either way.
+        pixels alone, and decoded there alone: the bytes there, and so the decoded depth, are the same either way. With
+        skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
         """
         settings, rig = self.settings, self.settings.rig
         vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
@@ -59,13 +57,12 @@ class Studio:
         hits = traced.primary(*rig.camera.rays())
         lit = lit_object(hits, rig, self.lighting, traced)
         stream = (settings.seed, mesh.name, view)
-        background = self._shadowed_background(traced) if self.lighting.shadows else self._background
-        whole = background.patched(hits.pixels, lit)
+        whole = self.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
         self._expose(hits, lit, whole, stream)
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
         seen = object_mask(exact_mm)
-        depth_mm = decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
+        depth_mm = self._ground_truth_mm(seen)
         measured = {
             "distance_mm": distance_m * MM_PER_M,
             "rays": hits.rays + whole.shadow_rays,
@@ -76,20 +73,25 @@ class Studio:
 
     def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
         images = self._frames.reshape(len(self._frames), -1)
-        for run in _runs(self._stored):
+        everything = not skipping_enabled()
+        for run in _runs(tuple(range(len(images))) if everything else self._stored):
             self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
-        others = [index for index in range(len(images)) if index not in self._stored]
-        if others:
+        if self._unstored and not everything:
             pixels = hits.pixels.astype(np.uint32)
-            for index, values in zip(others, self.exposure.expose(others, lit, pixels, stream), strict=True):
+            exposed = self.exposure.expose(self._unstored, lit, pixels, stream)
+            for index, values in zip(self._unstored, exposed, strict=True):
                 images[index, hits.pixels] = values
 
-    def _shadowed_background(self, traced: TracedObject) -> LitPixels:
+    def _ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         rig = self.settings.rig
-        everywhere = np.full(self._pixels.size, rig.background_m)
-        normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (self._pixels.size, 3))
-        plane = Hits(self._pixels.astype(np.int64), everywhere, normals, rays=0)
-        return light_surface(hit_points_m(plane, rig), normals, rig, self.lighting, traced)
+        if skipping_enabled():
+            return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
+        return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
+
+
+def unstored_frames(sequence: Sequence, stored: tuple[int, ...]) -> tuple[int, ...]:
+    """Frames that the ground truth is decoded from and that are not ``stored``: all others but black and white."""
+    return tuple(i for i in range(len(sequence)) if i not in stored and i not in (sequence.black, sequence.white))
 
 
 def _runs(indices: tuple[int, ...]) -> list[range]:

@@ -1,0 +1,169 @@
+"""What a scene does not need is left out, and the results are the same bytes with skipping off."""
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import TINY_SIZE, file_bytes, tiny_settings
+from test_decoding import LENSES, PAPER, TURNED, capture, tilted
+
+from fpp_ml_bench.acceleration import SWITCH as COMPILED
+from fpp_ml_bench.decode_blocks import Limits
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.loaders.backdrop import Backdrop
+from fpp_ml_bench.loaders.build import build
+from fpp_ml_bench.loaders.camera import Exposure
+from fpp_ml_bench.loaders.illumination import Lighting
+from fpp_ml_bench.loaders.raycast import TracedObject
+from fpp_ml_bench.loaders.scene import SolidMesh, place
+from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
+
+
+def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
+    monkeypatch.delenv(SWITCH, raising=False)
+    assert skipping_enabled()
+    with skipping(False):
+        assert not skipping_enabled()
+        with skipping(True):
+            assert skipping_enabled()
+        assert not skipping_enabled()
+    assert skipping_enabled()
+    monkeypatch.setenv(SWITCH, "0")
+    assert not skipping_enabled()
+
+
+@pytest.mark.parametrize("change", [{}, {"shadows": True, "stored": "single_shot"}])
+def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
+    settings = tiny_settings(objects=("power_drill",), **change)
+    build(tmp_path / "on", settings, workers=1)
+    with skipping(False):
+        build(tmp_path / "off", settings, workers=1)
+    one, other = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
+    assert sorted(one) == sorted(other) and sum(name.endswith(".arrow") for name in one) in (1, 4)
+    assert [name for name in one if one[name] != other[name]] == []
+
+
+def counting(monkeypatch):
+    """What really happens: rays given to Embree, pixels exposed whole or in part."""
+    counts = {"rays": 0, "exposed": 0}
+    first, expose = TracedObject._first, Exposure.expose
+
+    def counted_first(self, origins, directions):
+        counts["rays"] += len(origins)
+        return first(self, origins, directions)
+
+    def counted_expose(self, frames, lit, pixels, *rest):
+        counts["exposed"] += len(frames) * pixels.size
+        return expose(self, frames, lit, pixels, *rest)
+
+    monkeypatch.setattr(TracedObject, "_first", counted_first)
+    monkeypatch.setattr(Exposure, "expose", counted_expose)
+    return counts
+
+
+def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeypatch):
+    counts = counting(monkeypatch)
+    settings = tiny_settings(objects=("cork",), stored="single_shot")
+    manifest = build(tmp_path / "on", settings, workers=1)
+    rows = manifest.samples["train"]
+    pixels = TINY_SIZE**2
+    assert counts["rays"] == sum(row["rays"] for row in rows) < 0.1 * len(rows) * pixels
+    # Frame 0 whole; 49 that only the ground truth needs at the object alone; black and white nowhere.
+    assert counts["exposed"] == sum(pixels + 49 * row["exact_px"] for row in rows)
+    counts.update(rays=0, exposed=0)
+    with skipping(False):
+        build(tmp_path / "off", settings, workers=1)
+    assert counts == {"rays": len(rows) * pixels, "exposed": len(rows) * 52 * pixels}
+
+
+def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
+    rig, lighting = paper_rig(TINY_SIZE), Lighting(shadows=True)
+    ball = trimesh.creation.icosphere(3, 0.15)
+    mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
+    traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
+    covered = traced.primary(*rig.camera.rays()).pixels
+    backdrop, counts = Backdrop(rig, lighting), counting(monkeypatch)
+    fewer = backdrop.behind(traced, covered)
+    asked = counts["rays"]
+    with skipping(False):
+        every = backdrop.behind(traced, covered)
+    assert 0 < asked == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - asked)
+    elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
+    elsewhere[covered] = False
+    np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
+    unshaded = Backdrop(rig, Lighting()).behind(traced, covered).gain
+    assert ((fewer.gain == 0) & (unshaded > 0))[elsewhere].sum() > 100
+
+
+# ---- decoding
+
+RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
+
+
+def sparse(rig, share=0.3):
+    """Frames of a tilted plane that fills a band of the image, far background elsewhere, some of it dark."""
+    shape = rig.camera.height, rig.camera.width
+    surface = tilted(rig)
+    surface[int(share * shape[0]) :] = 3.2
+    albedo = np.full(shape, 0.45)
+    albedo[-shape[0] // 4 :] = 0.005
+    return capture(rig, surface, albedo=albedo), surface < 3
+
+
+@RIGS
+@pytest.mark.parametrize("compiled", ["1", "0"])
+@pytest.mark.parametrize("steps", [3, None])
+def test_depth_alone_is_the_depth_with_reasons(rig, compiled, steps, monkeypatch):
+    monkeypatch.setenv(COMPILED, compiled)
+    frames, seen = sparse(rig)
+    everything = decode_stack(frames, rig, steps=steps)
+    alone = decode_stack(frames, rig, steps=steps, reasons=False)
+    np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
+    decoded = alone.depth_mm > 0
+    assert decoded.sum() > 0.5 * seen.sum()
+    # A pixel without depth says so, though perhaps for another reason; one with depth is decoded.
+    np.testing.assert_array_equal(alone.reason == 0, decoded)
+    assert everything.second_px == seen.size
+    if rig is LENSES:  # no bound is known for a projector with distortion: nothing is left out
+        assert alone.second_px == seen.size
+    else:
+        assert decoded.sum() <= alone.second_px < 1.1 * seen.sum() < 0.4 * seen.size
+    with skipping(False):
+        off = decode_stack(frames, rig, steps=steps, reasons=False)
+    np.testing.assert_array_equal(off.depth_mm, alone.depth_mm)
+    np.testing.assert_array_equal(off.reason, everything.reason)
+    assert off.second_px == seen.size
+
+
+@pytest.mark.parametrize("disagreement", [0.02, 1.5, 8.0])
+def test_no_pixel_near_the_ends_of_the_range_is_lost(disagreement):
+    """Planes at the very ends of the range, noise that moves pixels across them, and any tolerance."""
+    near_mm, far_mm = PAPER.working_range_mm
+    shape = PAPER.camera.height, PAPER.camera.width
+    for depth_mm in (near_mm, far_mm):
+        frames = capture(PAPER, np.full(shape, depth_mm / 1000), noise=12.0)
+        limits = Limits(max_disagreement_px=disagreement)
+        everything = decode_stack(frames, PAPER, steps=3, limits=limits)
+        alone = decode_stack(frames, PAPER, steps=3, limits=limits, reasons=False)
+        assert 0.01 < (everything.depth_mm > 0).mean() < 0.9
+        np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
+
+
+def test_inside_a_mask_the_bytes_are_those_of_the_whole_image():
+    frames, seen = sparse(PAPER)
+    mask = seen.copy()
+    mask[:, ::3] = False
+    whole = decode_stack(frames, PAPER)
+    for reasons in (True, False):
+        part = decode_stack(frames, PAPER, mask=mask, reasons=reasons)
+        np.testing.assert_array_equal(part.depth_mm, np.where(mask, whole.depth_mm, 0))
+        assert part.counts["not_asked"] == (~mask).sum()
+    # Frames in which everything outside the mask is destroyed: nothing there is looked at.
+    destroyed = [np.where(mask, frame, 255 - frame).astype(np.uint8) for frame in frames]
+    np.testing.assert_array_equal(decode_stack(destroyed, PAPER, mask=mask).depth_mm, part.depth_mm)
+
+
+def test_an_image_without_object_never_reads_the_second_direction():
+    frames = capture(PAPER, np.full((PAPER.camera.height, PAPER.camera.width), 3.2))
+    found = decode_stack(frames, PAPER, reasons=False, threads=2)
+    assert found.second_px == 0 and not found.depth_mm.any()
