@@ -1,9 +1,10 @@
 """A sinusoid frame that can't be what it should: dead, dimmed or flashed. Found from the frames' mean grey levels.
 
-Every pixel follows ``A + C cos delta_n + S sin delta_n``, and so does the mean over any set of pixels. From five steps
-on a mean that the others contradict therefore shows, whatever the scene; with four nothing is left to say which frame
-it is, but for one that is black at every pixel, for which the frame half a period on vouches. Three steps have no
-redundancy. A wrong frame would otherwise pass in silence, as a phase error of up to (2/N) (A + B) / B.
+Every pixel follows ``A + C cos delta_n + S sin delta_n``, and so does the mean over any set of pixels. From seven steps
+on a mean that the others contradict therefore shows, whatever the scene, and three spare equations keep a scene that
+bends the law (gamma on a few pixels) from being taken for a wrong frame. With four to six only a black frame is sure to
+be wrong: the one half a period on vouches. Three steps have no redundancy. A wrong frame would otherwise pass in
+silence, as a phase error of up to (2/N) (A + B) / B.
 """
 
 from collections.abc import Mapping
@@ -24,7 +25,10 @@ LEAST_OFF_SHARE = 0.3
 AGREEMENT_GREY = 3.0
 """Largest residual of the other frames' means: quantisation, noise and clipping leave less, unless the scene itself
 does not follow the model (a strong gamma on a few pixels), and then no frame is accused."""
-OPPOSITE_SPAN_GREY = 8
+LEAST_STEPS_FOR_MEANS = 7
+OPPOSITE_SPAN_GREY = 40
+"""A frame is black by right where all phases stand within 0.2 rad of its minimum; the frame half a period on, or 36
+degrees beside that for five steps, then spans at most a fifth of the modulation."""
 
 
 def check_frames(
@@ -42,25 +46,24 @@ def check_frames(
     step = -(-asked // SAMPLED_PX)
     where = slice(None, None, step) if chosen is None else chosen[::step]
     levels = [flat[index][where] for index in plan.sinusoids]
-    if len(levels) > 4:
+    if len(levels) >= LEAST_STEPS_FOR_MEANS:
         shifts = 2 * np.pi * np.array([sequence.frames[index].step for index in plan.sinusoids]) / sequence.steps
         model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
         wrong = _off(np.array([level.mean() for level in levels]), model, plan.weights)
     else:
         wrong = _black(levels)
     if wrong is not None:
-        place, found, expected = wrong
+        place, what = wrong
         raise DecodeError(
-            f"frame {sequence.frames[plan.sinusoids[place]].title}: its mean grey level is {found:.0f}, and by the "
-            f"other {len(levels) - 1} steps it should be {expected:.0f}: its capture failed (dead, dimmed or flashed "
-            "frame); take it again, or decode with steps that leave it out"
+            f"frame {sequence.frames[plan.sinusoids[place]].title}: {what}: its capture failed (dead, dimmed or "
+            "flashed frame); take it again, or decode with steps that leave it out"
         )
 
 
 def _off(
     means: NDArray[np.float64], model: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[int, float, float] | None:
-    """The frame whose mean the others contradict, with its mean and what it should be; None where there is none."""
+) -> tuple[int, str] | None:
+    """The frame whose mean the others contradict, and what is wrong with it; None where there is none."""
     fitted = model @ (weights @ means)
     influence = np.einsum("ij,ji->i", model, weights)
     off = np.abs(means - fitted) / (1 - influence)  # from what the other frames alone predict
@@ -70,15 +73,16 @@ def _off(
         expected = float(model[place] @ fit)
         agree = np.abs(model[others] @ fit - means[others]).max() <= AGREEMENT_GREY
         if agree and off[place] > LEAST_OFF_SHARE * max(expected, 0.0):
-            return int(place), float(means[place]), expected
+            found = f"its mean grey level is {means[place]:.0f}, and by the other steps it should be {expected:.0f}"
+            return int(place), found
     return None
 
 
-def _black(levels: list[NDArray[np.uint8]]) -> tuple[int, float, float] | None:
-    """Of four: the frame that is black at every pixel while the one half a period on varies. Both are at an extreme of
-    the fringe there, so one can't vary if the other does not."""
+def _black(levels: list[NDArray[np.uint8]]) -> tuple[int, str] | None:
+    """The frame that is black at every pixel while the one half a period on varies. Both are at an extreme of the
+    fringe there, so one can't vary if the other does not."""
     for place, level in enumerate(levels):
-        before, opposite, after = (levels[(place + step) % 4] for step in (-1, 2, 1))
+        opposite = levels[(place + len(levels) // 2) % len(levels)]
         if not level.any() and int(opposite.max()) - int(opposite.min()) >= OPPOSITE_SPAN_GREY:
-            return place, 0.0, float(before.mean() + after.mean() - opposite.mean())
+            return place, "it is black all over while the other steps vary"
     return None

@@ -115,7 +115,7 @@ def family(
                 lambda parameters=parameters: run(**parameters),
                 wanted,
                 heavy(**parameters),
-            )  # fmt: skip
+            )
         )
     return cases
 

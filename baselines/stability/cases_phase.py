@@ -66,7 +66,7 @@ def cases() -> list[Case]:
             {"spread_rad": (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8)},
             computes="wrapped phase at shifts 0, s, 2 s", unit="rad",
             reference="least squares of the same frames in 50 digits",
-            predicts="8 N u cond (A + B) / B (pinv times model is I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused",
+            predicts="8 N u cond (A + B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused",
             expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
         ),
         *family(
