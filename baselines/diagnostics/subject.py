@@ -210,7 +210,9 @@ def subject_of_network(found: Any, dataset: "DatasetFolder", layers: Sequence[st
     def untrained(seed: int) -> "nn.Module":
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return build(model.config.network, **model.config.options).eval().requires_grad_(False)
+            network: nn.Module = build(model.config.network, **model.config.options)
+        network = network.eval().requires_grad_(False)
+        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     return Subject(
         name=found.name,

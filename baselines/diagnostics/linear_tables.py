@@ -1,0 +1,92 @@
+"""The tables of linear probing: the paper's, and those that say what its numbers rest on."""
+
+import numpy as np
+
+from fpp_ml_bench.baselines.diagnostics.activations import INPUT
+from fpp_ml_bench.baselines.diagnostics.probe import Cell, Table
+from fpp_ml_bench.baselines.diagnostics.scores import (
+    CONTROLS,
+    TRAINED,
+    UNTRAINED,
+    Layers,
+    Score,
+    Scores,
+    mean_ratio,
+    ratio,
+)
+
+TITLES = {
+    "edges": "edges", "depth": "depth, whole image", "distance": "depth in mm, object", "phase": "wrapped phase",
+    "order": "fringe order",
+}  # fmt: skip
+_CONTROL_TITLES = {INPUT: "raw input", "position": "pixel's place alone"}
+
+
+def tables(linear: Scores, spatial: Scores) -> list[Table]:
+    """All of them, the paper's first."""
+    return [paper_table(spatial), variance_table(spatial), *(linear_table(linear, target) for target in _asked(linear))]
+
+
+def paper_table(spatial: Scores) -> Table:
+    """Validation MSE of the four-convolution probes by layer, and their ratio."""
+    rows: list[list[Cell]] = [
+        [layer, found["edges"].mse, found["depth"].mse, ratio(found)] for layer, found in spatial[TRAINED].items()
+    ]
+    rows += [
+        [title, *(_mean(layers, target) for target in ("edges", "depth")), mean_ratio(layers)]
+        for title, layers in (
+            ("Average", spatial[TRAINED]),
+            ("Average, random weights", spatial[UNTRAINED]),
+            ("Raw input", spatial[CONTROLS]),
+        )
+    ]
+    return Table(
+        "Four-convolution probes, validation MSE (the paper's table; less is easier to read)",
+        ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"),
+        rows,
+    )
+
+
+def variance_table(spatial: Scores) -> Table:
+    """The same probes as a share of variance explained, against the same probe on random weights."""
+    header = ("Layer", "Edges R2", "random weights", "Depth R2", "random weights")
+    rows: list[list[Cell]] = [
+        [
+            layer,
+            *(shown(layers[layer][target]) for target in ("edges", "depth") for layers in _pair(spatial)),
+        ]
+        for layer in spatial[TRAINED]
+    ]
+    raw = spatial[CONTROLS][INPUT]
+    rows.append(["Raw input", shown(raw["edges"]), None, shown(raw["depth"]), None])
+    return Table("The same probes, share of variance explained (R2)", header, rows)
+
+
+def linear_table(linear: Scores, target: str) -> Table:
+    """One target of the 1 x 1 probes: trained, random weights, and the controls."""
+    rows: list[list[Cell]] = [
+        [layer, shown(found[target]), shown(linear[UNTRAINED][layer][target])]
+        for layer, found in linear[TRAINED].items()
+    ]
+    rows += [[_CONTROL_TITLES[layer], shown(found[target]), None] for layer, found in linear[CONTROLS].items()]
+    return Table(f"Linear (1 x 1) probes for {TITLES[target]}: R2", ("Layer", "This network", "random weights"), rows)
+
+
+def shown(score: Score) -> str:
+    """R2 with its interval."""
+    if score.r2_interval is None:
+        return f"{score.r2:.3f}"
+    low, high = score.r2_interval
+    return f"{score.r2:.3f} ({low:.3f} to {high:.3f})"
+
+
+def _asked(linear: Scores) -> list[str]:
+    return list(next(iter(linear[TRAINED].values())))
+
+
+def _pair(scores: Scores) -> tuple[Layers, Layers]:
+    return scores[TRAINED], scores[UNTRAINED]
+
+
+def _mean(layers: Layers, target: str) -> float:
+    return float(np.mean([found[target].mse for found in layers.values()]))
