@@ -1,0 +1,193 @@
+"""What the order cases compute: cells and fringe orders where bits blend, flip or run out and the phase wraps."""
+
+import numpy as np
+
+from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
+from fpp_ml_bench.baselines.stability.frames import (
+    MEAN,
+    coded_rig,
+    direction_levels,
+    frame_gain,
+    grey,
+    plan,
+    plane_stack,
+    shifts,
+    sinusoids,
+    worst_angle,
+)
+from fpp_ml_bench.baselines.stability.roundoff import U64, difference, high_precision
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decode_blocks import Limits, Reason, decode_direction
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.frames import Direction, Sequence
+from fpp_ml_bench.gray_code import (
+    INCONSISTENT_RAD,
+    absolute_phase,
+    binary_to_gray,
+    cell_centres_rad,
+    cell_count,
+    gray_to_binary,
+)
+from fpp_ml_bench.phase import minus_atan2
+from fpp_ml_bench.rig import Rig, paper_rig
+
+_MODULATION = 100.0
+
+
+def _quantised_px(rig: Rig) -> float:
+    """Largest error of a coordinate, px, that rounding frames to whole grey levels causes."""
+    return rig.pitch("vertical") / (2 * np.pi) * worst_angle(0.5 * frame_gain(rig.sequence.steps), _MODULATION)
+
+
+def edge_blend(pitch_px: float, blend: float) -> Outcome:
+    """Pixels that see two neighbouring cells at once: every bit is a mixture of both codes."""
+    rig = coded_rig(pitch_px)
+    length, half = rig.pattern_length("vertical"), pitch_px / 2
+    edges = np.ceil(np.arange(1, cell_count(length, pitch_px)) * half)
+    where = edges - 1 + blend  # between the last pixel of a cell and the first of the next
+    below, above = direction_levels(rig, edges - 1), direction_levels(rig, edges)
+    levels = direction_levels(rig, where)
+    steps = rig.sequence.steps
+    levels[steps:] = (1 - blend) * below[steps:] + blend * above[steps:]
+    found = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(found.coordinate_px - where, _quantised_px(rig), found.reason != Reason.DECODED)
+
+
+def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
+    """Pixels at phase +-pi exactly, where sine is 0 and its sign an accident, with unsteady but readable bits."""
+    rig = coded_rig(pitch_px)
+    periods = int(rig.pattern_length("vertical") / pitch_px) - 1
+    where = (np.arange(periods) + 0.5) * pitch_px
+    levels = direction_levels(rig, where)
+    steps = rig.sequence.steps
+    levels[steps:] += bit_noise * _MODULATION * np.random.default_rng(1).uniform(-1, 1, levels[steps:].shape)
+    found = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(found.coordinate_px - where, _quantised_px(rig), found.reason != Reason.DECODED)
+
+
+def order_of_pi(phase_rad: float) -> Outcome:
+    """The order rule itself on a phase at the wrap, in every cell: no whole period may be lost or gained."""
+    rig = paper_rig(32)
+    pitch, length = rig.pitch("vertical"), rig.pattern_length("vertical")
+    centres = cell_centres_rad(length, pitch)
+    cells = np.arange(len(centres), dtype=np.int32)
+    absolute, agrees = absolute_phase(np.full(len(cells), phase_rad), cells, centres)
+    mp = high_precision()
+    exact = []
+    for centre in centres:
+        order = mp.floor((mp.mpf(float(centre)) - mp.mpf(phase_rad)) / (2 * mp.pi) + mp.mpf(0.5))
+        exact.append(mp.mpf(phase_rad) + 2 * mp.pi * order)
+    bound = 4 * U64 * np.abs(absolute).max()
+    near = np.array([abs(float(value) - centre) for value, centre in zip(exact, centres, strict=True)])
+    may_flag = float(np.mean(near > INCONSISTENT_RAD - 1e-9))
+    return worst(difference(absolute, exact), bound, ~agrees, may_flag)
+
+
+def arctangent(scale: float, code: str) -> Outcome:
+    """The phase's arctangent in every octant, on its axes, and a hair's breadth beside +-pi."""
+    turn = np.concatenate(
+        [
+            np.linspace(-np.pi, np.pi, 97),
+            np.pi - np.logspace(-15, -1, 15),
+            -np.pi + np.logspace(-15, -1, 15),
+            np.pi / 8 + np.array([-1e-15, 0, 1e-15]),
+        ]
+    )
+    cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
+    cosine = np.concatenate([cosine, scale * np.array([1.0, -1, 0, 0, -1, 1])])
+    sine = np.concatenate([sine, scale * np.array([0.0, 0, 1, -1, -1e-17, 1e-300])])
+    if code == "compiled" and numba_enabled():
+        from fpp_ml_bench.decode_kernels import _minus_atan2
+
+        found = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
+    else:
+        found = minus_atan2(sine, cosine)
+    mp = high_precision()
+    exact = [-mp.atan2(mp.mpf(float(a)), mp.mpf(float(b))) for a, b in zip(sine, cosine, strict=True)]
+    error = difference(found, exact)
+    error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi is -pi, as it should be
+    bound = np.maximum(4 * U64 * np.abs(found), 2.0**-1073)
+    return worst(error, np.maximum(bound, 8 * U64 * (np.abs(found) > 3.0)))
+
+
+def order_range() -> Outcome:
+    """+pi is never given: the interval is [-pi, pi), also for signed zeros."""
+    sine, cosine = np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0, -1.0, -1.0, -1.0, -1e-300])
+    found = minus_atan2(sine, cosine)
+    return worst(np.maximum(found - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - found, 0), 0.0)
+
+
+def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
+    rig = coded_rig(size=96)
+    frames, exact = plane_stack(rig)
+    flipped = rig.sequence.gray(direction)[bit]
+    turned_over = frames[flipped]
+    frames[flipped] = None if turned_over is None else 255 - turned_over
+    u, v = exact["vertical"], exact["horizontal"]
+    inside = (u > 3) & (u < rig.projector.width - 4) & (v > 3) & (v < rig.projector.height - 4)
+    found = decode_stack(frames, rig, mask=inside)
+    per_metre = rig.projector.fx * rig.translation_m[0] / 1.8**2
+    bound_mm = _quantised_px(rig) / per_metre * MM_PER_M * np.sqrt(2) * 1.01
+    return worst(found.depth_mm[inside] - 1800.0, bound_mm, found.reason[inside] != Reason.DECODED, 1.0)
+
+
+def flipped_bit_alone(bit: int) -> Outcome:
+    """One direction can't know: its error must be the one that the misread cell predicts, period for period."""
+    rig = coded_rig()
+    pitch, bits = 18.0, rig.sequence.bits("vertical")
+    where = np.arange(3.0, rig.pattern_length("vertical") - 3.0, 0.25)
+    levels = direction_levels(rig, where)
+    row = rig.sequence.steps + bit
+    levels[row] = 2 * MEAN - levels[row]
+    found = decode_direction(grey(levels), plan(rig), Limits())
+    cells = np.floor(np.rint(where) / (pitch / 2)).astype(int)
+    read = np.asarray(gray_to_binary(binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
+    centres = cell_centres_rad(912, pitch)
+    exists = read < len(centres)
+    centre = centres[np.minimum(read, len(centres) - 1)]
+    absolute = where * 2 * np.pi / pitch
+    slip = np.floor((centre - absolute) / (2 * np.pi) + 0.5)
+    refused = ~exists | (np.abs(absolute + 2 * np.pi * slip - centre) > INCONSISTENT_RAD)
+    refused |= (where + pitch * slip < -0.5) | (where + pitch * slip > 911.5)
+    flagged = found.reason != Reason.DECODED
+    error = found.coordinate_px - (where + pitch * slip)
+    silent = float(np.mean(~flagged & (slip != 0)))
+    # Within half a grey level of a limit either answer is right.
+    near = np.abs(np.abs(absolute + 2 * np.pi * slip - centre) - INCONSISTENT_RAD) < 0.01
+    wrong_flag = (flagged != refused) & ~near
+    note = f"{silent:.0%} of the pixels are whole periods off and one direction can't know it; both directions do"
+    return worst(np.where(wrong_flag, np.inf, error), _quantised_px(rig), flagged & ~wrong_flag, 1.0, note=note)
+
+
+def too_few_codes(bits: int) -> Outcome:
+    rig = paper_rig(32)
+
+    def make() -> Rig:
+        sequence = Sequence(18, 7, bits)
+        return Rig(rig.camera, rig.projector, rig.rotation, rig.translation_m, 18.0, 18.0, sequence)
+
+    return refusal(make, RigError)
+
+
+def cell_off_pattern(cell: int) -> Outcome:
+    """A code that no pixel of the pattern has: seven bits name 128 cells and 912 px hold 102."""
+    rig = paper_rig(32)
+    deltas = shifts(rig.sequence.steps)
+    angle = np.linspace(-3, 3, 50)
+    code = int(binary_to_gray(cell))
+    bits = np.array([(code >> (6 - bit)) & 1 for bit in range(7)], float)
+    waves = sinusoids(angle, deltas, MEAN, _MODULATION)[:, 0]
+    levels = np.concatenate([waves, np.repeat(MEAN + _MODULATION * (2 * bits[:, None] - 1), 50, axis=1)])
+    found = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(np.zeros(50), 0.0, found.reason != Reason.DECODED, 1.0)
+
+
+def code_length(bits: int) -> Outcome:
+    """Every cell of a code that is used to its last word; 15 bits fill the compiled decoder's 16-bit integers."""
+    pitch = 4.0
+    rig = coded_rig(pitch, steps=3, length=min(65536, 2**bits * 2))
+    where = np.arange(2**bits) * 2 + 0.5
+    found = decode_direction(grey(direction_levels(rig, where)), plan(rig), Limits())
+    return worst(found.coordinate_px - where, _quantised_px(rig) + 8 * U64 * where, found.reason != Reason.DECODED)
