@@ -1,0 +1,73 @@
+"""Phase reliance as part of a result: how far a method's answers follow the fringe's phase, by counterfactual scenes.
+
+``fpp_ml_bench.baselines.diagnostics.reliance`` defines and measures it; here is what a result file says of it.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from fpp_ml_bench.evaluation.result_models import Interval, Sha256
+from fpp_ml_bench.evaluation.schema import NonNegative, Share, StrictModel, Text
+
+RelianceVersion = Literal["1.0.0"]
+RELIANCE_VERSION: RelianceVersion = "1.0.0"
+"""Version of the score's definition and of the scenes; scores of different versions are not compared."""
+
+
+class RelianceParts(StrictModel):
+    """What the score is made of, and what stands beside it; means over samples, null where there is nothing to say.
+
+    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline: ``phase``, where only
+    the phase is the moved surface's and every pixel keeps its brightness (the score's); ``light``, where only the
+    brightness is; ``both``, as it would be photographed; ``constant``, the phase alone, by one constant.
+    ``change_*``: how much the answer moves, in units of what the phase's moves ask: under another outline (the
+    score's), without fringes inside or outside the object, under the fringes of the other direction, of another pitch.
+    ``answered_*``: share of the object's pixels that have an answer there. ``order_free_*``: allowing whole periods.
+    """
+
+    follows_phase: Share | None
+    follows_light: Share | None
+    follows_both: Share | None
+    follows_constant: Share | None
+    change_outline: NonNegative | None
+    change_no_fringe_inside: NonNegative | None
+    change_no_fringe_outside: NonNegative | None
+    change_other_direction: NonNegative | None
+    change_other_pitch: NonNegative | None
+    answered_no_fringe_inside: Share | None
+    answered_no_fringe_outside: Share | None
+    order_free_follows_phase: Share | None
+    order_free_change_outline: NonNegative | None
+
+
+class Reliance(StrictModel):
+    """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below two objects).
+
+    ``order_free_score`` allows whole periods and is null where the answer is not in mm. ``units`` are those of the
+    answer that was held against the truth; ``weights_sha256`` of a network is that of its weights file.
+    """
+
+    version: RelianceVersion
+    score: Share
+    interval: Interval
+    order_free_score: Share | None
+    parts: RelianceParts
+    units: Literal["mm", "normalised"]
+    direction: Literal["horizontal", "vertical"]
+    samples: Annotated[int, Field(gt=0)]
+    objects: Annotated[int, Field(gt=0)]
+    dataset_fingerprint: Sha256
+    protocol_version: Text
+    weights_sha256: Sha256 | None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Reliance":
+        low, high = self.interval
+        if (low is None) != (high is None):
+            raise ValueError("interval: expected two numbers or two nulls")
+        if low is not None and high is not None and not 0 <= low <= high <= 1:
+            raise ValueError("interval: expected 0 <= low <= high <= 1")
+        if self.objects > self.samples:
+            raise ValueError("objects is above samples")
+        return self
