@@ -68,6 +68,7 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
         if getattr(method, "uses_ground_truth_mask", False):
             frame *= object_mask(opened.depth_mm(sample))
         frames[index] = frame
+    opened.release(sample)
     return frames
 
 

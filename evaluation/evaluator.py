@@ -75,7 +75,12 @@ def evaluate(
     problems, rows = list(listing.problems), []
     # The description is checked while the first files are scored: pydantic takes long to import.
     known = units in get_args(Units)
-    found = scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target)) if known else ()
+    release = getattr(dataset, "release", lambda sample: None)  # a dataset that is no map of files has nothing to free
+    found = (
+        scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target), release)
+        if known
+        else ()
+    )
     submission: Submission | None = None
     if content is not None:
         try:

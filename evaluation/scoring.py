@@ -37,9 +37,14 @@ class Rules(NamedTuple):
 
 
 def scored(
-    folder: Path, listing: Listing, rules: Rules, target_mm: Callable[[str], NDArray[np.float32]]
+    folder: Path,
+    listing: Listing,
+    rules: Rules,
+    target_mm: Callable[[str], NDArray[np.float32]],
+    release: Callable[[str], None] = lambda sample: None,
 ) -> Iterator[Found]:
-    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W).
+    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W), and
+    ``release`` is told when it is not needed any more.
 
     Work begins with this call, in threads, and not only when the first result is asked for.
     """
@@ -63,6 +68,8 @@ def scored(
                 scores = score_sample(*pair, rules.edge_band_px, compiled)
         except PredictionError as error:
             problems = [str(error)]
+        with looking_up:
+            release(sample)
         if problems:
             return [f"{read.named(sample)}: {problem}" for problem in problems], []
         return [], [

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE
+from fpp_ml_bench.skipping import skipping_enabled
 
 DEPTH_EDGE_JUMP_MM = 10.0
 """A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
@@ -86,6 +87,8 @@ def object_near_edges(
         return found
     # Every edge touches the object, so the object's box and one pixel around it hold all of them.
     box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
+    if not skipping_enabled():
+        box = (slice(None), slice(None))
     edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
     for near, band_px in zip(found, bands_px, strict=True):
         if band_px > 0:

@@ -47,6 +47,7 @@ class DatasetFolder:
         self.manifest = manifest
         self._batches: dict[str, list[pa.RecordBatch]] = {}
         self._images: dict[tuple[str, str], list[NDArray]] = {}
+        self._maps: dict[str, pa.Buffer] = {}
 
     @classmethod
     def unchecked(cls, path: Path, manifest: Manifest) -> "DatasetFolder":
@@ -58,6 +59,7 @@ class DatasetFolder:
     def forget(self, shard: ShardFile) -> None:
         """Let go of the maps of one file."""
         self._batches.pop(shard.path, None)
+        self._maps.pop(shard.path, None)
         for key in [key for key in self._images if key[0] == shard.path]:
             del self._images[key]
 
@@ -163,9 +165,28 @@ class DatasetFolder:
         """Several frames of a sample, each uint8 (H, W), in the order asked."""
         return [self.frame(sample, index) for index in indices]
 
+    def release(self, sample: str) -> None:
+        """Let go of the memory of a sample's images, those that were read. Views of them stay valid.
+
+        Whoever goes through a split calls it after each sample, and his memory does not grow with their number.
+        """
+        from fpp_ml_bench.loaders.mapped_pages import let_go
+
+        split, row = self._find(sample)
+        for shard in self.manifest.shards:
+            whole = self._maps.get(shard.path)
+            if whole is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
+                continue
+            for column in self.record_batches(shard)[0].schema.names:
+                if (shard.path, column) in self._images:
+                    let_go(self._row_of(shard, column, row), whole.address, whole.size)
+
     def _image(self, sample: str, group: str, column: str) -> NDArray:
         split, row = self._find(sample)
-        shard = self._shard(split, group, row)
+        return self._row_of(self._shard(split, group, row), column, row)
+
+    def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
+        """Image of row ``row`` of the split in one of its files."""
         row -= shard.first_row
         for images in self.column_images(shard, column):
             if row < len(images):
@@ -186,7 +207,10 @@ class DatasetFolder:
 
             path = self.path / shard.path
             try:
-                self._batches[shard.path] = list(pa.ipc.open_stream(pa.memory_map(str(path), "r")))
+                mapped = pa.memory_map(str(path), "r")
+                whole = mapped.read_buffer()
+                self._batches[shard.path] = list(pa.ipc.open_stream(whole))
+                self._maps[shard.path] = whole
             except (pa.ArrowException, OSError) as error:
                 raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
         return self._batches[shard.path]

@@ -1,5 +1,7 @@
 """What a scene does not need is left out, and the results are the same bytes with skipping off."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,6 +9,8 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.acceleration import SWITCH as COMPILED
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.prediction import captured_frames
 from fpp_ml_bench.decode_blocks import Limits
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.backdrop import Backdrop
@@ -15,6 +19,7 @@ from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import Lighting
 from fpp_ml_bench.loaders.raycast import TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place
+from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.rig import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 
@@ -167,3 +172,44 @@ def test_an_image_without_object_never_reads_the_second_direction():
     frames = capture(PAPER, np.full((PAPER.camera.height, PAPER.camera.width), 3.2))
     found = decode_stack(frames, PAPER, reasons=False, threads=2)
     assert found.second_px == 0 and not found.depth_mm.any()
+
+
+# ---- reading
+
+
+def mapped_bytes(folder):
+    """Bytes of files below ``folder`` that lie in this process's memory, by the kernel's count (proc(5), smaps)."""
+    total, counted = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if "-" in line.split(" ", 1)[0]:
+            counted = str(folder) in line
+        elif counted and line.startswith("Rss:"):
+            total += 1024 * int(line.split()[1])
+    return total
+
+
+def test_memory_of_a_split_that_is_gone_through_does_not_grow_with_its_samples(tiny):
+    opened = DatasetFolder(tiny)
+    size, kept, resident = TINY_SIZE**2, [], []
+    for sample in opened.samples("all"):
+        kept.append([image.copy() for image in (*opened.frames(sample, range(52)), opened.depth_mm(sample))])
+        opened.release(sample)
+        resident.append(mapped_bytes(tiny))
+    # Opening a file maps what stands between its images; that is there from the first sample on.
+    assert len(resident) == 24 and max(resident) <= resident[0] + 56 * size < 24 * 56 * size / 4
+    # Views of what was let go are still good, and count again.
+    for images, sample in zip(kept, opened.samples("all"), strict=True):
+        for image, again in zip(images, (*opened.frames(sample, range(52)), opened.depth_mm(sample)), strict=True):
+            np.testing.assert_array_equal(image, again)
+    assert mapped_bytes(tiny) > 24 * 56 * size
+
+
+def test_frames_that_a_method_does_not_use_are_not_read(tiny):
+    opened = DatasetFolder(tiny)
+    method = ClassicalMethod(opened.rig, "vertical", 3)
+    sample = opened.samples("test")[0]
+    frames = captured_frames(opened, method, sample)
+    assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)
+    groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path, _ in opened._images}
+    assert groups == {"test/vertical", "test/codes"} and len(opened._images) == len(method.frames_used) == 10
+    assert set(opened._maps) == {path for path, _ in opened._images}  # nor are other files mapped
