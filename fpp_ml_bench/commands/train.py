@@ -8,15 +8,19 @@ from fpp_ml_bench.baselines.training.tables import PRESETS
 SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
 EXAMPLES = (
     "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
+    "fpp-bench train phase-net data/full --out runs/phase-net      the network of the phase route",
     "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
 )
 MODEL = "model.safetensors"
+PHASE_NET = "phase-net"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), or a .yaml")
+    parser.add_argument(
+        "recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net"
+    )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to go on with")
     parser.add_argument(
@@ -39,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
+    if args.recipe == PHASE_NET:
+        return _phase_net(args)
     recipe = load_recipe(args.recipe, args.preset)
     done = train(recipe, args.dataset, args.out, minutes=args.minutes)
     if not PartialState().is_main_process:
@@ -53,4 +59,21 @@ def run(args: argparse.Namespace) -> int:
     print(f"{weights}: {recipe.title}, epoch {done.best_epoch} of {done.epochs}, {done.seconds:.0f} s")
     print(f"curve: {done.curve}")
     print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
+    return 0
+
+
+def _phase_net(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.baselines.phase_network.recipe import Recipe
+    from fpp_ml_bench.baselines.phase_network.trainer import train_phase_net
+    from fpp_ml_bench.commands import CHECK_FAILED
+    from fpp_ml_bench.commands.console import progress_bar
+
+    recipe = Recipe()
+    done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print)
+    if done.weights is None:
+        print(f"{args.out}: stopped after {done.steps} of {recipe.steps} steps, all saved; the same command goes on")
+        return CHECK_FAILED
+    scores = ", ".join(f"{key} {value:.3g}" for key, value in done.validation.items())
+    print(f"{done.weights}: {done.steps} steps, mask threshold {done.threshold:g}; validation: {scores}")
+    print(f"next: fpp-bench predict phase-net {args.dataset} --weights {done.weights} --out predictions")
     return 0

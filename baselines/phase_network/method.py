@@ -1,0 +1,98 @@
+"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
+from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetFile, load_net
+from fpp_ml_bench.baselines.phase_route.measurement import Measurement
+from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.rig import Rig
+
+PERIOD_TOLERANCE = 2.2
+"""Factor by which an image's fringe period in px may differ from the one that the weights learned from."""
+
+
+class PhaseNetMethod:
+    """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
+
+    ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
+    Raises `WeightsError` for weights that can't be used, and `PredictionError` for an option's value that there is not
+    and for a rig whose fringe period in the image is far from what the weights have seen.
+    """
+
+    name = "phase-net"
+    uses_ground_truth_range = False
+    units = "mm"
+    packages = ("numpy", "numba", "torch")
+    device = "cpu"
+
+    def __init__(
+        self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile = DEFAULT,
+        min_confidence: float = 0.0, shading: bool = True, levers: Levers | None = None, threads: int = 1,
+    ) -> None:  # fmt: skip
+        self.options = Settings(direction=direction, min_confidence=min_confidence, shading=shading)
+        self.file = weights if isinstance(weights, NetFile) else load_net(weights)
+        self.rig, self.threads = rig, threads
+        learned, here = self.file.config.period_px.get(direction), rig.image_px_per_period(direction)
+        if learned is None:
+            raise PredictionError(
+                f"{self.file.path}: learned from {', '.join(self.file.config.period_px)} fringes only, not from "
+                f"{direction} ones; use other weights, or the measured route (phase)"
+            )
+        if not learned / PERIOD_TOLERANCE < here < learned * PERIOD_TOLERANCE:
+            raise PredictionError(
+                f"{self.file.path}: learned from {direction} fringes of {learned:.1f} px a period in the image, this "
+                f"rig's have {here:.1f} px, beyond a factor of {PERIOD_TOLERANCE}; train weights for it (fpp-bench "
+                "train phase-net), or use the measured route (phase)"
+            )
+        chosen = levers or Levers(shading=shading)
+        self.route = NetworkRoute(rig, self.options, self.file.network, self.file.config.threshold, chosen)
+
+    @property
+    def frames_used(self) -> tuple[int, ...]:
+        """The one frame that must be captured."""
+        return (self.rig.sequence.sinusoids(self.options.direction)[0],)
+
+    @property
+    def title(self) -> str:
+        blind = "" if self.options.shading else ", without brightness"
+        return f"Phase route, one {self.options.direction} fringe; order, mask and correction learned{blind}"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {
+            "direction": self.options.direction, "shading": self.options.shading,
+            "min_confidence": self.options.min_confidence, "weights": self.file.config.name,
+            "weights_sha256": self.file.sha256, "mask_threshold": self.file.config.threshold, "threads": self.threads,
+        }  # fmt: skip
+
+    @property
+    def parameters(self) -> int:
+        """Numbers that were learned."""
+        return sum(one.numel() for one in self.file.network.parameters())
+
+    def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
+        """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""
+        import torch
+
+        (index,) = self.frames_used
+        image = frames[index] if index < len(frames) else None
+        if image is None:
+            raise DecodeError(f"frame {index} is missing: phase-net needs that one fringe")
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads)
+        try:
+            return self.route.measure(image)
+        finally:
+            torch.set_num_threads(before)
+
+    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm

@@ -1,0 +1,174 @@
+"""Windows of training samples, varied as other scenes would vary them.
+
+Whole objects are put at another distance: the phase of every pixel moves by what the object's middle moves, its light
+changes as the calibrated lamp's would, and what the measured route got wrong there stays as wrong as it was. Wrong
+first orders are made up in patches and whole windows, for the training objects show few. Columns are mirrored, which
+is a lamp on the other side. Brightness varies a little, and now and then the brightness channels are left out, so that
+the network can be asked to do without them.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, SHADING, STEP_PX, Image, Scene, channels
+from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.shading import irradiance
+from fpp_ml_bench.constants import MM_PER_M
+
+IGNORED = -100
+"""Class of a pixel whose order teaches nothing: background, or none of the three candidates is right."""
+_MIRRORED = CHANNELS.index("slope across")
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How often (0 to 1) and how much windows are varied; 0 throughout leaves them as they were captured."""
+
+    near_edge: float = 0.6
+    shift: float = 0.5
+    margin_mm: float = 60.0
+    brightness: float = 0.04
+    wrong_window: float = 0.1
+    wrong_patch: float = 0.25
+    patch_periods: float = 2.0
+    no_shading: float = 0.1
+    mirror: float = 0.5
+
+
+@dataclass(frozen=True)
+class Window:
+    """One training example: ``x`` (C, n, n) float32, ``exists`` (3, n, n); ``order`` int64 (n, n), 0 to 2 or `IGNORED`;
+    ``correction_rad`` and ``fitted`` (n, n): what is left of the phase, and where it counts; ``target`` bool (n, n):
+    object; ``known``: where the mask counts, for light that was made up says nothing of it."""
+
+    x: Image
+    exists: NDArray[np.bool_]
+    order: NDArray[np.int64]
+    correction_rad: Image
+    fitted: NDArray[np.bool_]
+    target: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+
+
+def draw(
+    samples: list[Sample], geometries: dict[str, Geometry], size: int, vary: Variation, random: np.random.Generator
+) -> Window:
+    """A random window of ``size`` px of one of ``samples``."""
+    sample = samples[random.integers(len(samples))]
+    geometry = geometries[sample.direction]
+    rows, columns = _place(sample, size, random.random() < vary.near_edge, random)
+    scene, missing = sample.scene.window(rows, columns).single(), sample.missing_rad[rows, columns].astype(np.float32)
+    target = sample.target[rows, columns]
+    layer = geometry.layer.at(scene.crop)
+    moved = random.random() < vary.shift and target.any()
+    if moved:
+        scene = _moved(scene, missing, target, layer, geometry, vary, random)
+    scene, missing = _wrong(scene, missing, layer, geometry, vary, random)
+    settings = geometry.route.settings
+    x, exists = channels(scene, layer, geometry.rig, geometry.rotation, geometry.route.period_px, settings.slack_mm)
+    if random.random() < vary.no_shading:
+        x[list(SHADING)] = 0
+    missing = geometry.rotation.turn(missing) * np.float32(geometry.rotation.sign)
+    target = geometry.rotation.turn(target)
+    window = _labelled(x, exists, missing, target, size, known=not moved)
+    return _mirrored(window) if random.random() < vary.mirror else window
+
+
+def _place(sample: Sample, size: int, near_edge: bool, random: np.random.Generator) -> tuple[slice, slice]:
+    height, width = sample.target.shape
+    if near_edge and len(sample.edges):
+        row, column = sample.edges[random.integers(len(sample.edges))] + random.integers(-size // 3, size // 3 + 1, 2)
+    else:
+        row, column = random.integers(height), random.integers(width)
+    top = int(np.clip(row - size // 2, 0, max(height - size, 0)))
+    left = int(np.clip(column - size // 2, 0, max(width - size, 0)))
+    return slice(top, min(top + size, height)), slice(left, min(left + size, width))
+
+
+def _moved(
+    scene: Scene, missing: Image, target: NDArray[np.bool_], layer: CalibrationLayer, geometry: Geometry,
+    vary: Variation, random: np.random.Generator,
+) -> Scene:  # fmt: skip
+    """The object at another distance within the working range."""
+    near, far = geometry.rig.working_range_mm
+    true = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
+    middle = float(np.median(true[target]))
+    gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
+    depth_m = random.uniform(near + vary.margin_mm, far - vary.margin_mm) / MM_PER_M
+    delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
+    every = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
+    rows, columns = scene.crop
+    where = (slice(rows.start, rows.stop, STEP_PX), slice(columns.start, columns.stop, STEP_PX))
+    coarse, slopes = layer.at(every), (scene.slopes[0][every], scene.slopes[1][every])
+    with np.errstate(all="ignore"):
+        before, after = (
+            np.maximum(irradiance(coarse, residual, slopes, geometry.rig, where), 1e-3)
+            for residual in (true[every], true[every] + delta)
+        )
+        ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
+    height, width = scene.light.shape
+    ratio = ratio.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[:height, :width].astype(np.float32)
+    ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
+    seen = scene.phase_rad + missing
+    light = ratio * (scene.light + scene.bright * (np.cos(seen + delta) - np.cos(seen)))
+    phase = scene.phase_rad + delta
+    carry = np.rint(phase / TAU)
+    return replace(
+        scene, light=np.where(target, light, scene.light), bright=scene.bright * ratio,
+        phase_rad=(phase - TAU * carry).astype(np.float32), order=scene.order + carry.astype(np.int32),
+        middle_rad=scene.middle_rad + float(delta),
+    )  # fmt: skip
+
+
+def _wrong(
+    scene: Scene, missing: Image, layer: CalibrationLayer, geometry: Geometry, vary: Variation,
+    random: np.random.Generator,
+) -> tuple[Scene, Image]:  # fmt: skip
+    """Wrong first orders, where the range allows them."""
+    off = np.zeros(scene.light.shape, np.int32)
+    middle = 0
+    if random.random() < vary.wrong_window:
+        middle = int(random.choice((-1, 1)))
+        off += middle
+    elif random.random() < vary.wrong_patch:
+        coarse = random.standard_normal((12, 12)).astype(np.float32)
+        height, width = off.shape
+        noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+        off += (noise > random.uniform(0.5, 1.5)) * int(random.choice((-1, 1)))
+    if not off.any():
+        return scene, missing
+    near, far = geometry.rig.working_range_mm
+    slack = geometry.route.settings.slack_mm
+    with np.errstate(all="ignore"):
+        depth = layer.depth_mm(scene.phase_rad, scene.order + off)
+        off = np.where((depth > near - slack) & (depth < far + slack), off, 0).astype(np.int32)
+    changed = replace(scene, order=scene.order + off, middle_rad=scene.middle_rad + TAU * middle)
+    return changed, missing - np.float32(TAU) * off
+
+
+def _labelled(
+    x: Image, exists: NDArray[np.bool_], missing: Image, target: NDArray[np.bool_], size: int, known: bool
+) -> Window:
+    steps = np.rint(missing / TAU).astype(np.int64)
+    possible = target & (np.abs(steps) <= 1)
+    place = np.clip(steps, -1, 1) + 1
+    possible &= np.take_along_axis(exists, place[None], axis=0)[0]
+    correction = (missing - TAU * steps).astype(np.float32)
+    _, height, width = x.shape
+    pad = ((0, size - height), (0, size - width))
+    deep = ((0, 0), *pad)
+    return Window(
+        np.pad(x, deep), np.pad(exists, deep, constant_values=True),
+        np.pad(np.where(possible, place, IGNORED), pad, constant_values=IGNORED),
+        np.pad(correction, pad), np.pad(possible, pad), np.pad(target, pad), np.pad(np.full(target.shape, known), pad),
+    )  # fmt: skip
+
+
+def _mirrored(window: Window) -> Window:
+    flipped = {name: getattr(window, name)[..., ::-1].copy() for name in Window.__dataclass_fields__}
+    flipped["x"][_MIRRORED] *= -1
+    return Window(**flipped)

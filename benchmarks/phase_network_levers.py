@@ -1,0 +1,194 @@
+"""What each lever of phase-net is worth, and the paper's UNet as a guide to the order instead of it.
+
+    python benchmarks/phase_network_levers.py DATASET [--split test] [--fringe vertical] [--per-object] [--hybrid]
+        [--weights FILE] [--pictures docs/pictures]
+
+Needs a generated dataset at 960 px with the fringe's first frame: ``fpp-bench build data/full --preset full``. Times
+are of one thread (``--threads``).
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+
+import cv2
+import numpy as np
+import torch
+from phase_route_stages import SHOWN
+
+from fpp_ml_bench.baselines.model import load
+from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
+from fpp_ml_bench.baselines.phase_network.route import Asked, Levers, NetworkRoute
+from fpp_ml_bench.baselines.phase_network.weights import DEFAULT
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route.measurement import Measurement
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.pixel_sets import object_mask
+
+NOTHING = Levers(order=False, mask=False, phase=False)
+VARIANTS: dict[str, Levers] = {
+    "nothing learned": NOTHING,
+    "order": Levers(mask=False, phase=False),
+    "order + mask": Levers(phase=False),
+    "order + correction": Levers(mask=False),
+    "mask + correction": Levers(order=False),
+    "order + mask + correction (phase-net)": Levers(),
+    "the same, graph 0.5": Levers(graph=0.5),
+    "the same, graph 2": Levers(graph=2.0),
+    "the same, correction within pi / 4": Levers(bound_rad=np.pi / 4),
+    "the same, correction within pi / 8": Levers(bound_rad=np.pi / 8),
+}
+BLIND = "the same, without brightness"
+HYBRID = "order by the paper's UNet (unet-global-rmse, 224 px), nothing else learned"
+COLUMNS = ("mean", "median view", "wrong order %", "right-order", "missed %", "background", "seconds")
+
+
+def compare(found: Measurement, route: NetworkRoute, target: np.ndarray) -> dict[str, float]:
+    """Scores of one sample in mm and percent of object pixels; a wrong order is off by more than half a period."""
+    inside = object_mask(target)
+    both = inside & (found.depth_mm > 0)
+    layer = route.geometry.layer.at(both)
+    true = layer.absolute_phase(target[both])
+    off = found.wrapped_phase[both] + TAU * found.order[both] - true
+    wrong = np.abs(off) > np.pi
+    error = np.abs(found.depth_mm - target)
+    return {
+        "mean": error[inside].mean(),
+        "wrong order %": 100 * wrong.sum() / inside.sum(),
+        "right-order": error[both][~wrong].mean(),
+        "missed %": 100 * (inside & ~both).sum() / inside.sum(),
+        "background": found.depth_mm[~inside].mean(),
+    }
+
+
+def guided(asked: Asked, route: NetworkRoute, depth_mm: np.ndarray) -> Measurement:
+    """The candidate order nearest to a depth map's."""
+    seen = asked.seen
+    wanted = np.rint((seen.layer.absolute_phase(np.maximum(depth_mm[seen.crop], 1.0)) - seen.phase_rad) / TAU)
+    first, count = seen.candidates.first, seen.candidates.count
+    order = np.clip(wanted, first, first + np.maximum(count, 1) - 1).astype(np.int32)
+    return route.geometry.route.conclude(seen, order, np.zeros_like(asked.margin))
+
+
+def unet(size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
+    """The paper's network at its own size, its depth map brought to ``size`` (H, W)."""
+    model = load("unet-global-rmse", "cpu")
+    height, width = model.config.image_size
+
+    def predict(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return cv2.resize(model.predict(small), size[::-1], interpolation=cv2.INTER_LINEAR)
+
+    return predict
+
+
+def table(rows: dict[str, list[dict[str, float]]]) -> None:
+    print("| learned | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
+    for title, found in rows.items():
+        means = {key: np.mean([one[key] for one in found]) for key in found[0]}
+        means["median view"] = np.median([one["mean"] for one in found])
+        print(f"| {title} | " + " | ".join(f"{means[key]:.2f}" if key in means else "" for key in COLUMNS) + " |")
+
+
+def by_object(rows: list[dict[str, float]], names: list[str]) -> None:
+    objects = list(dict.fromkeys(name.rsplit("_A", 1)[0] for name in names))
+    print("\n| object | " + " | ".join(key for key in COLUMNS if key in rows[0]) + " |")
+    print("|---|" + "---|" * sum(key in rows[0] for key in COLUMNS))
+    for one in objects:
+        own = [row for row, name in zip(rows, names, strict=True) if name.rsplit("_A", 1)[0] == one]
+        print(
+            f"| {one} | " + " | ".join(f"{np.mean([row[k] for row in own]):.2f}" for k in COLUMNS if k in own[0]) + " |"
+        )
+
+
+def pictures(opened: DatasetFolder, method: PhaseNetMethod, folder: Path) -> None:
+    """Fringe, wrapped phase, order, depth, error and correction of the views that docs/phase_route.md shows."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    for sample in SHOWN:
+        image, target = np.array(opened.frame(sample, method.frames_used[0])), opened.depth_mm(sample)
+        asked = method.route.observe(image)
+        found = method.route.conclude(asked)
+        shown = object_mask(target) | (found.depth_mm > 0)
+        rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+        box = (slice(max(rows[0] - 8, 0), rows[-1] + 8), slice(max(columns[0] - 8, 0), columns[-1] + 8))
+        none = np.where(found.depth_mm > 0, 1.0, np.nan)[box]
+        limits = np.percentile(target[object_mask(target)], [1, 99])
+        correction = np.zeros(image.shape)
+        correction[asked.seen.crop] = 0 if asked.answers is None else asked.answers.correction_rad
+        error = {"cmap": "RdBu", "vmin": -20, "vmax": 20}
+        panels = (
+            ("fringe, grey levels", image[box], {"cmap": "gray"}),
+            ("wrapped phase, rad", found.wrapped_phase[box], {"cmap": "twilight"}),
+            ("order", found.order[box] * none, {"cmap": "viridis"}),
+            ("depth, mm", found.depth_mm[box] * none, {"vmin": limits[0], "vmax": limits[1]}),
+            ("error, mm", np.where(shown, found.depth_mm - target, np.nan)[box], error),
+            ("correction, rad", correction[box] * none, {"cmap": "PuOr", "vmin": -0.6, "vmax": 0.6}),
+        )
+        height, width = image[box].shape
+        figure, axes = plt.subplots(1, 6, figsize=(18, 18 / 6 * height / width + 0.9), layout="constrained")
+        for axis, (title, values, style) in zip(axes, panels, strict=True):
+            drawn = axis.imshow(values, interpolation="nearest", **style)
+            axis.set_title(title, fontsize=11)
+            axis.set_axis_off()
+            figure.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.05)
+        figure.suptitle(f"{sample}, phase-net, one {method.options.direction} fringe")
+        figure.savefig(folder / f"phase_net_{sample}.png", dpi=60)
+        plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
+    parser.add_argument("--weights", type=Path, help="default: those that come with the package")
+    parser.add_argument("--per-object", action="store_true")
+    parser.add_argument("--hybrid", action="store_true", help="also the paper's UNet as a guide to the order")
+    parser.add_argument("--blind", action="store_true", help="also without brightness")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--every", type=int, default=1, help="only every n-th sample")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also write the pictures there")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    torch.set_num_threads(args.threads)
+    opened = DatasetFolder(args.dataset)
+    method = PhaseNetMethod(opened.rig, args.fringe, args.weights or DEFAULT)
+    blind = PhaseNetMethod(opened.rig, args.fringe, method.file, shading=False) if args.blind else None
+    guide = unet(opened.size) if args.hybrid else None
+    rows: dict[str, list[dict[str, float]]] = {}
+    names = opened.samples(args.split)[:: args.every]
+    for number, name in enumerate(names):
+        image, target = np.array(opened.frame(name, method.frames_used[0])), opened.depth_mm(name)
+        if number == 0:
+            method.route.measure(image)
+        started = perf_counter()
+        asked = method.route.observe(image)
+        shared = perf_counter() - started
+        for title, levers in VARIANTS.items():
+            started = perf_counter()
+            found = method.route.conclude(asked, levers)
+            seconds = shared + perf_counter() - started
+            if levers == NOTHING:
+                seconds -= asked.seen.watch.seconds.get("network", 0.0)
+            rows.setdefault(title, []).append(compare(found, method.route, target) | {"seconds": seconds})
+        if blind is not None:
+            rows.setdefault(BLIND, []).append(compare(blind.route.measure(image), method.route, target))
+        if guide is not None:
+            rows.setdefault(HYBRID, []).append(compare(guided(asked, method.route, guide(image)), method.route, target))
+    print(
+        f"\n{args.dataset.name}, {args.split}, {args.fringe} fringe: {len(names)} samples, object and background in mm"
+    )
+    table(rows)
+    if args.per_object:
+        by_object(rows["order + mask + correction (phase-net)"], names)
+    if args.pictures:
+        pictures(opened, method, args.pictures)
+
+
+if __name__ == "__main__":
+    main()
