@@ -7,7 +7,7 @@ scores whenever a file is read, and overall is checked against object and backgr
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from fpp_ml_bench.evaluation.error_stats import combine
 from fpp_ml_bench.evaluation.protocol import (
@@ -21,7 +21,8 @@ from fpp_ml_bench.evaluation.protocol import (
     Target,
     Track,
 )
-from fpp_ml_bench.evaluation.result_checks import check_same, check_sample
+from fpp_ml_bench.evaluation.reliance import Reliance
+from fpp_ml_bench.evaluation.result_checks import check_reliance, check_same, check_sample
 from fpp_ml_bench.evaluation.result_models import (
     Bootstrap,
     DatasetInfo,
@@ -62,6 +63,15 @@ class Result(StrictModel):
     bootstrap: Bootstrap
     seeds: dict[Text, Count]
     environment: Environment
+    reliance: Reliance | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Not written where it was not measured, so that files from before there was this key stay as they are.
+        content: dict[str, Any] = handler(self)
+        if self.reliance is None:
+            content.pop("reliance", None)
+        return content
 
     @property
     def track(self) -> Track:
@@ -90,6 +100,8 @@ class Result(StrictModel):
             raise ValueError("per_sample names a sample twice")
         if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
+        if self.reliance is not None:
+            check_reliance(self.reliance, self.submission)
         for row in self.per_sample:
             check_sample(row, height * width)
         stored = self.model_dump(include=set(derived := _derived(self.per_sample)))

@@ -5,7 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from fpp_ml_bench.evaluation.error_stats import combine
+from fpp_ml_bench.evaluation.reliance import Reliance
 from fpp_ml_bench.evaluation.result_models import SampleResult
+from fpp_ml_bench.evaluation.submission import Submission
 
 AGREES = 1e-9
 """Relative difference at which two computations of one average still count as the same number."""
@@ -25,6 +27,20 @@ def check_sample(row: SampleResult, pixels: int) -> None:
     if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
         raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
     _check_distribution(row)
+
+
+def check_reliance(reliance: Reliance, submission: Submission) -> None:
+    """Refuse (ValueError) a phase reliance that is of other weights or another output than was scored."""
+    weights = submission.settings.get("weights_sha256")
+    if weights != reliance.weights_sha256:
+        raise ValueError(
+            f"reliance was measured on weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}; "
+            "measure it again"
+        )
+    if (reliance.units == "normalised") != (submission.units == "normalised"):
+        raise ValueError(
+            f"reliance is that of an answer in {reliance.units}, scored was one in {submission.units}; measure it again"
+        )
 
 
 def _check_distribution(row: SampleResult) -> None:

@@ -13,6 +13,7 @@ from fpp_ml_bench.leaderboard.rows import Entry
 NAME_WIDTH = 90
 DEVICE_WIDTH = 40
 SELF_REPORTED = "*"
+NOT_MEASURED = "not measured"
 NOTE = (
     "Errors in mm, mean over samples; 95% interval from a bootstrap over objects. Rank: 1 and the number of methods "
     f"whose whole interval is better. {SELF_REPORTED} time as reported by its author, not measured here."
@@ -44,6 +45,17 @@ def _interval(key: str) -> Callable[[Ranked], str]:
         return "-" if found is None else "-".join(millimetres(end) for end in found)
 
     return text
+
+
+def reliance(entry: Entry) -> str:
+    """The phase-reliance score with two decimals."""
+    return NOT_MEASURED if entry.reliance is None else f"{entry.reliance.score:.2f}"
+
+
+def reliance_interval(entry: Entry) -> str:
+    """The ends of its interval; empty without any."""
+    low, high = (None, None) if entry.reliance is None else entry.reliance.interval
+    return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
 
 
 def device(entry: Entry) -> str:
@@ -86,6 +98,7 @@ def columns(sort: str) -> list[Column]:
         ),
         Column("s/sample", _time),
         Column("Frames", lambda row: str(row.entry.frames)),
+        Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE),
         Column("Provenance", lambda row: row.entry.provenance, right=False, from_width=MIDDLE),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
     ]

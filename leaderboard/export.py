@@ -80,6 +80,7 @@ def _row(row: Ranked) -> dict[str, Any]:
         "seconds_per_sample": row.entry.value("seconds_per_sample"),
         "time_measured_here": row.entry.time_measured,
         "timing": None if result.timing is None else result.timing.model_dump(mode="json"),
+        "phase_reliance": None if result.reliance is None else result.reliance.model_dump(mode="json"),
         "timed_on": device(row.entry),
         "frames_used": row.entry.frames,
         "samples": result.dataset.samples,

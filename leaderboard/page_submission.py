@@ -26,6 +26,7 @@ def submission_page(group: Group, row: Ranked, style: str) -> str:
         f"<section><h2>Scores</h2>{score_table(result)}</section>\n",
         f"<section><h2>Object by object</h2>{_objects(result)}</section>\n",
         f"<section><h2>What it costs</h2>{_costs(entry)}</section>\n",
+        _reading(result),
         f"<section><h2>How it was made</h2>{_making(result)}</section>\n",
         f"<section><details><summary>Every sample</summary>{sample_table(result)}</details></section>\n</main>\n",
     ]
@@ -139,6 +140,42 @@ def _costs(entry: Entry) -> str:
         ["Platform", machine.platform],
     ]
     return html_table("Run time and what it takes", ("What", "Value"), rows, text_columns=2)
+
+
+_PARTS = {
+    "follows_phase": "follows the phase, within the object, brightness unchanged",
+    "follows_light": "follows the brightness, phase unchanged",
+    "follows_both": "follows a moved surface as it would be photographed",
+    "follows_constant": "follows the phase when all of the object moves",
+    "change_outline": "changes with another outline",
+    "change_no_fringe_inside": "changes without fringes inside the object",
+    "change_no_fringe_outside": "changes without fringes outside the object",
+    "change_other_direction": "changes with fringes of the other direction",
+    "change_other_pitch": "changes with fringes of another pitch",
+    "answered_no_fringe_inside": "share answered without fringes inside",
+    "answered_no_fringe_outside": "share answered without fringes outside",
+    "order_free_follows_phase": "follows the phase, whole periods aside",
+    "order_free_change_outline": "changes with another outline, whole periods aside",
+}
+
+
+def _reading(result: Result) -> str:
+    """What the counterfactual scenes say; nothing where they were not asked."""
+    found = result.reliance
+    if found is None:
+        return ""
+    low, high = found.interval
+    span = "" if low is None or high is None else f", 95% interval {low:.2f} to {high:.2f}"
+    free = "" if found.order_free_score is None else f"; whole periods aside {found.order_free_score:.2f}"
+    rows = [
+        [words, f"{value:.2f}"] for key, words in _PARTS.items() if (value := getattr(found.parts, key)) is not None
+    ]
+    return (
+        f"<section><h2>What it reads</h2><p>Phase reliance {found.score:.2f}{span}{free}: {found.samples} samples of "
+        f"{found.objects} objects, answers in {escaped(found.units)}, data {escaped(found.dataset_fingerprint[:8])}. "
+        "1 follows the fringe's phase and nothing else, 0 does not follow it. Changes are in units of what the moved "
+        f"phase asks.</p>{html_table('Counterfactual scenes', ('What', 'Value'), rows, text_columns=1)}</section>\n"
+    )
 
 
 def _making(result: Result) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.report_html import escaped
 from fpp_ml_bench.evaluation.report_scores import interval_text
-from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, device
+from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, NOT_MEASURED, device, reliance, reliance_interval
 from fpp_ml_bench.leaderboard.page_scatter import ERROR, provenance_class
 from fpp_ml_bench.leaderboard.ranking import Group, Ranked
 
@@ -51,6 +51,13 @@ def _time(row: Ranked) -> str:
     return f"{milliseconds(entry.latency_ms)}{spread}{mark}"
 
 
+def _reliance(row: Ranked) -> str:
+    if row.entry.reliance is None:
+        return f'<span class="soft small">{NOT_MEASURED}</span>'
+    interval = reliance_interval(row.entry)
+    return reliance(row.entry) + (f"<small>{interval.replace(' - ', ' to ')}</small>" if interval else "")
+
+
 def badge(provenance: str) -> str:
     """A provenance in words, with a colour beside it."""
     return f'<span class="badge {provenance_class(provenance)}">{escaped(provenance)}</span>'
@@ -72,6 +79,10 @@ def _columns(slugs: dict[int, str], plot: Callable[[Ranked], str]) -> list[_Colu
         _metric("overall_mae_mm", "Overall MAE, mm", secondary=True),
         _Column("ms", "Time, ms", _time, lambda row: row.entry.latency_ms),
         _Column("frames", "Frames", lambda row: str(row.entry.frames), lambda row: float(row.entry.frames)),
+        _Column(
+            "reliance", "Phase reliance", _reliance,
+            lambda row: None if row.entry.reliance is None else row.entry.reliance.score,
+        ),
         _Column(
             "provenance", "Provenance", lambda row: badge(row.entry.provenance), lambda row: row.entry.provenance,
             text=True,

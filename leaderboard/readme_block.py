@@ -6,18 +6,19 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, SELF_REPORTED, device
+from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, SELF_REPORTED, device, reliance
 from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, Group, Ranked
 from fpp_ml_bench.loaders.manifest import write_atomically
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
-_TITLES = ("Rank", "Method", "Object MAE, mm", "95% interval", "Time, ms", "Frames", "Provenance")
-_RIGHT = (True, False, True, True, True, True, False)
+_TITLES = ("Rank", "Method", "Object MAE, mm", "95% interval", "Time, ms", "Frames", "Phase reliance", "Provenance")
+_RIGHT = (True, False, True, True, True, True, True, False)
 _MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in `leaderboard/rows/`."
 _NOTE = (
     f"{_MADE_BY} Rank: 1 and the number of methods whose whole interval is better (95%, bootstrap over objects). Time: "
-    f"median latency of one image. \\{SELF_REPORTED} self-reported."
+    f"median latency of one image. \\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and "
+    "nothing else, 0 does not follow it (docs/reliance.md)."
 )
 SHOWN = 10
 """Rows of a group that README shows; the page shows them all."""
@@ -53,6 +54,7 @@ def _cells(row: Ranked) -> list[str]:
         "-" if interval is None else f"{millimetres(interval[0])} - {millimetres(interval[1])}",
         time,
         str(entry.frames),
+        reliance(entry),
         entry.provenance,
     ]
 

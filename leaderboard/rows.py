@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.reliance import Reliance
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.result_io import parse_result, read_json, result_content
 from fpp_ml_bench.evaluation.schema import StrictModel, validate
@@ -76,6 +77,11 @@ class Entry:
         timing, submission = self.result.timing, self.result.submission
         source = timing.provenance if timing is not None else submission.seconds_source
         return source == "measured" and self.provenance in ("measured here", LOCAL)
+
+    @property
+    def reliance(self) -> Reliance | None:
+        """How far the method follows the fringe's phase; None where it was not measured."""
+        return self.result.reliance
 
     def value(self, key: str) -> float | None:
         """What ``key`` of the sort keys sorts by; None for an empty pixel set or an unknown time."""
