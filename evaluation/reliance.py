@@ -41,6 +41,24 @@ class RelianceParts(StrictModel):
     order_free_change_outline: NonNegative | None
 
 
+PART_TITLES = {
+    "follows_phase": "follows the phase, within the object, brightness unchanged",
+    "follows_light": "follows the brightness, phase unchanged",
+    "follows_both": "follows a moved surface as it would be photographed",
+    "follows_constant": "follows the phase when all of the object moves",
+    "change_outline": "changes with another outline",
+    "change_no_fringe_inside": "changes without fringes inside the object",
+    "change_no_fringe_outside": "changes without fringes outside the object",
+    "change_other_direction": "changes with fringes of the other direction",
+    "change_other_pitch": "changes with fringes of another pitch",
+    "answered_no_fringe_inside": "share answered without fringes inside",
+    "answered_no_fringe_outside": "share answered without fringes outside",
+    "order_free_follows_phase": "follows the phase, whole periods aside",
+    "order_free_change_outline": "changes with another outline, whole periods aside",
+}
+"""Each part in words."""
+
+
 class Reliance(StrictModel):
     """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below two objects).
 

@@ -1,6 +1,7 @@
 """The page of one submission: scores with intervals, objects, cost, how it was made, and its error panels."""
 
 from fpp_ml_bench.evaluation.numbers import millimetres
+from fpp_ml_bench.evaluation.reliance import PART_TITLES
 from fpp_ml_bench.evaluation.report_html import data_uri, escaped, page
 from fpp_ml_bench.evaluation.report_scores import html_table, sample_table, score_table
 from fpp_ml_bench.evaluation.result import Result
@@ -142,23 +143,6 @@ def _costs(entry: Entry) -> str:
     return html_table("Run time and what it takes", ("What", "Value"), rows, text_columns=2)
 
 
-_PARTS = {
-    "follows_phase": "follows the phase, within the object, brightness unchanged",
-    "follows_light": "follows the brightness, phase unchanged",
-    "follows_both": "follows a moved surface as it would be photographed",
-    "follows_constant": "follows the phase when all of the object moves",
-    "change_outline": "changes with another outline",
-    "change_no_fringe_inside": "changes without fringes inside the object",
-    "change_no_fringe_outside": "changes without fringes outside the object",
-    "change_other_direction": "changes with fringes of the other direction",
-    "change_other_pitch": "changes with fringes of another pitch",
-    "answered_no_fringe_inside": "share answered without fringes inside",
-    "answered_no_fringe_outside": "share answered without fringes outside",
-    "order_free_follows_phase": "follows the phase, whole periods aside",
-    "order_free_change_outline": "changes with another outline, whole periods aside",
-}
-
-
 def _reading(result: Result) -> str:
     """What the counterfactual scenes say; nothing where they were not asked."""
     found = result.reliance
@@ -168,7 +152,9 @@ def _reading(result: Result) -> str:
     span = "" if low is None or high is None else f", 95% interval {low:.2f} to {high:.2f}"
     free = "" if found.order_free_score is None else f"; whole periods aside {found.order_free_score:.2f}"
     rows = [
-        [words, f"{value:.2f}"] for key, words in _PARTS.items() if (value := getattr(found.parts, key)) is not None
+        [words, f"{value:.2f}"]
+        for key, words in PART_TITLES.items()
+        if (value := getattr(found.parts, key)) is not None
     ]
     return (
         f"<section><h2>What it reads</h2><p>Phase reliance {found.score:.2f}{span}{free}: {found.samples} samples of "

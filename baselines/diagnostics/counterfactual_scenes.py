@@ -12,42 +12,24 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, Recut, original
+from fpp_ml_bench.baselines.diagnostics.counterfactual_outlines import recuts
 from fpp_ml_bench.baselines.diagnostics.synth import Darkroom, Projected, Scene
-from fpp_ml_bench.baselines.diagnostics.synth_surface import Field, Surface, moved, surface_of_sample
+from fpp_ml_bench.baselines.diagnostics.synth_surface import Field, Surface, moved
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.illumination import LitPixels
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.pixel_sets import object_mask
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU
 """A shift that the working range holds below this says nothing; the move is left out."""
-GROWTH = 0.1
-"""How far a grown object reaches beyond its outline, in roots of its area: it gains about half its area."""
-ROUND_SHARE = 0.5
-"""Share of the object's area that the ellipse has which it is cut to."""
-PROJECTED: dict[str, Projected] = {
-    "no fringe inside": "no fringe inside",
-    "no fringe outside": "no fringe outside",
-    "other direction": "other direction",
-    "other pitch": "other pitch",
-}
-
-
-@dataclass(frozen=True)
-class Original:
-    """A sample as it is: ``surface`` and ``scene``, ``target`` bool (H, W) (pixels with a decoded depth, those that are
-    scored), exact ``depth_mm`` float64 (H, W), and its object."""
-
-    sample: str
-    object: str
-    surface: Surface
-    scene: Scene
-    target: NDArray[np.bool_]
-    depth_mm: NDArray[np.float64]
+REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "other direction", "other pitch")
+VIEWS_PER_OBJECT = 2
+_KEPT_PX = 300
+"""Scenes of images up to this wide are kept in memory; larger ones are made again for each method."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +49,6 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Recut:
-    """The same phase under another outline; ``keeps`` bool (H, W): target pixels that are object before and after."""
-
-    name: str
-    scene: Scene
-    keeps: NDArray[np.bool_]
-    depth_mm: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
 class Counterfactuals:
     """All that is asked of one sample. ``direction``: of the phase that moves."""
 
@@ -90,15 +62,6 @@ class Counterfactuals:
     def moves_within(self) -> tuple[Move, ...]:
         """Those that vary over the object."""
         return tuple(move for move in self.moves if move.name != "constant")
-
-
-def original(dataset: DatasetFolder, room: Darkroom, sample: str) -> Original:
-    """The sample as the dataset shows it."""
-    about, surface = dataset.measured(sample), surface_of_sample(dataset, sample)
-    target = object_mask(dataset.depth_mm(sample))
-    stream = (dataset.manifest.settings.get("seed", 0), about["object"], about["view"])
-    scene = Scene(surface.pixels.astype(np.uint32), room.light(surface), target, stream)
-    return Original(sample, about["object"], surface, scene, target, surface.depth_mm(room.shape))
 
 
 def counterfactuals(
@@ -115,8 +78,8 @@ def counterfactuals(
         direction=direction,
         layer=CalibrationLayer.of(room.rig, direction),
         moves=tuple(_moves(found, room, direction)),
-        recuts=tuple(_recuts(found, room, outlines)),
-        reprojected={name: replace(found.scene, projected=value) for name, value in PROJECTED.items()},
+        recuts=tuple(recuts(found, room, outlines)),
+        reprojected={name: replace(found.scene, projected=name) for name in REPROJECTED},
     )
 
 
@@ -172,84 +135,6 @@ def _room_for(surface: Surface, room: Darkroom, direction: Direction, field: Fie
     return float(np.clip(limits.min(), 0.0, LARGEST_SHIFT_RAD))
 
 
-def _recuts(found: Original, room: Darkroom, outlines: Sequence[NDArray[np.bool_]]) -> Iterator[Recut]:
-    inside = np.zeros(room.shape, dtype=bool)
-    inside.ravel()[found.surface.pixels] = True
-    cuts = {"ellipse": _ellipse(found)}
-    laid = [_laid_over(outline, found.target) for outline in outlines]
-    if laid:
-        # The one that leaves nearest to half: an outline that covers the object changes nothing.
-        kept = [(cut & found.target).sum() / found.target.sum() for cut in laid]
-        cuts["another object's outline"] = laid[int(np.argmin(np.abs(np.array(kept) - ROUND_SHARE)))]
-    for name, cut in cuts.items():
-        chosen = cut.ravel()[found.surface.pixels]
-        scene = replace(
-            found.scene,
-            pixels=found.scene.pixels[chosen],
-            lit=_part(found.scene, chosen),
-            mask=found.target & cut,
-        )
-        yield Recut(name, scene, found.target & cut, found.depth_mm * (inside & cut))
-    yield _grown(found, room, inside)
-
-
-def _grown(found: Original, room: Darkroom, inside: NDArray[np.bool_]) -> Recut:
-    """The surface carried on beyond its outline: depth and brightness of the nearest pixel of the target."""
-    from scipy.ndimage import distance_transform_edt
-
-    away, nearest = distance_transform_edt(~found.target, return_indices=True)
-    ring = (away > 0) & (away <= GROWTH * np.sqrt(found.target.sum())) & ~inside
-    place = np.full(room.shape, -1)
-    place.ravel()[found.surface.pixels] = np.arange(found.surface.pixels.size)
-    source = place[tuple(nearest)][ring]
-    x, y = (rays[ring] for rays in room.rig.camera.rays())
-    grown = Surface(np.flatnonzero(ring), x, y, found.surface.depth_m[source], found.surface.normals[source])
-    both = Surface(
-        np.concatenate([found.surface.pixels, grown.pixels]),
-        np.concatenate([found.surface.x, grown.x]),
-        np.concatenate([found.surface.y, grown.y]),
-        np.concatenate([found.surface.depth_m, grown.depth_m]),
-        np.concatenate([found.surface.normals, grown.normals]),
-    )
-    lit = room.light(both)
-    gain = np.concatenate([found.scene.lit.gain, found.scene.lit.gain[source]])
-    scene = replace(
-        found.scene, pixels=both.pixels.astype(np.uint32), lit=replace(lit, gain=gain), mask=found.target | ring
-    )
-    return Recut("grown", scene, found.target, both.depth_mm(room.shape))
-
-
-def _part(scene: Scene, chosen: NDArray[np.bool_]) -> LitPixels:
-    lit = scene.lit
-    lookup = {
-        name: replace(found, index=found.index[chosen], weight=found.weight[chosen])
-        for name, found in lit.lookup.items()
-    }
-    return replace(lit, lookup=lookup, gain=lit.gain[chosen], ambient=lit.ambient[chosen])
-
-
-def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``outline`` shifted so that its middle lies on the target's."""
-    middles = [np.argwhere(mask).mean(axis=0) for mask in (target, outline)]
-    down, across = np.rint(middles[0] - middles[1]).astype(int)
-    laid = np.zeros_like(outline)
-    rows, columns = np.nonzero(outline)
-    rows, columns = rows + down, columns + across
-    there = (rows >= 0) & (rows < laid.shape[0]) & (columns >= 0) & (columns < laid.shape[1])
-    laid[rows[there], columns[there]] = True
-    return laid
-
-
-def _ellipse(found: Original) -> NDArray[np.bool_]:
-    """An ellipse on the target's middle, shaped as its spread, that holds `ROUND_SHARE` of its pixels."""
-    points = np.argwhere(found.target).astype(np.float64)
-    spread = np.maximum(points.std(axis=0), 1.0)
-    rows, columns = np.indices(found.target.shape)
-    middle = points.mean(axis=0)
-    radius = np.hypot((rows - middle[0]) / spread[0], (columns - middle[1]) / spread[1])
-    return np.asarray(radius <= np.quantile(radius[found.target], ROUND_SHARE))
-
-
 def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple[str, list[str]]]:
     """``views`` samples of each object of ``split``, each with one sample of every other object, whose outlines it may
     be cut to. Raises `DiagnosisError` for a split without an object."""
@@ -268,3 +153,22 @@ def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple
             others = [theirs[view % len(theirs)] for other, theirs in by_object.items() if other != name]
             found.append((ordered[view], others))
     return found
+
+
+class SceneBook:
+    """The counterfactual scenes of a dataset, shared by every method that is asked about them: ``views`` samples of
+    each object of ``split``. Raises `DiagnosisError` for a split without an object."""
+
+    def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
+        self.dataset, self.room = dataset, Darkroom.of(dataset)
+        self.chosen = chosen_samples(dataset, split, views)
+        self._kept: dict[tuple[str, Direction], Counterfactuals] = {}
+
+    def scenes(self, direction: Direction) -> Iterator[Counterfactuals]:
+        """Those of every sample, the phase of ``direction`` moved."""
+        for sample, others in self.chosen:
+            key = sample, direction
+            found = self._kept.get(key) or counterfactuals(self.dataset, self.room, sample, direction, others)
+            if self.dataset.size[1] <= _KEPT_PX:
+                self._kept[key] = found
+            yield found

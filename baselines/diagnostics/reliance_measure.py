@@ -7,7 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfactuals, Move
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfactuals, Move, SceneBook
+from fpp_ml_bench.baselines.diagnostics.probe import Progress, silent
 from fpp_ml_bench.baselines.diagnostics.reliance import (
     Change,
     follows,
@@ -165,6 +166,18 @@ def reliance_of(
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
+
+
+def measure(
+    asked: Asked, book: SceneBook, weights_sha256: str | None = None, progress: Progress = silent
+) -> tuple[Reliance, list[SampleReliance]]:
+    """The block of a method, and what every sample gave. Raises `DiagnosisError` as `Asker` and `reliance_of`."""
+    asker, direction = Asker(asked, book.room), direction_read(asked.frames_used, book.dataset)
+    samples = []
+    for scenes in book.scenes(direction):
+        progress(len(samples), len(book.chosen), scenes.original.sample)
+        samples.append(measure_sample(asker, scenes))
+    return reliance_of(asker, samples, book.dataset, direction, weights_sha256), samples
 
 
 def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> Direction:

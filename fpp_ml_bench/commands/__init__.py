@@ -26,7 +26,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train one recipe, a shipped one or yours, into a weights file"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
     "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
+    "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
     "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),
+    "reliance": ("reliance", "measure phase reliance: does an answer follow the fringes or the outline"),
+    "diagnose": ("diagnose", "look into a model: does it read fringes or shapes; one HTML report"),
     "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
     "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
 }

@@ -1,0 +1,129 @@
+"""Put the phase reliance into the leaderboard's rows: of every row whose method can be made again from what is here.
+
+    fpp-bench build data/cpu224 --preset full --size 224
+    fpp-bench reproduce all --preset cpu --data data/cpu224
+    python benchmarks/reliance_rows.py --data data/cpu224 data/full --runs runs/cpu
+    fpp-bench leaderboard --readme README.md
+
+A network's row is measured on the data it was scored on, with the weights file whose SHA-256 it names (below ``--runs``
+or shipped with the package); a classical or phase row on its own data where that is given, else on the first of
+``--data``, for which the block says so. Rows that have a block of the same version, data and weights are left alone, so
+an interrupted run goes on. Rows of other methods or of weights that are not here are named and left as they are.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneBook
+from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
+from fpp_ml_bench.baselines.methods import METHODS, Method, method
+from fpp_ml_bench.baselines.model import Model, load
+from fpp_ml_bench.baselines.network_method import NetworkMethod
+from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
+from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench.evaluation.reliance import RELIANCE_VERSION
+from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
+from fpp_ml_bench.loaders.store import DatasetFolder
+
+REFUSED = 2
+
+
+def weights_by_hash(runs: list[Path]) -> dict[str, Path]:
+    """Every weights file of the package and below ``runs`` by its SHA-256."""
+    files = [weights_path(name) for name in shipped_names()]
+    files += [path for folder in runs for path in sorted(folder.glob("**/weights*.safetensors"))]
+    return {sha256(path.read_bytes()).hexdigest(): path for path in files}
+
+
+class Bench:
+    """Datasets, weights and scenes, each opened once."""
+
+    def __init__(self, data: list[Path], runs: list[Path], views: int) -> None:
+        self.books = [SceneBook(DatasetFolder(folder), views) for folder in data]
+        self.weights = weights_by_hash(runs)
+        self._model: tuple[str, Model] | None = None
+
+    def book_of(self, entry: Entry, anywhere: bool) -> SceneBook:
+        """The scenes of the row's own data; of the first dataset where it is not given and ``anywhere`` will do."""
+        wanted = entry.result.dataset.fingerprint
+        for book in self.books:
+            if book.dataset.fingerprint == wanted:
+                return book
+        if not anywhere:
+            raise FppBenchError(f"its data {wanted[:8]} is not among --data")
+        return self.books[0]
+
+    def method_of(self, entry: Entry) -> tuple[Method, SceneBook]:
+        """The row's method, made again, and the scenes to ask it about. Raises FppBenchError where it can't be."""
+        about = entry.result.submission
+        if about.method in METHODS:
+            book = self.book_of(entry, anywhere=True)
+            return method(about.method, book.dataset.rig, **_options(about.settings)), book
+        wanted = about.settings.get("weights_sha256")
+        if not isinstance(wanted, str) or wanted not in self.weights:
+            raise FppBenchError("its weights are not here" if wanted else "not a method of this package")
+        book = self.book_of(entry, anywhere=False)
+        if self._model is None or self._model[0] != wanted:
+            self._model = wanted, load(self.weights[wanted], "cpu")
+        return NetworkMethod(self._model[1], about.settings.get("depth_range"), about.settings.get("frame")), book  # type: ignore[arg-type]
+
+
+def _options(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in ("weights_sha256", "device")}
+
+
+def fill(bench: Bench, path: Path, again: bool) -> str:
+    """Put the block into the row at ``path`` where it lacks one; what became of it, in words."""
+    entry = read_entry(path)
+    asked, book = bench.method_of(entry)
+    check_same_method(entry, asked)
+    weights = asked.settings.get("weights_sha256")
+    before = entry.reliance
+    if before is not None and not again:
+        same = (before.version, before.dataset_fingerprint, before.weights_sha256)
+        if same == (RELIANCE_VERSION, book.dataset.fingerprint, weights):
+            return f"{before.score:.3f}, as it was"
+    started = time.perf_counter()
+    found, _ = measure(asked, book, weights if isinstance(weights, str) else None)
+    write_reliance(entry, found)
+    low, high = found.interval
+    return f"{found.score:.3f} ({low} to {high}), {time.perf_counter() - started:.1f} s"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__.split("\n", 1)[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="dataset folders with all frames")
+    parser.add_argument("--runs", type=Path, nargs="+", default=[Path("runs")], help="folders with trained weights")
+    parser.add_argument("--rows", type=Path, default=SHIPPED_ROWS, help="folder of the rows")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows alone, by file name without .json")
+    parser.add_argument("--views", type=int, default=VIEWS_PER_OBJECT, help="samples of each test object")
+    parser.add_argument("--again", action="store_true", help="measure rows that have a block anew")
+    args = parser.parse_args()
+    bench = Bench(args.data, args.runs, args.views)
+    paths = [path for path in sorted(args.rows.glob("*.json")) if not args.only or path.stem in args.only]
+    left = _each(paths, lambda path: fill(bench, path, args.again))
+    print(f"{len(paths) - left} rows have a phase reliance, {left} have not")
+    return 0 if paths else REFUSED
+
+
+def _each(paths: list[Path], work: Callable[[Path], str]) -> int:
+    left = 0
+    for path in paths:
+        try:
+            print(f"{path.stem}: {work(path)}", flush=True)
+        except FppBenchError as error:
+            left += 1
+            print(f"{path.stem}: left as it is, {error}", flush=True)
+    return left
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""Writing a measured phase reliance into a result file or a row, and into no other method's."""
+
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.reliance import Reliance
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.result_io import result_content, write_result
+from fpp_ml_bench.evaluation.schema import validate
+from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.methods import Method
+
+_OF_THE_MACHINE = ("threads", "device")
+
+
+def check_same_method(entry: Entry, method: "Method") -> None:
+    """Refuse (SubmissionError) a row of another method: name, frames, units, or a setting that both have."""
+    about = entry.result.submission
+    pairs: dict[str, tuple[object, object]] = {
+        "method": (about.method, method.name),
+        "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
+        "units": (about.units, getattr(method, "units", "mm")),
+    }
+    for key, value in method.settings.items():
+        if key in about.settings and key not in _OF_THE_MACHINE:
+            pairs[f"settings.{key}"] = about.settings[key], value
+    for key, (found, asked) in pairs.items():
+        if found != asked:
+            raise SubmissionError(
+                f"{printable(str(entry.path), 500)}: {key} is {printable(str(found))}, but {printable(str(asked))} is "
+                "what would be asked; phase reliance belongs to the very method that was scored: give the same options"
+            )
+
+
+def write_reliance(entry: Entry, reliance: Reliance) -> None:
+    """Put ``reliance`` into the file of ``entry``, in place of an earlier one; row files keep their provenance.
+
+    Raises SubmissionError for a block that contradicts the result (other weights, other units).
+    """
+    content = {**result_content(entry.result), "reliance": reliance.model_dump(mode="json")}
+    result: Result = validate(Result, content, entry.path, "result of fpp-eval")
+    if entry.provenance == LOCAL:
+        write_result(result, entry.path)
+    else:
+        write_row(Entry(entry.path, result, entry.provenance), entry.provenance, entry.path)
