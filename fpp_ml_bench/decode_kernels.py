@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from fpp_ml_bench.acceleration import njit
-from fpp_ml_bench.triangulation import GAUSS_NEWTON_STEPS
+from fpp_ml_bench.triangulation import GAUSS_NEWTON_STEPS, LEAST_PARALLAX
 
 TILE = 1024
 _HALF_PI = math.pi / 2
@@ -122,8 +122,11 @@ def depth_one(x, y, coordinate, rotation, translation, axis, focal, centre, dept
     for i in range(len(x)):
         ideal = (coordinate[i] - centre) / focal
         forward = s0 * x[i] + s1 * y[i] + s2
-        z = (ideal * tz - t) / (r0 * x[i] + r1 * y[i] + r2 - ideal * forward)
+        along, across = r0 * x[i] + r1 * y[i] + r2, ideal * forward
+        z = (ideal * tz - t) / (along - across)
         good = (z > 0.0) & (z < np.inf) & (forward * z + tz > 0.0)
+        size = abs(along) + (abs(coordinate[i]) + abs(centre)) / focal * abs(forward)
+        good &= abs(along - across) > LEAST_PARALLAX * size
         depth_mm[i] = z * 1000.0 if good else np.nan
 
 

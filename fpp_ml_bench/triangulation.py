@@ -26,6 +26,10 @@ relative error, and three leave nothing of it in float64."""
 FIXED_POINT_STEPS = 50
 FIXED_POINT_TOLERANCE = 1e-13
 """Last change, in normalised units, of a projector coordinate whose distortion has been iterated away."""
+LEAST_PARALLAX = 2.0**-49
+"""Least ``|a_0 - x_p a_2|`` as a part of the magnitudes it is the difference of, the coordinate's own included. Its
+round-off is up to 8 units of 2^-53 of those, so that below this ray and projector plane are parallel, and a depth would
+be half noise."""
 
 
 class DepthFromBoth(NamedTuple):
@@ -91,8 +95,12 @@ def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direct
         else:
             ideal = (coordinate - (device.cx, device.cy)[axis]) / (device.fx, device.fy)[axis]
         forward = rotated_ray(rays, rig, 2)
-        depth = (ideal * rig.t[2] - rig.t[axis]) / (rotated_ray(rays, rig, axis) - ideal * forward)
-        return _kept(depth, forward, rig)
+        along, across = rotated_ray(rays, rig, axis), ideal * forward
+        depth = (ideal * rig.t[2] - rig.t[axis]) / (along - across)
+        centre, focal = (device.cx, device.cy)[axis], (device.fx, device.fy)[axis]
+        size = np.abs(along) + (np.abs(coordinate) + abs(centre)) / focal * np.abs(forward)
+        parallel = np.abs(along - across) <= LEAST_PARALLAX * size
+        return np.where(parallel, np.nan, _kept(depth, forward, rig))
 
 
 def depth_from_both(

@@ -184,3 +184,13 @@ def test_unknown_directions_and_steps_are_refused():
         depth_noise_mm(rig, 1800.0, "diagonal", 18, 60.0)
     with pytest.raises(DecodeError, match="at least 3"):
         depth_noise_mm(rig, 1800.0, "both", 2, 60.0)
+
+
+def test_rays_that_are_parallel_up_to_round_off_have_no_depth():
+    rig = paper_rig(40)
+    x = np.random.default_rng(5).uniform(-0.2, 0.2, 2000)
+    infinity = rig.projector.fx * x + rig.projector.cx
+    rays = x, np.zeros_like(x)
+    assert np.isnan(depth_from_coordinate(rays, infinity, rig, "vertical")).all()
+    nearly = depth_from_coordinate(rays, infinity + 1e-9, rig, "vertical")
+    np.testing.assert_allclose(nearly, 1824 * 125 / 1e-9, rtol=2e-3)
