@@ -1,0 +1,229 @@
+"""The pictures of a trade-off: error against seconds and frames, error over image size, seconds over what grows."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.leaderboard.tradeoff_points import Cost, ErrorKey, Growth, Point, Tradeoff
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ERRORS: dict[ErrorKey, str] = {
+    "object_mae_mm": "object MAE (mm); not measured counts whole",
+    "measured_mae_mm": "MAE over measured object pixels (mm)",
+}
+_FAMILIES = (
+    ("classical-vertical", "classical, vertical", "tab:blue", "o"),
+    ("classical-horizontal", "classical, horizontal", "tab:cyan", "o"),
+    ("classical-both", "classical, both", "tab:green", "o"),
+    ("precision", "NumPy, float32 and float64", "tab:gray", "D"),
+    ("phase", "phase route, one or few frames", "tab:orange", "s"),
+    ("network", "networks", "tab:purple", "^"),
+)
+"""Start of the keys, name, colour and mark of each family; a point belongs to the first that fits."""
+_PLACES = ((5, 4), (5, -9), (-5, 4), (-5, -9), (0, 8), (0, -13), (9, 12), (9, -17), (-9, 12), (-9, -17))
+"""Offsets of a label from its mark in points, the best first."""
+
+
+def draw_tradeoff(found: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm") -> bool:
+    """Two panels on log axes with the front of each; False where no point can be drawn."""
+    points = [point for point in found.points if point.group != "sizes" and point.seconds and getattr(point, error)]
+    if not points:
+        return False
+    figure = _figure(13, 6.2)
+    by_time, by_frames = figure.subplots(1, 2, sharey=True)
+    panels: tuple[tuple[Axes, Cost, float], ...] = ((by_time, "seconds", 1000), (by_frames, "frames", 1))
+    for axes, cost, scale in panels:
+        front = found.front(cost, error)
+        _families(axes, points, cost, error, scale)
+        x = [scale * getattr(point, cost) for point in front]
+        axes.step(x, [getattr(point, error) for point in front], where="post", color="black", lw=1.2, ls="--", zorder=1)
+        _log(axes)
+    by_time.set_ylabel(ERRORS[error])
+    by_time.set_xlabel(f"milliseconds a view ({_clock(found)})")
+    by_frames.set_xlabel("frames captured")
+    height, width = found.image_size
+    threads = found.settings.get("threads")
+    figure.suptitle(
+        f"{found.dataset}, {width}x{height} px, {len(found.views)} test views, against {found.target}; "
+        f"{threads} thread(s) of {found.hardware.cpu}\ndashed: the front. Hollow: told the view's own depth range or mask, on no front",
+        fontsize=9,
+    )
+    by_time.legend(fontsize=7.5, loc="best", framealpha=0.85)
+    for axes, cost, scale in panels:
+        front = found.front(cost, error)
+        named = [*front, *(point for point in points if point not in front and _worth_a_name(point))]
+        _label(
+            axes, [(scale * getattr(p, cost), getattr(p, error), _short(p), p in front) for p in named],
+            [(scale * getattr(p, cost), getattr(p, error)) for p in points],
+        )  # fmt: skip
+    _save(figure, path)
+    return True
+
+
+def draw_sizes(found: Tradeoff, path: Path) -> bool:
+    """Error over image size, and against seconds; False without such points."""
+    points = [point for point in found.points if point.group == "sizes" and point.seconds and point.measured_mae_mm]
+    if not points:
+        return False
+    figure = _figure(11, 4.6)
+    by_size, by_time = figure.subplots(1, 2, sharey=True)
+    titles = dict.fromkeys(point.title for point in points)
+    for title, colour in zip(titles, ("tab:green", "tab:blue", "tab:orange"), strict=False):
+        line = [point for point in points if point.title == title]
+        error = [point.measured_mae_mm for point in line]
+        by_size.plot([point.image_px for point in line], error, "o-", color=colour, label=title)
+        by_time.plot([1000 * (point.seconds or 0) for point in line], error, "o-", color=colour)
+        for point in line:
+            by_time.annotate(
+                f"{point.image_px}", (1000 * (point.seconds or 0), point.measured_mae_mm or 0), fontsize=7.5,
+                xytext=(4, 4), textcoords="offset points",
+            )  # fmt: skip
+    for axes in (by_size, by_time):
+        _log(axes)
+    by_size.set_xlabel("image width (px)")
+    by_time.set_xlabel(f"milliseconds a view ({_clock(found)}); numbers: image width")
+    sizes = sorted({point.image_px for point in points})
+    by_size.set_xticks(sizes, [str(size) for size in sizes], minor=False)
+    by_size.set_xticks([], minor=True)
+    by_size.set_ylabel(ERRORS["measured_mae_mm"])
+    by_size.legend(fontsize=8)
+    _save(figure, path)
+    return True
+
+
+def _clock(found: Tradeoff) -> str:
+    return "processor time" if found.settings.get("clock") == "processor" else "by the wall's clock"
+
+
+def draw_growth(growth: Sequence[Growth], path: Path) -> bool:
+    """Seconds against pixels, frames, rows and objects, with the fitted powers; False without any."""
+    if not growth:
+        return False
+    panels: list[tuple[str, list[Growth]]] = [
+        ("pixels: stages", [g for g in growth if g.over == "pixels" and ":" not in g.stage]),
+        ("pixels: parts of stages", [g for g in growth if g.over == "pixels" and ":" in g.stage]),
+        ("frames", [g for g in growth if g.over == "frames"]),
+        ("rows or objects", [g for g in growth if g.over in ("rows", "objects")]),
+    ]
+    figure = _figure(15, 8.5)
+    for axes, (title, lines) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        for line in sorted(lines, key=lambda one: -one.seconds[-1]):
+            over = f" over {line.over}" if title.startswith("rows") else ""
+            label = f"{line.exponent:.2f}  {line.stage}{over}" + (" (!)" if line.flag else "")
+            wide = 2.4 if line.flag else 1.2
+            axes.plot(line.amounts, [1000 * s for s in line.seconds], "o-", ms=4, lw=wide, label=label)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(title.split(":")[0])
+        axes.set_ylabel("milliseconds")
+        _log(axes)
+        if lines:
+            axes.legend(
+                fontsize=7.5, title="fitted power, stage", title_fontsize=7.5, loc="upper left", bbox_to_anchor=(1, 1)
+            )
+    figure.suptitle("Least time of each stage as its input grows; (!): steeper than it should be", fontsize=10)
+    _save(figure, path)
+    return True
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=110, layout="constrained")
+
+
+def family(point: Point) -> str:
+    """Start of the keys of the point's family."""
+    return next((start for start, *_ in _FAMILIES if point.key.startswith(start)), _FAMILIES[-1][0])
+
+
+def _families(axes: "Axes", points: Iterable[Point], cost: Cost, error: ErrorKey, scale: float) -> None:
+    points = list(points)
+    for start, name, colour, mark in _FAMILIES:
+        mine = [point for point in points if family(point) == start]
+        if not mine:
+            continue
+        label: str | None = name
+        for chosen, face in (([p for p in mine if not p.given], colour), ([p for p in mine if p.given], "none")):
+            x, y = [scale * getattr(p, cost) for p in chosen], [getattr(p, error) for p in chosen]
+            line = "-" if start.startswith("classical") else ""
+            axes.plot(
+                x, y, mark + line, color=colour, mfc=face, ms=4.5 if line else 6, lw=0.8, alpha=0.85,
+                label=label if chosen else None,
+            )  # fmt: skip
+            label = None if chosen else label
+            if cost == "seconds":
+                for point, up in zip(chosen, y, strict=True):
+                    ends = [scale * (point.seconds_p5 or 0), scale * (point.seconds_p95 or 0)]
+                    axes.plot(ends, [up, up], color=colour, lw=0.7, alpha=0.35, zorder=0)
+
+
+def _worth_a_name(point: Point) -> bool:
+    """Beside the front: not the classical steps between the ends, not each precision of a network."""
+    if point.group == "classical":
+        return point.title.split()[0] in ("N=3", "N=18")
+    return point.group != "networks" or point.title.endswith(", fp32")
+
+
+def _short(point: Point) -> str:
+    return point.title.removeprefix("phase ").replace(", fp32", "").replace("predicted range", "predicted")
+
+
+def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks: Sequence[tuple[float, float]]) -> None:
+    """A name beside each of ``named`` (x, y, text, on the front) that finds room, the first ones first."""
+    figure = axes.figure
+    figure.canvas.draw()  # constrained layout has then placed the axes
+    taken = [_box(axes.transData.transform(mark), 3) for mark in marks]
+    legend = axes.get_legend()
+    if legend is not None:
+        taken.append(legend.get_window_extent().extents)
+    inside = axes.get_window_extent().extents
+    for x, y, text, bold in named:
+        for across, up in _PLACES:
+            side = "left" if across > 0 else "right" if across < 0 else "center"
+            label = axes.annotate(
+                text, (x, y), xytext=(across, up), textcoords="offset points", ha=side, fontsize=7,
+                fontweight="bold" if bold else "normal",
+            )  # fmt: skip
+            box = label.get_window_extent().extents
+            within = box[0] > inside[0] and box[2] < inside[2] and box[1] > inside[1] and box[3] < inside[3]
+            if within and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                break
+            label.remove()
+
+
+def _box(at: Sequence[float], half: float) -> tuple[float, float, float, float]:
+    return at[0] - half, at[1] - half, at[0] + half, at[1] + half
+
+
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    return bool(one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3])
+
+
+def _log(axes: "Axes") -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.grid(True, which="both", alpha=0.2)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        within_a_decade_or_two = high < 300 * low
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if within_a_decade_or_two else (1,)))
+        axis.set_major_formatter(FuncFormatter(_plain))
+        axis.set_minor_formatter(NullFormatter())
+    axes.tick_params(which="both", labelsize=8)
+
+
+_plain: Callable[[float, int], str] = lambda value, place: f"{value:g}" if value < 1e6 else f"{value:.0e}"  # noqa: E731
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None

@@ -1,0 +1,152 @@
+"""A trade-off as files and tables: tradeoff.json, two CSVs, four pictures, and what the terminal shows."""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result_io import write_json
+from fpp_ml_bench.leaderboard.tradeoff_figure import draw_growth, draw_sizes, draw_tradeoff
+from fpp_ml_bench.leaderboard.tradeoff_points import TRADEOFF_FILE, Growth, Point, Tradeoff, failures
+from fpp_ml_bench.loaders.manifest import write_atomically
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_POINT_FIELDS = tuple(name for name in Point.model_fields if name != "interval_mm")
+
+
+def write_report(found: Tradeoff, out: Path) -> list[Path]:
+    """Write everything into folder ``out``; returns the files. SubmissionError where one can't be written."""
+    write_json(found.model_dump(mode="json", exclude_none=True), out / TRADEOFF_FILE)
+    written = [out / TRADEOFF_FILE]
+    if found.points:
+        written.append(_write(out / "tradeoff.csv", points_csv(found)))
+    if found.growth:
+        written.append(_write(out / "costs.csv", growth_csv(found.growth)))
+    for name, drawn in (
+        ("tradeoff.png", lambda path: draw_tradeoff(found, path)),
+        ("tradeoff_measured.png", lambda path: draw_tradeoff(found, path, "measured_mae_mm")),
+        ("sizes.png", lambda path: draw_sizes(found, path)),
+        ("costs.png", lambda path: draw_growth(found.growth, path)),
+    ):
+        if drawn(out / name):
+            written.append(out / name)
+    return written
+
+
+def _write(path: Path, text: str) -> Path:
+    try:
+        write_atomically(path, text.encode("utf-8"))
+    except OSError as error:
+        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
+    return path
+
+
+def points_csv(found: Tradeoff) -> str:
+    """One line a setting; ``front_seconds`` and ``front_frames``: on the front of object MAE; ``slowed``: the machine
+    was busier beside it than in the run's median."""
+    fronts = {cost: {point.key for point in found.front(cost)} for cost in ("seconds", "frames")}  # type: ignore[arg-type]
+    head = [*_POINT_FIELDS, "interval_low_mm", "interval_high_mm", "front_seconds", "front_frames", "slowed"]
+    lines = []
+    for point in found.points:
+        row = [_cell(getattr(point, name)) for name in _POINT_FIELDS]
+        row += [_cell(end) for end in point.interval_mm or (None, None)]
+        row += [str(point.key in fronts[cost]).lower() for cost in ("seconds", "frames")]
+        lines.append([*row, str(found.slowed(point)).lower()])
+    return _csv(head, lines)
+
+
+def growth_csv(growth: Iterable[Growth]) -> str:
+    """One line a stage and amount, with the stage's fitted power."""
+    head = ["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"]
+    lines = [
+        [one.stage, one.over, _cell(amount), _cell(seconds), *map(_cell, (one.exponent, one.low, one.high, one.tail)),
+         one.flag or ""]
+        for one in growth
+        for amount, seconds in zip(one.amounts, one.seconds, strict=True)
+    ]  # fmt: skip
+    return _csv(head, lines)
+
+
+def _csv(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(lines)
+    return text.getvalue()
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def front_table(found: Tradeoff) -> "Table":
+    """Both fronts of object MAE, the cheapest first."""
+    from rich.table import Table
+
+    table = Table(title="Fronts of object MAE: nobody is both cheaper and more exact", title_justify="left")
+    table.add_column("Against")
+    table.add_column("Setting", overflow="fold")
+    for title in ("ms a view", "5th-95th", "Frames", "Object MAE mm", "Measured MAE mm", "Not measured"):
+        table.add_column(title, justify="right")
+    for cost in ("seconds", "frames"):
+        for point in found.front(cost):  # type: ignore[arg-type]
+            table.add_row(cost, point.title, *_figures(point))
+        table.add_section()
+    return table
+
+
+def _figures(point: Point) -> tuple[str, ...]:
+    low, high = (1000 * (end or 0) for end in (point.seconds_p5, point.seconds_p95))
+    return (
+        f"{1000 * (point.seconds or 0):.3g}",
+        f"{low:.3g}-{high:.3g}",
+        str(point.frames),
+        "-" if point.object_mae_mm is None else f"{point.object_mae_mm:.3g}",
+        "-" if point.measured_mae_mm is None else f"{point.measured_mae_mm:.3g}",
+        "-" if point.missing_share is None else f"{100 * point.missing_share:.3g}%",
+    )
+
+
+def growth_table(growth: Sequence[Growth]) -> "Table":
+    """The fitted powers, flagged ones named as such."""
+    from rich.table import Table
+
+    table = Table(title="Costs that grow: seconds = c amount^power", title_justify="left")
+    table.add_column("Stage", overflow="fold")
+    table.add_column("Over")
+    for title in ("From", "To", "ms at most", "Power", "95% interval", "At the end"):
+        table.add_column(title, justify="right")
+    table.add_column("Flag", overflow="fold")
+    for one in growth:
+        table.add_row(
+            one.stage, one.over, f"{one.amounts[0]:,.0f}", f"{one.amounts[-1]:,.0f}", f"{1000 * one.seconds[-1]:.3g}",
+            f"{one.exponent:.2f}", f"{one.low:.2f} to {one.high:.2f}", f"{one.tail:.2f}", one.flag or "",
+        )  # fmt: skip
+    return table
+
+
+def remarks(found: Tradeoff) -> list[str]:
+    """What to know before the numbers are believed: load, pace, sittings, settings that gave nothing."""
+    lines = []
+    paces, loads = found.pace_ms, found.loads
+    if loads:
+        lines.append(
+            f"Load of the machine: {loads[0]:g} to {loads[-1]:g} on {found.hardware.cores} cores; its pace (a fixed "
+            f"piece of work): {paces[0]:.3g} to {paces[-1]:.3g} ms, median {paces[len(paces) // 2]:.3g}."
+        )
+    slow = sum(map(found.slowed, found.points))
+    if slow:
+        lines.append(
+            f"{slow} of {len(found.points)} settings ran while the machine was clearly busier than in the median "
+            "(column slowed of tradeoff.csv): their times are too long."
+        )
+    if found.sittings > 1:
+        lines.append(f"Measured in {found.sittings} sittings: times of different sittings are compared with care.")
+    lines += [f"Not measured: {point.title}: {point.failed}" for point in failures(found.points)]
+    return lines

@@ -1,0 +1,115 @@
+"""The views that settings are measured on: some of a dataset's test views, or small scenes photographed at a size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.baselines.prediction import captured_frames
+from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.rig import Rig
+
+Frames = Sequence[NDArray[np.uint8] | None]
+
+
+class Views(Protocol):
+    """Frames and true depth of some views of one rig; ``names`` and their ``objects`` in the same order."""
+
+    names: Sequence[str]
+
+    @property
+    def rig(self) -> Rig: ...
+    @property
+    def objects(self) -> list[str]: ...
+    def frames(self, method: Method, name: str) -> Frames:
+        """The sequence as ``method`` may see it, in memory."""
+
+    def target_mm(self, name: str) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm to score against, 0 = background."""
+
+
+@dataclass
+class StoredViews:
+    """Views ``names`` of a dataset, against the exact depth where it is known."""
+
+    opened: DatasetFolder
+    names: Sequence[str]
+
+    @property
+    def rig(self) -> Rig:
+        return self.opened.rig
+
+    @property
+    def objects(self) -> list[str]:
+        return [split_sample_name(name)[0] for name in self.names]
+
+    @property
+    def target(self) -> str:
+        return "depth_exact" if self.opened.has_exact else "depth"
+
+    def frames(self, method: Method, name: str) -> Frames:
+        return captured_frames(self.opened, method, name)
+
+    def target_mm(self, name: str) -> NDArray[np.float32]:
+        return self.opened.target_mm(name, self.target)
+
+
+def some_views(opened: DatasetFolder, an_object: int, split: str = "test") -> StoredViews:
+    """``an_object`` views of each object of ``split``, spread over its views, in row order.
+
+    Raises `DatasetError` for a split without samples.
+    """
+    of: dict[str, list[str]] = {}
+    for sample in opened.samples(split):
+        of.setdefault(split_sample_name(sample)[0], []).append(sample)
+    if not of:
+        raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
+    chosen: list[str] = []
+    for number, names in enumerate(of.values()):
+        count = min(an_object, len(names))
+        # Each object begins one view later, so that the views differ between objects.
+        chosen += sorted(
+            {names[(number + place * len(names) // count) % len(names)] for place in range(count)}, key=names.index
+        )
+    return StoredViews(opened, chosen)
+
+
+@dataclass
+class PhotographedViews:
+    """Objects of the benchmark in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
+
+    rig: Rig
+    objects: list[str]
+    view: str = "A60"
+    _taken: dict[str, tuple[list[NDArray[np.uint8]], NDArray[np.float32]]] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{name}_{self.view}" for name in self.objects]
+
+    def frames(self, method: Method, name: str) -> Frames:
+        frames, _ = self._photograph(name)
+        return [frame if index in method.frames_used else None for index, frame in enumerate(frames)]
+
+    def target_mm(self, name: str) -> NDArray[np.float32]:
+        return self._photograph(name)[1]
+
+    def _photograph(self, name: str) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32]]:
+        if name not in self._taken:
+            from fpp_ml_bench.loaders.meshes import solid_mesh
+            from fpp_ml_bench.loaders.settings import BuildSettings
+            from fpp_ml_bench.loaders.view import Studio
+            from fpp_ml_bench.pixel_sets import object_mask
+
+            studio = Studio(BuildSettings(self.rig, tuple(self.objects)))
+            row = studio.photograph(solid_mesh(split_sample_name(name)[0]), self.view)
+            # The studio's own memory; it goes with the studio, the next view gets another.
+            frames = [row.frames[index] for index in range(len(self.rig.sequence))]
+            exact = np.zeros_like(row.depth_mm) if row.depth_exact_mm is None else row.depth_exact_mm
+            self._taken[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
+        return self._taken[name]
