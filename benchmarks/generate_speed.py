@@ -85,7 +85,7 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
         ("illumination of the object", median_ms(lambda: lit_object(hits, rig, studio.lighting, traced))),
         (
             f"{count} exposures with noise",
-            median_ms(lambda: studio._expose(hits, lit, whole, stream)),
+            median_ms(lambda: studio.expose(hits, lit, whole, stream)),
         ),
         ("decoded ground truth (object only)", median_ms(lambda: decode_stack(frames, rig, mask=seen))),
     ]

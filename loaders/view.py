@@ -40,8 +40,8 @@ class Studio:
         self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
         self.backdrop = Backdrop(rig, self.lighting)
         self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
-        self._stored = stored_frames(rig.sequence, settings.stored)
-        self._unstored = unstored_frames(rig.sequence, self._stored)
+        self.stored = stored_frames(rig.sequence, settings.stored)
+        self.unstored = unstored_frames(rig.sequence, self.stored)
         self._frames = np.zeros((len(rig.sequence), rig.camera.height, rig.camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
@@ -58,31 +58,33 @@ class Studio:
         lit = lit_object(hits, rig, self.lighting, traced)
         stream = (settings.seed, mesh.name, view)
         whole = self.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
-        self._expose(hits, lit, whole, stream)
+        self.expose(hits, lit, whole, stream)
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
         seen = object_mask(exact_mm)
-        depth_mm = self._ground_truth_mm(seen)
+        depth_mm = self.ground_truth_mm(seen)
         measured = {
             "distance_mm": distance_m * MM_PER_M,
             "rays": hits.rays + whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
-        frames = {index: self._frames[index] for index in self._stored}
+        frames = {index: self._frames[index] for index in self.stored}
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 
-    def _expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
+    def expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
+        """Expose a view into the studio's frames: what ``whole`` says of every pixel, ``lit`` of the object's."""
         images = self._frames.reshape(len(self._frames), -1)
         everything = not skipping_enabled()
-        for run in _runs(tuple(range(len(images))) if everything else self._stored):
+        for run in _runs(tuple(range(len(images))) if everything else self.stored):
             self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
-        if self._unstored and not everything:
+        if self.unstored and not everything:
             pixels = hits.pixels.astype(np.uint32)
-            exposed = self.exposure.expose(self._unstored, lit, pixels, stream)
-            for index, values in zip(self._unstored, exposed, strict=True):
+            exposed = self.exposure.expose(self.unstored, lit, pixels, stream)
+            for index, values in zip(self.unstored, exposed, strict=True):
                 images[index, hits.pixels] = values
 
-    def _ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
         rig = self.settings.rig
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fpp_ml_bench.commands.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.frames import CONFIGS
 
@@ -18,6 +19,7 @@ EXAMPLES = (
     "fpp-bench build data/train --preset full --frames single_shot    frame 0 and depth only",
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
+    "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
 
 
@@ -40,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable")  # fmt: skip
     parser.add_argument("--meshes", type=Path, metavar="LIST.yaml",
                         help="meshes of yours with scale, pose and split")  # fmt: skip
+    add_explain_options(parser)
 
 
 def settings_of(args: argparse.Namespace) -> "BuildSettings":
@@ -86,6 +89,11 @@ def settings_of(args: argparse.Namespace) -> "BuildSettings":
 
 
 def run(args: argparse.Namespace) -> int:
+    with as_asked(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from time import perf_counter
 
     from fpp_ml_bench.commands.console import progress_bar
@@ -112,6 +120,9 @@ def run(args: argparse.Namespace) -> int:
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
     _summary(args.out, manifest, rows * frames, sum(steps[1:]) * frames, seconds)
+    from fpp_ml_bench.loaders.explain_build import explain_build
+
+    explain(args, lambda: explain_build(manifest, settings))
     return 0
 
 

@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from fpp_ml_bench.commands import run_command
+from fpp_ml_bench.commands.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 
@@ -61,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
     parser.add_argument("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
+    add_explain_options(parser)
 
 
 def _band(text: str) -> int:
@@ -71,6 +73,11 @@ def _band(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Score, write the JSON if asked to, print the table. Raises FppBenchError for anything that can't be scored."""
+    with as_asked(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.evaluation.process import prepare_process
 
     prepare_process()
@@ -98,6 +105,10 @@ def run(args: argparse.Namespace) -> int:
     for written in (args.json, args.report):
         if written is not None:
             print(f"Written: {written}")
+    if args.explain or args.explain_json:
+        from fpp_ml_bench.evaluation.explain_eval import explain_eval
+
+        explain(args, lambda: explain_eval(dataset, args.split, args.target, args.edge_band))
     return 0
 
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fpp_ml_bench.commands.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.commands.method_options import METHOD_HELP, add_method_options, chosen_method
 
 if TYPE_CHECKING:
@@ -27,9 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left"
     )
     add_method_options(parser)
+    add_explain_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    with as_asked(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.baselines.prediction import predict_split
     from fpp_ml_bench.commands.console import progress_bar
     from fpp_ml_bench.loaders.store import DatasetFolder
@@ -45,6 +52,9 @@ def run(args: argparse.Namespace) -> int:
     )
     how = f"--dataset {args.dataset} --split {args.split}{_scoring(chosen, opened)}"
     print(f"next: fpp-eval {args.out} {how} --json result.json")
+    from fpp_ml_bench.baselines.explain_predict import explain_predict
+
+    explain(args, lambda: explain_predict(opened, chosen, args.split))
     return 0
 
 
