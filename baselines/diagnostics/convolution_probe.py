@@ -17,7 +17,8 @@ WIDTH = 16
 SHARE = 4
 """Image px a grid step."""
 LEARNING_RATE = 3e-3
-EPOCHS = 8
+EPOCHS = 6
+BATCH = 4
 _LEAST_SPREAD = 1e-6
 
 
@@ -70,14 +71,17 @@ class ConvolutionProbe(nn.Module):
 
 
 class ProbeSet:
-    """Probes that learn side by side: one for each (features, target, seed), by those three names."""
+    """Probes that learn side by side: one for each (features, target, seed), by those three names.
+
+    ``seeds``: how many of each features; ``steps``: how many steps there will be.
+    """
 
     def __init__(
-        self, moments: Mapping[str, Moments], target_means: Mapping[str, float], seeds: int, steps: int
+        self, moments: Mapping[str, Moments], target_means: Mapping[str, float], seeds: Mapping[str, int], steps: int
     ) -> None:
         self.probes: dict[tuple[str, str, int], ConvolutionProbe] = {}
-        for seed in range(seeds):
-            for features in moments:
+        for features in moments:
+            for seed in range(seeds[features]):
                 for target, mean in target_means.items():
                     with torch.random.fork_rng(devices=[]):
                         torch.manual_seed(seed)

@@ -47,7 +47,9 @@ def _paper(spatial: Scores, folder: Path) -> Figure:
             axis.axhline(raw, color=_COLOURS[target], linewidth=1, linestyle=":", label=f"raw input, {target}")
         _layers(axis, layers)
         figures.tidy(axis, title, y="MSE" if key == "mse" else "R2")
-    axes[0, 0].legend(fontsize=7, frameon=False, ncols=2)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=5, loc="outside lower center"
+    )
     file = "linear_four_convolutions.png"
     figures.save_png(figure, folder / file)
     return Figure(

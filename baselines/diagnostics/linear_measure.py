@@ -155,15 +155,16 @@ def _position(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
 def spatial_errors(
     subject: Subject, networks: Mapping[str, nn.Module], dataset: "DatasetFolder", train: Sequence[str],
-    validation: Sequence[str], seeds: int, epochs: int, batch: int, tick: Tick,
+    validation: Sequence[str], seeds: Mapping[str, int], epochs: int, tick: Tick,
 ) -> tuple[dict[tuple[str, str, str, int], list[float]], dict[str, list[float]]]:  # fmt: skip
     """Errors of the four-convolution probes of each of ``networks``, by network, layer, target and seed, and of the
-    mean; the raw input is network and layer `INPUT`. Trained on ``train`` side by side for ``epochs``."""
+    mean; the raw input is network and layer `INPUT`. Trained on ``train`` side by side for ``epochs``, as often as
+    ``seeds`` says of each network."""
     height, width = subject.image_size
     side = max(1, height // convolution.SHARE), max(1, width // convolution.SHARE)
 
     def stream(samples: Sequence[str], doing: str, use: Callable[[dict[str, Tensor], dict[str, Tensor]], None]) -> None:
-        for names, fringe in batches(subject, dataset, samples, batch):
+        for names, fringe in batches(subject, dataset, samples, convolution.BATCH):
             seen = {f"{INPUT}/{INPUT}": at_size(fringe, side)}
             for who, network in networks.items():
                 layers = subject.layers_of(network)
@@ -185,8 +186,9 @@ def spatial_errors(
 
     stream(train, "spread of the activations", measure)
     means = {target: total / count for target, (total, count) in sums.items()}
-    steps = epochs * -(-len(train) // batch)
-    probes = convolution.ProbeSet(moments, means, seeds, steps)
+    steps = epochs * -(-len(train) // convolution.BATCH)
+    each = {source: seeds[source.partition("/")[0]] for source in moments}
+    probes = convolution.ProbeSet(moments, means, each, steps)
     for epoch in range(epochs):
         order = np.random.default_rng([1, epoch]).permutation(len(train))
         stream([train[place] for place in order], "four-convolution probes learn", probes.step)

@@ -13,6 +13,7 @@ from fpp_ml_bench.baselines.diagnostics.scores import (
     Scores,
     mean_ratio,
     ratio,
+    ratio_of_means,
 )
 
 TITLES = {
@@ -40,6 +41,8 @@ def paper_table(spatial: Scores) -> Table:
             ("Raw input", spatial[CONTROLS]),
         )
     ]
+    known = spatial[CONTROLS][INPUT]
+    rows.append(["Predicting the mean", known["edges"].mse_of_mean, known["depth"].mse_of_mean, ratio_of_means(known)])
     return Table(
         "Four-convolution probes, validation MSE (the paper's table; less is easier to read)",
         ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"),

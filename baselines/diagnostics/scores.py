@@ -12,14 +12,15 @@ from fpp_ml_bench.evaluation.uncertainty import Interval, object_interval
 @dataclass(frozen=True)
 class Score:
     """``mse``: mean over samples and seeds. ``r2``: 1 - mse / that of predicting the training samples' mean everywhere;
-    1 is perfect, 0 no better than that mean. Intervals: 95%, resampled over objects (the reference error is taken as
-    known). ``seeds``: r2 of each seed."""
+    1 is perfect, 0 no better than that mean. Intervals: 95%, resampled over objects; that of r2, a ratio of two means,
+    to first order. ``seeds``: r2 of each seed. ``mse_of_mean``: the error of that mean."""
 
     mse: float
     mse_interval: Interval | None
     r2: float
     r2_interval: Interval | None
     seeds: tuple[float, ...]
+    mse_of_mean: float
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -35,10 +36,14 @@ def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects
     if not known > 0:
         raise ValueError("the target is the same everywhere, so there is nothing to explain")
     each = table.mean(axis=0)
-    interval = object_interval(each.tolist(), objects)
-    gain = None if interval is None else (1 - interval[1] / known, 1 - interval[0] / known)
     mse = float(each.mean())
-    return Score(mse, interval, 1 - mse / known, gain, tuple((1 - table.mean(axis=1) / known).tolist()))
+    r2 = 1 - mse / known
+    # Of a resample, r2 differs from this by -mean(each - (1 - r2) reference) / known, to first order: large objects
+    # have large errors either way, and that cancels.
+    swing = object_interval(((each - (1 - r2) * np.asarray(reference)) / known).tolist(), objects)
+    span = None if swing is None else (r2 - swing[1], r2 - swing[0])
+    interval = object_interval(each.tolist(), objects)
+    return Score(mse, interval, r2, span, tuple((1 - table.mean(axis=1) / known).tolist()), known)
 
 
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
@@ -59,3 +64,8 @@ def mean_ratio(layers: Layers) -> float:
         np.mean([layer["depth"].mse for layer in layers.values()])
         / np.mean([layer["edges"].mse for layer in layers.values()])
     )
+
+
+def ratio_of_means(layer: Mapping[str, Score]) -> float:
+    """The paper's ratio of a probe that has learned nothing and predicts the means: of variances, not of knowledge."""
+    return layer["depth"].mse_of_mean / layer["edges"].mse_of_mean

@@ -1,0 +1,138 @@
+"""``fpp-bench diagnose``: what a model read, fringes or shapes, as one HTML report."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.baselines.diagnostics.registry import PROBES
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fpp_ml_bench.baselines.diagnostics.diagnosis import Diagnosis
+    from fpp_ml_bench.baselines.diagnostics.probe import Probe, Progress
+
+SUMMARY = "Look into a model: the paper's probes and more, on any network or method, as one HTML report and a JSON."
+EXAMPLES = (
+    "fpp-bench diagnose unet-individual-rmse data/cpu224 --out report",
+    "fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   joins the report",
+    "fpp-bench diagnose phase data/cpu224 --out report-phase",
+    "fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1 bottleneck dec1 --quick --out look",
+    "fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder decoder.2 --out report-mine",
+)
+UNITS = ("mm", "m", "normalised")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument(
+        "model", metavar="MODEL",
+        help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or a torch "
+        "module of yours as file.py:factory; that file is run",
+    )  # fmt: skip
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the model's image size")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
+    parser.add_argument(
+        "--probe", action="append", default=[], metavar="NAME",
+        help=f"only this one; may be given again: {', '.join(PROBES)} (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--samples", type=_count, metavar="N", help="samples of a split at most, evenly over it (default: the probe's)"
+    )
+    parser.add_argument("--seeds", type=_count, metavar="N", help="repeats of what depends on chance (default: 2)")
+    parser.add_argument("--quick", action="store_true", help="a look in a minute or two, not a measurement")
+    parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to look into (default: the model's own)")
+    parser.add_argument("--frame", type=int, metavar="N", help="frame a network is given (default: its first)")
+    parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
+    parser.add_argument(
+        "--units", choices=UNITS,
+        help="what a module of yours puts out: depth in mm, in m, or normalised to the sample's range (default)",
+    )  # fmt: skip
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
+    return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask the probes, write the report, print what they say. Raises FppBenchError for what can't be looked into."""
+    from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
+    from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings
+    from fpp_ml_bench.baselines.diagnostics.registry import checked_names
+    from fpp_ml_bench.baselines.diagnostics.subject import subject
+    from fpp_ml_bench.evaluation.console import show
+    from fpp_ml_bench.hardware import usable_cores
+    from fpp_ml_bench.loaders.store import DatasetFolder
+
+    asked = checked_names(args.probe)
+    opened = DatasetFolder(args.dataset)
+    model = subject(args.model, opened, args.layers, args.units, args.frame, args.threads or usable_cores())
+    settings = ProbeSettings(args.samples, args.seeds, args.quick)
+    with _bars() as progress:
+        found = diagnose(model, opened, asked, settings, args.out, progress, _command(args))
+    show(_table(model.title, found))
+    print(f"Written: {found.report}\nWritten: {found.values}")
+    return 0
+
+
+@contextmanager
+def _bars() -> "Iterator[Callable[[Probe], Progress]]":
+    """A bar for each probe, on standard error."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def started(probe: "Probe") -> "Progress":
+            task = bars.add_task(probe.title, total=None)
+
+            def told(done: int, total: int, doing: str = "") -> None:
+                said = f"{probe.title}: {doing}" if doing else probe.title
+                bars.update(task, completed=done, total=total, description=said)
+
+            return told
+
+        yield started
+
+
+def _table(title: str, found: "Diagnosis") -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left")
+    table.add_column("Probe")
+    table.add_column("What it says", overflow="fold")
+    table.add_column("Seconds", justify="right")
+    for answer in found.answers:
+        said = f"not asked: {answer.finding.skipped}" if answer.finding.skipped else answer.finding.summary
+        table.add_row(answer.probe.name, Text(said), "kept" if answer.kept else f"{answer.seconds:.1f}")
+    return table
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that makes the same report, machine's settings left out."""
+    import shlex
+
+    words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
+    for name in args.probe:
+        words += ["--probe", name]
+    for option in ("samples", "seeds", "frame", "units"):
+        value = getattr(args, option)
+        words += [] if value is None else [f"--{option}", str(value)]
+    words += ["--quick"] if args.quick else []
+    words += ["--layers", *args.layers] if args.layers else []
+    return shlex.join(words)
