@@ -20,6 +20,7 @@ NO_DISTORTION: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 INVERSE_TOLERANCE = 1e-12
 """Largest accepted error of the inverse, distorted again, in normalised units: 2e-9 px at the paper's focal length."""
 MAX_ITERATIONS = 50
+START_TABLE = 4096
 
 
 def is_distorted(coefficients: Coefficients) -> bool:
@@ -57,17 +58,40 @@ def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     return np.where(folded, np.nan, xd), np.where(folded, np.nan, yd)
 
 
+def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients: Coefficients) -> Pair:
+    """Points whose radial distortion alone is that of (xd, yd), to a few digits; at the fold for those beyond it."""
+    k1, k2, _, _, k3 = coefficients
+    measured = np.hypot(xd, yd)
+    wanted = float(np.max(measured, initial=0.0, where=np.isfinite(measured)))
+    fold = math.sqrt(fold_radius_squared(coefficients))
+
+    def distorted(r: NDArray[np.float64]) -> NDArray[np.float64]:
+        r2 = r * r
+        return r * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+
+    reach = wanted
+    for _ in range(MAX_ITERATIONS):  # a radius that is distorted beyond all of the points, or the fold
+        if reach >= fold or float(distorted(np.float64(reach))) >= wanted:
+            break
+        reach *= 2
+    radius = np.linspace(0.0, min(reach, fold), START_TABLE)
+    shrink = np.interp(measured, distorted(radius), radius) / np.where(measured > 0, measured, 1.0)
+    return xd * shrink, yd * shrink
+
+
 def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Pair:
     """Ideal normalised coordinates of distorted ones, by Newton's method in float64, checked by distorting again.
 
-    Where no ideal point within the fold reproduces the input to `INVERSE_TOLERANCE`, both coordinates are NaN.
+    Newton starts at the inverse of the radial part, read off a table: from the distorted point itself it overshoots
+    where the polynomial flattens out, and misses points that have an inverse. Where no ideal point within the fold
+    reproduces the input to `INVERSE_TOLERANCE`, both coordinates are NaN.
     """
     xd, yd = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not is_distorted(coefficients):
         return xd.copy(), yd.copy()
     k1, k2, p1, p2, k3 = coefficients
-    xi, yi = xd.copy(), yd.copy()
     with np.errstate(all="ignore"):
+        xi, yi = _radial_start(xd, yd, coefficients)
         for _ in range(MAX_ITERATIONS):
             fx, fy = distortion_polynomial(xi, yi, coefficients)
             ex, ey = fx - xd, fy - yd

@@ -24,6 +24,8 @@ from fpp_ml_bench.pixel_sets import object_mask
 Normalisation = Literal["raw", "global", "individual"]
 NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
 
+_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
 
 def _check(name: str) -> None:
     if name not in NORMALISATIONS:
@@ -36,8 +38,9 @@ def normalise(
 ) -> NDArray:  # fmt: skip
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
 
-    Single precision loses nothing here: the difference of two float32 depths within a factor of two of each other is
-    exact (Sterbenz), and the division rounds once. Raises ``ValueError`` for an unknown name or a range that is not
+    Single precision loses nothing where depth and range are float32 themselves: the difference of two such depths within
+    a factor of two of each other is exact (Sterbenz), and the division rounds once. A range from elsewhere, or deeper
+    depths, would lose digits by being rounded first, so that is worked out in float64 and rounded at the end. Raises ``ValueError`` for an unknown name or a range that is not
     finite and ordered.
     """
     _check(name)
@@ -50,10 +53,13 @@ def normalise(
         span = _span(depth_min_mm, depth_max_mm)
         if span == 0:
             result[...] = 0
-        else:
+        elif depth_mm.dtype.itemsize <= 4 and _is_single(depth_min_mm) and _SMALLEST <= span <= _LARGEST:
             np.subtract(depth_mm, np.float32(depth_min_mm), out=result, casting="same_kind")
             result /= np.float32(span)
             result *= object_mask(depth_mm)
+        else:
+            share = (depth_mm.astype(np.float64) - float(depth_min_mm)) / span
+            result[...] = np.where(object_mask(depth_mm), share, 0.0)
     return result
 
 
@@ -70,6 +76,11 @@ def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth
     if name == "global":
         return depth * MM_PER_M
     return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
+
+
+def _is_single(value: float) -> bool:
+    """Whether float32 holds ``value`` exactly."""
+    return abs(value) <= _LARGEST and float(np.float32(value)) == float(value)
 
 
 def _span(depth_min_mm: float, depth_max_mm: float) -> float:

@@ -16,6 +16,10 @@ from fpp_ml_bench.lens import NO_DISTORTION, Coefficients, distort, is_distorted
 
 Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
 
+MAX_CONDITION = 2.0**26
+"""Largest accepted condition number of the intrinsic matrix, lengths in image sizes: inverting it then costs half of
+double precision's digits. The paper's camera has 3; a focal length of 0.01 px or 10^10 px reaches it."""
+
 
 def number(value: object, name: str, *, positive: bool = False) -> float:
     """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
@@ -60,6 +64,18 @@ class Pinhole:
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, number(getattr(self, name), name, positive=name in ("fx", "fy")))
         object.__setattr__(self, "distortion", numbers(self.distortion, 5, "distortion"))
+        self._check_intrinsics()
+
+    def _check_intrinsics(self) -> None:
+        w, h = self.width, self.height
+        matrix = np.array([[self.fx / w, 0, (self.cx + 0.5) / w], [0, self.fy / h, (self.cy + 0.5) / h], [0, 0, 1]])
+        condition = float(np.linalg.cond(matrix)) if np.isfinite(matrix).all() else math.inf
+        if not condition <= MAX_CONDITION:
+            raise RigError(
+                f"fx, fy, cx, cy: the intrinsic matrix {self.fx:g}, {self.fy:g}, {self.cx:g}, {self.cy:g} px of a "
+                f"{w} x {h} px image is nearly singular: condition number {condition:.3g}, accepted up to "
+                f"{MAX_CONDITION:.3g}; give focal lengths and principal point in px"
+            )
 
     @property
     def is_distorted(self) -> bool:

@@ -100,3 +100,19 @@ def test_individual_stays_between_zero_and_one(low, span, shares):
     assert ((found >= 0) & (found <= 1)).all()
     order = np.argsort(depth, kind="stable")
     assert (np.diff(found[0][order]) >= 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("span_mm", [1e-3, 1.0, 200.0])
+def test_a_range_that_is_no_float32_costs_no_digits(dtype, span_mm):
+    depth = np.linspace(1700.1, 1700.1 + span_mm, 60).reshape(6, 10).astype(dtype)
+    low, high = 1700.1 + span_mm / 7, 1700.1 + span_mm * 6 / 7
+    exact = (depth.astype(np.longdouble) - low) / (np.longdouble(high) - low)
+    np.testing.assert_allclose(normalise(depth, "individual", low, high), exact.astype(float), rtol=3e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("span_mm", [1e-30, 1e-40, 1e-300])
+def test_a_range_below_single_precision_is_not_divided_by_zero(span_mm):
+    depth = np.linspace(0, span_mm, 60).reshape(6, 10)
+    found = normalise(depth, "individual", 0.0, span_mm)
+    np.testing.assert_allclose(found.ravel(), np.linspace(0, 1, 60), atol=1e-7)

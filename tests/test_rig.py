@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.frames import Sequence
+from fpp_ml_bench.lens import distort, fold_radius_squared, undistort
 from fpp_ml_bench.rig import Pinhole, Rig, paper_rig
 from fpp_ml_bench.rig_io import load_rig, rig_from_dict, rig_to_dict, rotation_matrix, save_rig
 
@@ -220,3 +221,17 @@ def test_a_projector_that_looks_away_is_told_so():
     away = Rig(paper_rig().camera, paper_rig().projector, rotation_matrix((0.0, np.pi, 0.0)), (0.1, 0.0, 0.0))
     with pytest.raises(RigError, match="does not look at"):
         away.check_sampling()
+
+
+@pytest.mark.parametrize("intrinsics", [(5e-324, 479.5), (1e-6, 479.5), (1e12, 479.5), (2e3, 1e12)])
+def test_a_nearly_singular_intrinsic_matrix_is_refused(intrinsics):
+    focal, centre = intrinsics
+    with pytest.raises(RigError, match="nearly singular: condition number"):
+        Pinhole(960, 960, focal, focal, centre, centre)
+
+
+def test_a_lens_that_flattens_out_is_inverted_wherever_it_has_an_inverse():
+    coefficients = (0.6, 0.9, 0.0, 0.0, -0.3)  # Newton from the distorted point itself misses some of these
+    ideal = np.linspace(0.01, 0.98, 400) * np.sqrt(fold_radius_squared(coefficients))
+    distorted = distort(ideal, np.zeros_like(ideal), coefficients)
+    np.testing.assert_allclose(undistort(*distorted, coefficients)[0], ideal, rtol=1e-10)
