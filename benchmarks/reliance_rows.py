@@ -14,14 +14,20 @@ an interrupted run goes on. Rows of other methods or of weights that are not her
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping
-from hashlib import sha256
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneBook
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
+from fpp_ml_bench.baselines.inference import fringe_batch, probed, represent
 from fpp_ml_bench.baselines.methods import METHODS, Method, method
+from fpp_ml_bench.baselines.metric_twin import TWINS
 from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.network_method import NetworkMethod
 from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
@@ -30,6 +36,7 @@ from fpp_ml_bench.evaluation.reliance import RELIANCE_VERSION
 from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
 from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.normalisation import denormalise
 
 REFUSED = 2
 
@@ -41,13 +48,51 @@ def weights_by_hash(runs: list[Path]) -> dict[str, Path]:
     return {sha256(path.read_bytes()).hexdigest(): path for path in files}
 
 
+class OnePass:
+    """A network's answers to an image in every depth range, from one pass; the rows of one network share them."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self._kept: dict[bytes, dict[str | None, NDArray[np.float32]]] = {}
+
+    def answer(self, fringe: NDArray[np.uint8], depth_range: str | None) -> NDArray[np.float32]:
+        """As `NetworkMethod.predict` in that depth range."""
+        model, key = self.model, blake2b(fringe.tobytes()).digest()
+        if key not in self._kept:
+            batch = fringe_batch([fringe], model.config.image_size, model.config.name)
+            with torch.inference_mode(), probed(model.network) as probe:
+                values = represent(model.network, batch, model.config.name).float()
+                found: dict[str | None, torch.Tensor] = {"oracle": values}
+                if model.config.normalisation != "individual":
+                    mm = denormalise(values.numpy(), model.config.normalisation, 0.0, 0.0)
+                    found[None] = torch.from_numpy(mm.astype(np.float32))
+                elif model.heads is not None:
+                    found |= {twin: model.heads.depth_mm(values, probe, twin) for twin in TWINS}
+            self._kept[key] = {name: answer[0, 0].numpy() for name, answer in found.items()}
+        return self._kept[key][depth_range]
+
+
+class SharedPass(NetworkMethod):
+    """A `NetworkMethod` whose answers come from a pass that its twins share."""
+
+    def __init__(self, once: OnePass, depth_range: Any, frame: Any) -> None:
+        super().__init__(once.model, depth_range, frame)
+        self._once = once
+
+    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
+        fringe = frames[self.frame]
+        if fringe is None:
+            raise FppBenchError(f"{self.name} needs frame {self.frame}")
+        return self._once.answer(fringe, self.depth_range)
+
+
 class Bench:
     """Datasets, weights and scenes, each opened once."""
 
     def __init__(self, data: list[Path], runs: list[Path], views: int) -> None:
         self.books = [SceneBook(DatasetFolder(folder), views) for folder in data]
         self.weights = weights_by_hash(runs)
-        self._model: tuple[str, Model] | None = None
+        self._pass: tuple[str, OnePass] | None = None
 
     def book_of(self, entry: Entry, anywhere: bool) -> SceneBook:
         """The scenes of the row's own data; of the first dataset where it is not given and ``anywhere`` will do."""
@@ -69,9 +114,10 @@ class Bench:
         if not isinstance(wanted, str) or wanted not in self.weights:
             raise FppBenchError("its weights are not here" if wanted else "not a method of this package")
         book = self.book_of(entry, anywhere=False)
-        if self._model is None or self._model[0] != wanted:
-            self._model = wanted, load(self.weights[wanted], "cpu")
-        return NetworkMethod(self._model[1], about.settings.get("depth_range"), about.settings.get("frame")), book  # type: ignore[arg-type]
+        if self._pass is None or self._pass[0] != wanted:
+            self._pass = wanted, OnePass(load(self.weights[wanted], "cpu"))
+        once, settings = self._pass[1], about.settings
+        return SharedPass(once, settings.get("depth_range"), settings.get("frame")), book
 
 
 def _options(settings: Mapping[str, Any]) -> dict[str, Any]:

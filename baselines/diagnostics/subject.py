@@ -39,7 +39,8 @@ class Subject:
     ``network`` takes (B, 1, H, W) in [0, 1] of the one frame in ``frames_used`` and puts out depth in the
     representation ``normalisation``; it and what belongs to it are None for a method without a network. ``layer_names``
     are the layers that probes look into, in forward order. ``untrained(seed)`` is the same architecture with random
-    weights; ``find_layers`` gives the layers of any network of that architecture by name.
+    weights; ``find_layers`` gives the layers of any network of that architecture by name. ``weights_sha256`` is that of
+    its weights file.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Subject:
     layer_names: tuple[str, ...] = ()
     find_layers: "Callable[[nn.Module], dict[str, nn.Module]] | None" = None
     untrained: "Callable[[int], nn.Module] | None" = None
+    weights_sha256: str | None = None
 
     @property
     def layers(self) -> "dict[str, nn.Module]":
@@ -229,6 +231,7 @@ def subject_of_network(found: Any, dataset: "DatasetFolder", layers: Sequence[st
         layer_names=names,
         find_layers=lambda network: network.probe_layers,  # type: ignore[return-value]
         untrained=untrained,
+        weights_sha256=model.sha256,
     )
 
 
