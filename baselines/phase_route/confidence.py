@@ -6,6 +6,8 @@ carries on instead of averaging. The order: a margin of belief is a chance of be
 mm. A confidence of 1 / (1 + error / 5 mm) puts it between 0 and 1.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +52,10 @@ def phase_uncertainty_rad(
     return sigma_phase * (0.3 + rim) + steep * rim
 
 
-def clipped_share(grey: Image, fit: FringeFit, inside: NDArray[np.bool_], window: Window) -> Image:
-    """Saturated share of the window's weight on the object, float32 (h, w)."""
-    clipped = window.moment(((grey >= GREY_LEVELS) & inside).astype(np.float32))
+def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.bool_], window: Window) -> Image:
+    """Share of the window's weight on the object that is saturated in any of the frames, float32 (h, w)."""
+    anywhere = np.any([grey >= GREY_LEVELS for grey in greys], axis=0)
+    clipped = window.moment((anywhere & inside).astype(np.float32))
     return clipped / np.maximum(fit.weight, 1e-3)
 
 

@@ -46,7 +46,7 @@ class Background:
 
     ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
     ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
-    the calibrated constants had to do.
+    the calibrated constants had to do; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
     """
 
     ambient_grey: float
@@ -54,6 +54,7 @@ class Background:
     noise_grey: float
     residual: NDArray[np.float32]
     share: float
+    weights: tuple[float, ...] = ()
 
 
 class EmptyScene:
@@ -72,6 +73,8 @@ class EmptyScene:
         phase = layer.absolute_phase(rig.background_m * MM_PER_M)
         light = np.nan_to_num(fall_off(rig, rig.background_m) * (0.5 + 0.5 * np.cos(phase)))
         self._light = light
+        self._rays, self._phase = (x, y), phase
+        self._fall_off = fall_off(rig, rig.background_m)
         self._terms = [
             np.nan_to_num(light * term).astype(np.float32) for term in (np.ones_like(x), x, y, x * x, x * y, y * y)
         ]
@@ -93,7 +96,7 @@ class EmptyScene:
         share = float(good.mean())
         if share < LEAST_SHARE:
             residual = grey - self.ambient_grey - self.strength * self._terms[0]
-            return Background(self.ambient_grey, self.strength, self.noise_grey, residual, 0.0)
+            return Background(self.ambient_grey, self.strength, self.noise_grey, residual, 0.0, (self.strength,))
         t = self._tile
         chosen = np.zeros(image.shape, dtype=bool)
         chosen[: good.shape[0] * t, : good.shape[1] * t] = good.repeat(t, axis=0).repeat(t, axis=1)
@@ -106,7 +109,18 @@ class EmptyScene:
         residual = grey - np.float32(solution[0])
         for weight, term in zip(solution[1:], self._terms, strict=True):
             residual -= np.float32(weight) * term
-        return Background(float(solution[0]), float(solution[1]), noise, residual, share)
+        return Background(float(solution[0]), float(solution[1]), noise, residual, share, tuple(solution[1:]))
+
+    def predicted(self, background: Background, shift_rad: float, where: tuple[slice, slice]) -> NDArray[np.float32]:
+        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose fringe is shifted by
+        ``shift_rad``, in the light that ``background`` was fitted to."""
+        x, y = (axis[where] for axis in self._rays)
+        terms = (np.ones_like(x), x, y, x * x, x * y, y * y)
+        lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
+        fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
+        return np.float32(background.ambient_grey) + np.nan_to_num(lamp * self._fall_off[where] * fringe).astype(
+            np.float32
+        )
 
     def _background_tiles(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""

@@ -10,6 +10,7 @@ filtered along rows and columns. The window never reaches across the object mask
 what costs them twice the error (docs/phase_route.md).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -100,21 +101,30 @@ def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, wi
     return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
 
 
-def fringe_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: Image, ambient: float, window: Window) -> FringeFit:
-    """Fit of g (1 + cos(carrier + d)), g a plane, around each pixel of ``grey`` float32 (H, W)."""
+def fringe_fit(
+    greys: Sequence[Image], inside: NDArray[np.bool_], carrier_rad: Image, ambient: float, window: Window,
+    shifts_rad: Sequence[float] = (0.0,),
+) -> FringeFit:  # fmt: skip
+    """Fit of g (1 + cos(carrier + shift + d)), g a plane, around each pixel of ``greys``, float32 (H, W) each: one
+    image, or several whose fringes are shifted by ``shifts_rad``."""
     weight = inside.astype(np.float32)
-    light = (grey - np.float32(ambient)) * weight
-    raised, sine = 1 + np.cos(carrier_rad), np.sin(carrier_rad)
+    zero = np.zeros_like(weight)
+    rr, rs, ss, lr, ls = zero, zero, zero, zero, zero
+    for grey, shift in zip(greys, shifts_rad, strict=True):
+        angle = carrier_rad + np.float32(shift)
+        light = (grey - np.float32(ambient)) * weight
+        raised, sine = 1 + np.cos(angle), np.sin(angle)
+        rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
+        lr, ls = lr + light * raised, ls + light * sine
     m = window.moment
-    rr, rs = weight * raised * raised, weight * raised * sine
     r00 = m(rr)
     matrix = [
         [r00, m(rr, 1, 0), m(rr, 0, 1), m(rs)],
         [r00, m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
         [r00, r00, m(rr, 0, 2), m(rs, 0, 1)],
-        [r00, r00, r00, m(weight * sine * sine)],
+        [r00, r00, r00, m(ss)],
     ]
-    right = [m(light * raised), m(light * raised, 1, 0), m(light * raised, 0, 1), m(light * sine)]
+    right = [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)]
     g, gx, gy, s = solve_symmetric(matrix, right)
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
     scale = np.float32(1 / window.sigma_px)

@@ -1,4 +1,4 @@
-"""The phase route as a method of ``fpp-bench predict``: one captured fringe, metric depth, nothing learned."""
+"""The phase route as a method of ``fpp-bench predict``: one captured fringe or a few, metric depth, nothing learned."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from fpp_ml_bench.rig import Rig
 
 
 class PhaseMethod:
-    """Depth from the first sinusoid of one direction; options are those of `Settings`.
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`.
 
     Raises `PredictionError` for an option that there is not or a value it can't have.
     """
@@ -33,13 +33,16 @@ class PhaseMethod:
 
     @property
     def frames_used(self) -> tuple[int, ...]:
-        """The one frame that must be captured."""
-        return (self.rig.sequence.sinusoids(self.options.direction)[0],)
+        """The frames that must be captured."""
+        sinusoids = self.rig.sequence.sinusoids(self.options.direction)
+        return tuple(sinusoids[step] for step in self.route.steps)
 
     @property
     def title(self) -> str:
         cues = ["range"] + ["shading"] * self.options.shading + ["standoff"] * (self.options.prior == "standoff")
-        return f"Phase route, one {self.options.direction} fringe, order by {' + '.join(cues)}, nothing learned"
+        many = len(self.frames_used)
+        count = f"one {self.options.direction} fringe" if many == 1 else f"{many} {self.options.direction} fringes"
+        return f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -47,11 +50,14 @@ class PhaseMethod:
 
     def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
         """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""
-        (index,) = self.frames_used
-        image = frames[index] if index < len(frames) else None
-        if image is None:
-            raise DecodeError(f"frame {index} is missing: the phase route needs that one fringe")
-        return self.route.measure(image)
+        images = []
+        for index in self.frames_used:
+            image = frames[index] if index < len(frames) else None
+            if image is None:
+                needed = "that one fringe" if len(self.frames_used) == 1 else f"frames {self.frames_used}"
+                raise DecodeError(f"frame {index} is missing: the phase route needs {needed}")
+            images.append(image)
+        return self.route.measure(images)
 
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""

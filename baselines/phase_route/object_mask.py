@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background
+from fpp_ml_bench.decode_blocks import MIN_MODULATION
 
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background: noise alone does it to one in 2,000, which stay alone."""
@@ -20,6 +21,9 @@ OBJECT_BONUS = 4.0
 UNLIT_PERIODS = 0.8
 UNLIT_SIGMAS = 4.0
 """Brightest grey level, above ambient light, of what counts as unlit."""
+DARKEST_GREY = MIN_MODULATION / 4
+"""What is object and modulated less than this has no fringe at all: it lies in shadow or faces away, and gets no
+depth."""
 LEAST_AREA_PERIODS = 0.1
 """Smallest object, and largest hole that is closed, in squares of one period."""
 

@@ -32,16 +32,17 @@ class Stopwatch:
 class Observation:
     """Everything measured around the object; maps (h, w) of the part ``crop`` of an image of ``shape`` (H, W).
 
-    ``grey`` float32 grey levels of the first frame; ``inside``: object; ``layer``: calibration layer of the crop;
-    ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in [-pi, pi]; ``residual_rad``:
-    what is left of it when the phase at infinity is taken off, wrapped; ``slopes``: its change a px along x and y;
-    ``uncertainty_rad`` float32: of the phase, order aside; ``clipped`` float32: share of the window's weight that is
-    saturated; ``candidates``: the orders that the working range allows; ``question``: the same on a grid, for a
-    `Chooser`. An image without an object has a crop of one pixel that is not ``inside``.
+    ``frames``: how many were captured; ``grey`` float32 grey levels of the first; ``inside``: object; ``layer``:
+    calibration layer of the crop; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase
+    in [-pi, pi]; ``residual_rad``: what is left of it when the phase at infinity is taken off, wrapped; ``slopes``: its
+    change a px along x and y; ``uncertainty_rad`` float32: of the phase, order aside; ``clipped`` float32: share of
+    the window's weight that is saturated; ``candidates``: the orders that the working range allows; ``question``: the
+    same on a grid, for a `Chooser`. An image without an object has a crop of one pixel that is not ``inside``.
     """
 
     shape: tuple[int, int]
     crop: Crop
+    frames: int
     background: Background
     grey: Image
     inside: NDArray[np.bool_]

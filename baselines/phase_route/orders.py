@@ -28,13 +28,18 @@ EVIDENCE_PERIODS = 2.0
 """Side of the square over which evidence for an order is averaged: one pixel's brightness alone proves nothing."""
 LEAST_BRIGHTNESS = 1e-3
 """Least irradiance whose logarithm is taken, 1/m^2: a surface turned away."""
+JUMP_RAD_PER_PX, JUMP_LOG_PER_PX = 0.1, 0.06
+"""Change of residual phase, and of log brightness, from which on two pixels that were measured one by one lie on two
+surfaces; and what their link then still weighs."""
+JUMP_WEIGHT = 0.05
 
 
 @dataclass(frozen=True)
 class Question:
     """K candidates a pixel on the grid (h, w), nearest order first: ``residual_rad``, ``depth_mm``, ``exists`` and
     ``irradiance`` (1/m^2) are (K, h, w); ``brightness``: measured, in the same 1/m^2; ``trust`` 0 to 1: how much the
-    brightness says there (rims and dark slopes say little); ``inside``: object; ``stride``: image px a grid step.
+    brightness says there (rims and dark slopes say little); ``inside``: object; ``stride``: image px a grid step;
+    ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree, None for everywhere.
     """
 
     residual_rad: Image
@@ -46,6 +51,8 @@ class Question:
     inside: NDArray[np.bool_]
     stride: int
     period_px: float
+    smooth_x: Image | None = None
+    smooth_y: Image | None = None
 
 
 Chooser = Callable[[Question, Rig, Settings], tuple[NDArray[np.int32], Image]]
@@ -63,8 +70,10 @@ def ask(
     crop: tuple[slice, slice],
     strength: float,
     period_px: float,
+    sharp: bool = False,
 ) -> Question:
-    """The question for a part of the image: arrays (H, W) of the pixels ``crop``; ``strength`` from `Background`."""
+    """The question for a part of the image: arrays (H, W) of the pixels ``crop``; ``strength`` from `Background`;
+    ``sharp``: whether every pixel was measured alone, so that a jump from one to the next is seen."""
     stride = max(1, round(period_px / NODES_PER_PERIOD))
     grid = (slice(None, None, stride), slice(None, None, stride))
     here = layer.at(grid)
@@ -80,7 +89,24 @@ def ask(
     seen = fit.brightness[grid] / np.float32(strength / 2)
     trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * np.clip(seen * rig.standoff_m**2, 0.02, 1) ** 2
     exists = np.stack([k < count for k in steps])
-    return Question(residual, depth, exists, light, seen, trust.astype(np.float32), inside[grid], stride, period_px)
+    smooth = _smooth_links(residual[0], seen, stride) if sharp else (None, None)
+    return Question(
+        residual, depth, exists, light, seen, trust.astype(np.float32), inside[grid], stride, period_px, *smooth
+    )
+
+
+def _smooth_links(residual_rad: Image, seen: Image, stride: int) -> tuple[Image, Image]:
+    """Weights of the links along x (h, w - 1) and y (h - 1, w): less where the surface visibly jumps."""
+    log = np.log(np.maximum(seen, LEAST_BRIGHTNESS))
+    links = []
+    for axis in (1, 0):
+        change = np.diff(residual_rad, axis=axis)
+        change -= np.float32(TAU) * np.rint(change / np.float32(TAU))
+        jump = (np.abs(change) > JUMP_RAD_PER_PX * stride) | (
+            np.abs(np.diff(log, axis=axis)) > JUMP_LOG_PER_PX * stride
+        )
+        links.append(np.where(jump, np.float32(JUMP_WEIGHT), np.float32(1)))
+    return links[0], links[1]
 
 
 def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) -> tuple[NDArray[np.int32], Image]:
@@ -106,6 +132,8 @@ def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) 
     link_x, link_y = (
         (a & b).astype(np.float32) for a, b in ((inside[:, 1:], inside[:, :-1]), (inside[1:], inside[:-1]))
     )
+    if question.smooth_x is not None and question.smooth_y is not None:
+        link_x, link_y = link_x * question.smooth_x, link_y * question.smooth_y
     choice, margin = least_energy(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
     return choice, np.minimum(margin / np.float32(settings.jump_rad), _evidence(proof, choice, question))
 

@@ -4,22 +4,35 @@ Each stage is a function of its own module; this one hands arrays from one to th
 the rig alone is made once.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import confidence, orders
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, orders_in_range
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background, EmptyScene
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, fringe_fit
+from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement, Reason
-from fpp_ml_bench.baselines.phase_route.object_mask import object_region, refined, unlit
+from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, object_region, refined, unlit
 from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation, Stopwatch
 from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.phase_route.several_frames import (
+    PIXELWISE,
+    differs,
+    first_mask,
+    measure_pixels,
+    pair_fit,
+    pixel_uncertainty_rad,
+    steps_of,
+)
 from fpp_ml_bench.baselines.phase_route.shading import phase_slopes, wrapped
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decode_blocks import MIN_MODULATION
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.rig import Rig
+
+Image = NDArray[np.float32]
+Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 MARGIN_PERIODS = 0.5
 """Of the crop around the object: no window is needed beyond, the mask may grow into it."""
@@ -27,9 +40,8 @@ RING_PERIODS = 0.14
 """How far from the first mask's silhouette a pixel may change sides."""
 FRINGE_NOISE = 0.03
 """Uncertainty of a fringe carried on beyond its window, as a share of its brightness."""
-
-DARKEST_GREY = MIN_MODULATION / 4
-"""What is object and darker than this has no fringe at all: it lies in shadow or faces away, and gets no depth."""
+PAIR_ROUNDS = 2
+"""Fits to two frames over the small window."""
 
 
 class PhaseRoute:
@@ -48,9 +60,13 @@ class PhaseRoute:
         self._windows = [
             Window(share * self.period_px) for share in (self.settings.first_window, self.settings.second_window)
         ]
+        self.steps = steps_of(rig.sequence.steps, self.settings.frames)
+        self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
+        if self.settings.frames == 2:
+            self._windows += [Window(self.settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
-    def measure(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Measurement:
-        """Depth and all that it came from, of one captured fringe, uint8 (H, W).
+    def measure(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Measurement:
+        """Depth and all that it came from, of one captured fringe, uint8 (H, W), or of the frames of ``steps``.
 
         ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
         """
@@ -61,31 +77,25 @@ class PhaseRoute:
         )
         return self.conclude(seen, order, margin)
 
-    def observe(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Observation:
-        """Mask, phase and candidate orders of one captured fringe, uint8 (H, W); arguments as of `measure`."""
-        shape = (self.rig.camera.height, self.rig.camera.width)
-        if np.asarray(image).dtype != np.uint8 or np.shape(image) != shape:
-            raise DecodeError(
-                f"expected a fringe of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
-                f"{np.asarray(image).dtype} {np.shape(image)}; use rig.scaled(width) for a resized image"
-            )
+    def observe(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Observation:
+        """Mask, phase and candidate orders of captured fringes; arguments as of `measure`."""
+        images = self._checked(image)
         watch = Stopwatch()
-        background = self._scene.fit(image)
+        background = self._scene.fit(images[0])
         watch.done("background")
         region = object_region(background, self.period_px) if mask is None else mask
         crop = self._crop(region)
-        grey, inside = image[crop].astype(np.float32), region[crop]
-        if mask is None:
-            dark = unlit(grey, background.ambient_grey, background.noise_grey, self.period_px)
-            inside = inside & ~dark
         watch.done("mask")
+        greys = [one[crop].astype(np.float32) for one in images]
+        given = None if mask is None else mask[crop]
         layer = self.layer.at(crop)
-        fit = self.fit_phase(grey, inside, self._carrier[crop], background)
-        watch.done("phase")
-        if mask is None:
-            inside = self._refine(grey, inside, fit, background, crop)
-            inside &= ~dark & (fit.brightness > DARKEST_GREY)
-            watch.done("mask")
+        mean_grey = None
+        if len(greys) < PIXELWISE:
+            inside, fit = self._locally(greys, region[crop], given, background, crop, watch)
+        else:
+            inside, fit, mean_grey = measure_pixels(
+                greys, self.shifts_rad, given, self._scene, background, crop, self._windows[1], self.period_px, watch
+            )
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
@@ -93,17 +103,35 @@ class PhaseRoute:
         slack = self.settings.slack_mm
         candidates = orders_in_range(layer, phase, (near - slack, far + slack))
         question = orders.ask(
-            phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px
-        )
-        watch.done("candidates")
-        window = self._windows[1]
-        uncertainty = confidence.phase_uncertainty_rad(grey, fit, inside, slopes, background, window)
-        clipped = confidence.clipped_share(grey, fit, inside, window)
-        watch.done("confidence")
-        return Observation(
-            shape, crop, background, grey, inside, layer, fit, phase, residual, slopes, uncertainty, clipped,
-            candidates, question, watch,
+            phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px,
+            sharp=mean_grey is not None,
         )  # fmt: skip
+        watch.done("candidates")
+        if mean_grey is None:
+            uncertainty = confidence.phase_uncertainty_rad(greys[0], fit, inside, slopes, background, self._windows[-1])
+        else:
+            uncertainty = pixel_uncertainty_rad(fit, mean_grey, self.shifts_rad, background)
+        clipped = confidence.clipped_share(greys, fit, inside, self._windows[1])
+        watch.done("confidence")
+        shape = images[0].shape
+        return Observation(
+            (shape[0], shape[1]), crop, len(greys), background, greys[0], inside, layer, fit, phase, residual, slopes,
+            uncertainty, clipped, candidates, question, watch,
+        )  # fmt: skip
+
+    def _checked(self, image: Frames) -> list[NDArray[np.uint8]]:
+        """The frames, as many as the settings say."""
+        images = [image] if isinstance(image, np.ndarray) and image.ndim == 2 else list(image)
+        shape = (self.rig.camera.height, self.rig.camera.width)
+        if len(images) != len(self.steps):
+            raise DecodeError(f"expected {len(self.steps)} fringes, those of steps {self.steps}, got {len(images)}")
+        for one in images:
+            if np.asarray(one).dtype != np.uint8 or np.shape(one) != shape:
+                raise DecodeError(
+                    f"expected a fringe of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
+                    f"{np.asarray(one).dtype} {np.shape(one)}; use rig.scaled(width) for a resized image"
+                )
+        return images
 
     def conclude(self, seen: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
         """The measurement that an ``order`` int32 for each pixel of the observation's crop (h, w) makes of it;
@@ -125,12 +153,34 @@ class PhaseRoute:
         seen.watch.done("confidence")
         return self._whole(seen, order, sure, error_mm, depth_mm, reason)
 
+    def _locally(
+        self, greys: Sequence[Image], region: NDArray[np.bool_], mask: NDArray[np.bool_] | None, background: Background,
+        crop: Crop, watch: Stopwatch,
+    ) -> tuple[NDArray[np.bool_], FringeFit]:  # fmt: skip
+        """Object mask and local fits of one or two frames; ``region``: where the first of them differs."""
+        if mask is not None:
+            fit = self.fit_phase(greys, mask, self._carrier[crop], background)
+            watch.done("phase")
+            return mask, fit
+        dark = unlit(np.maximum.reduce(greys), background.ambient_grey, background.noise_grey, self.period_px)
+        if len(greys) > 1:
+            region = first_mask(differs(greys, self.shifts_rad, self._scene, background, crop), self.period_px)
+        inside = region & ~dark
+        watch.done("mask")
+        fit = self.fit_phase(greys, inside, self._carrier[crop], background)
+        watch.done("phase")
+        if len(greys) == 1:
+            inside = self._refine(greys[0], inside, fit, background, crop)
+        inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
+        watch.done("mask")
+        return inside, fit
+
     def fit_phase(
-        self, grey: NDArray[np.float32], inside: NDArray[np.bool_], carrier: NDArray, background: Background
+        self, greys: Sequence[Image], inside: NDArray[np.bool_], carrier: NDArray, background: Background
     ) -> FringeFit:
-        """Both local fits; arrays (h, w) of one part of the image."""
-        first = carrier_fit(grey, inside, carrier, self._windows[0])
-        return fringe_fit(grey, inside, first, background.ambient_grey, self._windows[1])
+        """The local fits to one or two frames; arrays (h, w) of one part of the image."""
+        first = carrier_fit(greys[0], inside, carrier, self._windows[0])
+        return pair_fit(greys, self.shifts_rad, inside, first, background.ambient_grey, self._windows[1:])
 
     def _crop(self, region: NDArray[np.bool_]) -> Crop:
         rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
