@@ -18,9 +18,11 @@ from fpp_ml_bench.leaderboard.page_scatter import front_rows, scatter_svg
 from fpp_ml_bench.leaderboard.page_submission import submission_page
 from fpp_ml_bench.leaderboard.page_table import badge, ranking_table
 from fpp_ml_bench.leaderboard.page_text import INTRODUCTION, SCATTER_KEY, paper_section, reading_section
+from fpp_ml_bench.leaderboard.page_tradeoff import tradeoff_section
 from fpp_ml_bench.leaderboard.paper import PaperTable
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, Group
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
+from fpp_ml_bench.leaderboard.tradeoff_points import Tradeoff
 from fpp_ml_bench.loaders.manifest import write_atomically
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
@@ -35,13 +37,15 @@ GIVEN = {
 _FRAME_LIMITS = (1, 2, 12, 25)
 
 
-def write_page(groups: Sequence[Group], papers: Sequence[PaperTable], out: Path) -> list[Path]:
-    """Write the page of ``groups`` (ranked by `DEFAULT_SORT`) and the paper's tables into folder ``out``.
+def write_page(
+    groups: Sequence[Group], papers: Sequence[PaperTable], out: Path, tradeoff: Tradeoff | None = None
+) -> list[Path]:
+    """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``.
 
     Returns the files written. Pages of submissions that are no longer in it are removed, nothing else is. Raises
     SubmissionError where a file can't be written.
     """
-    files = page_files(groups, papers)
+    files = page_files(groups, papers, tradeoff)
     try:
         (out / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -54,15 +58,18 @@ def write_page(groups: Sequence[Group], papers: Sequence[PaperTable], out: Path)
     return [out / name for name in files]
 
 
-def page_files(groups: Sequence[Group], papers: Sequence[PaperTable]) -> dict[str, bytes]:
+def page_files(
+    groups: Sequence[Group], papers: Sequence[PaperTable], tradeoff: Tradeoff | None = None
+) -> dict[str, bytes]:
     """Relative name -> content of every file of the page."""
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
-    body = _header(groups) + '<main id="main">\n' + _filters(groups)
+    settings = tradeoff_section(tradeoff)
+    body = _header(groups, bool(settings)) + '<main id="main">\n' + _filters(groups)
     body += "".join(_group_section(group, slugs, number) for number, group in enumerate(groups))
     if not groups:
         body += "<section><h2>No submission yet</h2><p>The first one is one JSON file away: see below.</p></section>\n"
-    body += paper_section(papers) + reading_section() + "</main>\n"
+    body += settings + paper_section(papers) + reading_section() + "</main>\n"
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
     files = {INDEX: index, DATA: table_json(groups, papers, DEFAULT_SORT)}
@@ -78,8 +85,9 @@ def slug(entry: Entry) -> str:
     return f"{plain}-{hashlib.sha256(result_json(entry.result)).hexdigest()[:12]}"
 
 
-def _header(groups: Sequence[Group]) -> str:
+def _header(groups: Sequence[Group], tradeoff: bool) -> str:
     links = [(f"#s{number}", _heading(group)) for number, group in enumerate(groups)]
+    links += [("#tradeoff", "Every setting against time")] if tradeoff else []
     links += [("#paper", "Reported by the paper"), ("#reading", "How to read this"), (DATA, "All figures as JSON")]
     items = "".join(f'<li><a href="{address}">{escaped(text)}</a></li>' for address, text in links)
     return f'<header>{INTRODUCTION}<nav aria-label="Sections"><ul class="links">{items}</ul></nav></header>\n'

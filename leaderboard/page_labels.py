@@ -17,7 +17,7 @@ _SHORTEST = 26
 
 @dataclass(frozen=True)
 class Named:
-    """A mark of radius ``r`` at (``x``, ``y``) px that wants its name beside it; ``slug`` is its row."""
+    """A mark of radius ``r`` at (``x``, ``y``) px that wants its name beside it; ``slug`` is its row, if it has one."""
 
     name: str
     slug: str
@@ -48,9 +48,9 @@ def label_texts(marks: Sequence[Named], lines: Sequence[Box], inside: Box) -> li
         box, anchor = (clear or free)[0]
         taken.append(box)
         x = {"start": box[0], "end": box[2], "middle": (box[0] + box[2]) / 2}[anchor]
+        row = f' data-row="{mark.slug}"' if mark.slug else ""
         parts.append(
-            f'<text class="name" data-row="{mark.slug}" x="{x:.1f}" y="{box[1] + 11.5:.1f}" '
-            f'text-anchor="{anchor}">{escaped(text)}</text>'
+            f'<text class="name"{row} x="{x:.1f}" y="{box[1] + 11.5:.1f}" text-anchor="{anchor}">{escaped(text)}</text>'
         )
     return parts
 

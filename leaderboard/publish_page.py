@@ -11,6 +11,7 @@ from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.publish import MARK, Publication, mark_bytes, staged_files
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.tradeoff_points import shipped_tradeoff
 
 _README = "README.md"
 _SUFFIXES = frozenset(
@@ -41,7 +42,8 @@ def write_page_of(results: Sequence[Path], folder: Path) -> None:
     no sound result.
     """
     rows = expand(results) if results else shipped_rows()
-    write_page(rank(read_entries(rows)), chosen_tables(None), folder)
+    settings = None if results else shipped_tradeoff()
+    write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
 
 
 def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:

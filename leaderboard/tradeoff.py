@@ -104,10 +104,9 @@ def _ladders(views: StoredViews, wish: Wish) -> Iterator[Ladder]:
         from fpp_ml_bench.leaderboard.tradeoff_ladders import frame_ladders, pixel_ladders
         from fpp_ml_bench.leaderboard.tradeoff_ladders_rows import row_ladders
 
-        # Networks last: torch, once imported, stays.
         yield from row_ladders(views.rig, wish.quick)
         yield from frame_ladders(views.rig, wish.quick)
-        yield from pixel_ladders(views.rig, "networks" in wish.groups or not wish.only, wish.quick)
+        yield from pixel_ladders(views.rig, wish.quick)
 
 
 def tradeoff(wish: Wish, plan: Plan, progress: Progress = lambda done: None) -> Tradeoff:

@@ -49,7 +49,8 @@ def draw_tradeoff(found: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm"
     threads = found.settings.get("threads")
     figure.suptitle(
         f"{found.dataset}, {width}x{height} px, {len(found.views)} test views, against {found.target}; "
-        f"{threads} thread(s) of {found.hardware.cpu}\ndashed: the front. Hollow: told the view's own depth range or mask, on no front",
+        f"{threads} thread(s) of {found.hardware.cpu}\n"
+        "dashed: the front. Hollow: told the view's own depth range or mask, on no front",
         fontsize=9,
     )
     by_time.legend(fontsize=7.5, loc="best", framealpha=0.85)

@@ -27,8 +27,8 @@ FRAMES_SIZE = 360
 BATCHES = (1, 2, 4, 8)
 
 
-def pixel_ladders(rig: Rig, networks: bool = True, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over image pixels, each on one view rendered at each size; ``networks``: a UNet too, which needs torch."""
+def pixel_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
+    """Stages over image pixels, each on one view rendered at each size; networks last, for torch, once there, stays."""
     sizes = QUICK_SIZES if quick else SIZES
     yield Ladder("render a view", "pixels", sizes, partial(_render, rig))
     yield Ladder("decode", "pixels", sizes, partial(_decode, rig))
@@ -36,9 +36,8 @@ def pixel_ladders(rig: Rig, networks: bool = True, quick: bool = False) -> Itera
     yield Ladder("decode: triangulate from both (NumPy)", "pixels", sizes, partial(_triangulate, rig))
     yield Ladder("phase route", "pixels", sizes, partial(_phase_route, rig))
     yield Ladder("score a view", "pixels", sizes, partial(_score, rig))
-    if networks:
-        yield Ladder("UNet width 8, untrained", "pixels", sizes, partial(_network, rig))
-        yield Ladder("UNet width 8, untrained", "rows", BATCHES[: 3 if quick else None], partial(_network_batch, rig))
+    yield Ladder("UNet width 8, untrained", "pixels", sizes, partial(_network, rig))
+    yield Ladder("UNet width 8, untrained", "rows", BATCHES[: 3 if quick else None], partial(_network_batch, rig))
 
 
 def frame_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:

@@ -30,7 +30,7 @@ ROW_OBJECTS, QUICK_ROW_OBJECTS = (8, 32, 128, 512), (4, 8, 16)
 """Objects of six rows each: 48 to 3,072 rows, ten times the benchmark's 300."""
 SCORED_OBJECTS = (8, 32, 128), QUICK_OBJECTS
 BOARD_ROWS, QUICK_BOARD = (8, 16, 32, 64, 128), (4, 8, 16)
-READ_FRAMES, READ_SIZES = (4, 13, 26, 52), (240, 480, 960)
+READ_FRAMES, READ_SIZES = (4, 13, 26, 52), (240, 360, 480, 720, 960)
 ROW_SIZE = 32
 BOARD_ROW = "classical-18-vertical.json"
 

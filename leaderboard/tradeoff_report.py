@@ -20,7 +20,9 @@ _POINT_FIELDS = tuple(name for name in Point.model_fields if name != "interval_m
 
 def write_report(found: Tradeoff, out: Path) -> list[Path]:
     """Write everything into folder ``out``; returns the files. SubmissionError where one can't be written."""
-    write_json(found.model_dump(mode="json", exclude_none=True), out / TRADEOFF_FILE)
+    content = found.model_dump(mode="json")
+    content["points"] = [point.model_dump(mode="json", exclude_none=True) for point in found.points]
+    write_json(content, out / TRADEOFF_FILE)
     written = [out / TRADEOFF_FILE]
     if found.points:
         written.append(_write(out / "tradeoff.csv", points_csv(found)))

@@ -44,6 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the static page of the shipped rows, or of those given: index.html, one page a submission",
     )
     parser.add_argument(
+        "--tradeoff", type=Path, metavar="FILE",
+        help="with --page: the tradeoff.json that stands on it (default: the one shipped, with the shipped rows)",
+    )  # fmt: skip
+    parser.add_argument(
         "--readme", type=Path, metavar="FILE",
         help="make the block between the leaderboard markers of this file anew, from the rows shipped with the package",
     )  # fmt: skip
@@ -74,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.check and args.readme is None:
         raise SubmissionError("--check asks about a README; give it with --readme FILE")
+    if args.tradeoff is not None and args.page is None:
+        raise SubmissionError("--tradeoff puts settings on a page; give it with --page DIR")
     if args.readme is not None:
         return _readme(args)
     if args.row is not None:
@@ -96,7 +102,11 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
     if args.page is not None:
-        written = write_page(rank(entries, DEFAULT_SORT), papers, args.page)
+        from fpp_ml_bench.leaderboard.tradeoff_points import read_tradeoff, shipped_tradeoff
+
+        shipped = None if args.results else shipped_tradeoff()
+        settings = shipped if args.tradeoff is None else read_tradeoff(args.tradeoff)
+        written = write_page(rank(entries, DEFAULT_SORT), papers, args.page, settings)
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
     show(*group_tables(groups, args.sort, output_width()), *paper_rich_tables(papers))
