@@ -5,7 +5,7 @@ and both directions it is the very process that made the ``depth`` column, so th
 anything about its error.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.decoding import Decoded, Directions, decode_stack
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.fewest import fewest_gray_bits
 from fpp_ml_bench.frames import DIRECTIONS, Direction
 from fpp_ml_bench.phase import choose_steps
 from fpp_ml_bench.rig import Rig
@@ -20,12 +21,15 @@ from fpp_ml_bench.rig import Rig
 
 @dataclass(frozen=True)
 class ClassicalMethod:
-    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned."""
+    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned.
+
+    ``fewest``: of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.fewest`)."""
 
     rig: Rig
     direction: Directions = "both"
     steps: int = 18
     threads: int = 1
+    fewest: bool = False
 
     name = "classical"
     uses_ground_truth_range = False
@@ -43,26 +47,45 @@ class ClassicalMethod:
         """Frames that must be captured, ascending."""
         sequence = self.rig.sequence
         used: list[int] = []
+        gray = self._gray_bits
         for direction in self.directions:
             sinusoids = sequence.sinusoids(direction)
             used += [sinusoids[n] for n in choose_steps(sequence.steps, self.steps)]
-            used += sequence.gray(direction)
+            bits = gray[direction]
+            used += [sequence.gray(direction)[bit] for bit in bits]
         return tuple(sorted(used))
 
     @property
     def title(self) -> str:
         which = "both directions" if self.direction == "both" else f"{self.direction} fringes"
-        return f"Classical {self.steps}-step + Gray code, {which}"
+        count = sum(map(len, self._gray_bits.values()))
+        if not self.fewest:
+            return f"Classical {self.steps}-step + Gray code, {which}"
+        return f"Classical {self.steps}-step, {which}, " + (f"{count} Gray frames" if count else "no Gray code")
 
     @property
-    def settings(self) -> dict[str, str | int]:
-        return {"direction": self.direction, "steps": self.steps, "threads": self.threads}
+    def _gray_bits(self) -> Mapping[Direction, tuple[int, ...]]:
+        """Gray bits that are captured, by direction."""
+        if self.fewest:
+            return fewest_gray_bits(self.rig, self.direction)
+        return {direction: tuple(range(self.rig.sequence.bits(direction))) for direction in self.directions}
+
+    @property
+    def settings(self) -> dict[str, str | int | bool]:
+        fewest: dict[str, str | int | bool] = {"fewest": True} if self.fewest else {}
+        return {"direction": self.direction, "steps": self.steps, "threads": self.threads, **fewest}
 
     def decode(self, frames: Sequence[NDArray[np.uint8] | None], reasons: bool = True) -> Decoded:
         """Full result of a captured sequence; frames that are not in `frames_used` may be None. ``reasons`` False is
         faster where only the depth is wanted: see `decode_stack`."""
         return decode_stack(
-            frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads, reasons=reasons
+            frames,
+            self.rig,
+            direction=self.direction,
+            steps=self.steps,
+            threads=self.threads,
+            reasons=reasons,
+            fewest=self.fewest,
         )
 
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:

@@ -4,7 +4,8 @@
 `verdict` here.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -78,11 +79,18 @@ class DirectionPlan:
     pitch_px: float
     length_px: int
     max_clipped_steps: int
+    known: Mapping[int, int] = field(default_factory=dict)
+    """Frames that need not be captured, because the grey level is the same wherever the camera can see, by index."""
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Indices of the frames in the order of its grey levels."""
+        return self.sinusoids + self.gray
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Indices of the frames it reads, in the order of its grey levels."""
-        return self.sinusoids + self.gray
+        """Indices of the frames it reads."""
+        return tuple(index for index in self.rows if index not in self.known)
 
 
 def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -> DirectionPlan:

@@ -192,3 +192,39 @@ def reach(  # type: ignore[no-untyped-def]
         margin = disagreement * math.sqrt(along * along + across * across) / abs(across) + slack
         outside = (coordinate[i] < min(begin, end) - margin) | (coordinate[i] > max(begin, end) + margin)
         reached[i] = not (outside & (first > 0.0) & (last > 0.0))
+
+
+@njit
+def joint_orders(  # type: ignore[no-untyped-def]
+    x, y, first, second, rotation, translation, axis, focal, centre, depths, pitches, tolerance, tries,
+    order_first, order_second, nearest,
+):  # fmt: skip
+    """`decode_fewest.nearest_pair`: fills the orders and ``nearest`` (px), float64 (n,). ``first`` and ``second``:
+    wrapped phases, of axis ``axis`` and of the other; ``depths`` in m, ``pitches`` in px: pairs in that order."""
+    other = 1 - axis
+    ta, tb, tz = translation[axis], translation[other], translation[2]
+    fa, fb, ca, cb = focal[axis], focal[other], centre[axis], centre[other]
+    near, far = depths
+    pa, pb = pitches
+    for i in range(len(x)):
+        a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
+        b = rotation[other, 0] * x[i] + rotation[other, 1] * y[i] + rotation[other, 2]
+        forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
+        q, r = near * forward + tz, far * forward + tz
+        nearest[i], order_first[i], order_second[i] = np.inf, 0.0, 0.0
+        if not ((q > 0.0) & (r > 0.0)):
+            continue
+        a_near, a_far = fa * (near * a + ta) / q + ca, fa * (far * a + ta) / r + ca
+        b_near, b_far = fb * (near * b + tb) / q + cb, fb * (far * b + tb) / r + cb
+        along, across = a_far - a_near, b_far - b_near
+        slope, share = across / along, abs(along) / math.sqrt(along * along + across * across)
+        low, high = min(a_near, a_far) - tolerance, max(a_near, a_far) + tolerance
+        start = math.ceil(low / pa - first[i] / _TAU)
+        for step in range(tries):
+            order = start + step
+            one = (first[i] + _TAU * order) * (pa / _TAU)
+            predicted = b_near + (one - a_near) * slope
+            found = math.floor(predicted / pb - second[i] / _TAU + 0.5)
+            off = abs((second[i] + _TAU * found) * (pb / _TAU) - predicted) * share
+            if (off < nearest[i]) & (one <= high):
+                nearest[i], order_first[i], order_second[i] = off, order, found

@@ -22,8 +22,10 @@ from fpp_ml_bench.decode_blocks import (
     plan_direction,
     verdict,
 )  # fmt: skip
+from fpp_ml_bench.decode_fewest import fewest_plans, with_orders, wrapped
 from fpp_ml_bench.decode_reach import reach_is_bounded, within_reach
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.fewest import JointCode
 from fpp_ml_bench.frame_check import check_frames
 from fpp_ml_bench.frames import DIRECTIONS, Direction
 from fpp_ml_bench.rig import Rig
@@ -116,6 +118,7 @@ def decode_stack(
     details: bool = False,
     threads: int = 1,
     reasons: bool = True,
+    fewest: bool = False,
 ) -> Decoded:
     """Depth in mm from a captured sequence.
 
@@ -138,9 +141,13 @@ def decode_stack(
     working range (`fpp_ml_bench.decode_reach`), or to have no coordinate, is not looked at in the other direction:
     depth is the same bit by bit, and its reason is the first direction's, or OUTSIDE_RANGE.
 
+    ``fewest``: read only the Gray frames that the rig's working range needs (`fpp_ml_bench.fewest`): with "both"
+    usually none, the orders then come from the two phases together. Where the depth is in range it is the same bit by
+    bit, but for pixels whose directions disagree by nearly as much as is allowed (`JointCode.tolerance_px`).
+
     Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane
-    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose
-    capture failed (`fpp_ml_bench.frame_check`).
+    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid
+    whose capture failed (`fpp_ml_bench.frame_check`).
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
@@ -151,6 +158,9 @@ def decode_stack(
     wanted = rig.sequence.steps if steps is None else steps
     asked: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
     plans = [plan_direction(rig, one, wanted, limits) for one in asked]
+    joint: JointCode | None = None
+    if fewest:
+        plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
     flat = _used_frames(frames, used, rig)
     shape = (rig.camera.height, rig.camera.width)
@@ -158,7 +168,7 @@ def decode_stack(
     for plan in plans:
         check_frames(flat, plan, chosen, rig.sequence)
     depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
-    image = _Image(flat, rig, plans, limits, chosen, details, depth_alone)
+    image = _Image(flat, rig, plans, limits, chosen, details, depth_alone and joint is None, joint)
     starts, second_px = range(0, image.pixels, BLOCK_PX), 0
     if threads == 1 or len(starts) < 2:
         for start in starts:
@@ -189,10 +199,11 @@ class _Image:
         chosen: NDArray[np.intp] | None,
         details: bool,
         depth_alone: bool,
+        joint: JointCode | None,
     ) -> None:
         size = rig.camera.height * rig.camera.width
         self.frames, self.rig, self.plans, self.limits, self.chosen = frames, rig, plans, limits, chosen
-        self.depth_alone = depth_alone
+        self.depth_alone, self.joint = depth_alone, joint
         self.pixels = size if chosen is None else len(chosen)
         self.depth_mm = np.zeros(size, dtype=np.float32)
         self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
@@ -207,38 +218,57 @@ class _Image:
         """Decode one block; returns of how many of its pixels every direction was looked at."""
         stop = min(start + BLOCK_PX, self.pixels)
         where = slice(start, stop) if self.chosen is None else self.chosen[start:stop]
-        first = self._coordinates(self.plans[0], where, stop - start)
+        found = {self.plans[0].direction: self._coordinates(self.plans[0], where, stop - start)}
         if self.depth_alone:
+            first = found[self.plans[0].direction]
             rays = self.rays[0][where], self.rays[1][where]
-            open_yet = within_reach(first.coordinate_px, rays, self.plans[0], self.rig, self.limits)
-            kept = np.flatnonzero(open_yet & (first.reason == 0))
-            if len(kept) <= WORTH_PICKING * (stop - start):
-                self.reason[where] = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
-                where = kept + start if self.chosen is None else self.chosen[start:stop][kept]
-                first, stop = first.at(kept), start + len(kept)
-        if stop == start:
-            return 0
-        found = {self.plans[0].direction: first}
+            reached = within_reach(first.coordinate_px, rays, self.plans[0], self.rig, self.limits)
+            no_depth = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
+            where, found = self._narrowed(start, where, found, reached & (first.reason == 0), no_depth)
+        looked_at = len(next(iter(found.values())).reason)
         for plan in self.plans[1:]:
-            found[plan.direction] = self._coordinates(plan, where, stop - start)
+            found[plan.direction] = self._coordinates(plan, where, looked_at)
+        if self.joint:
+            found = with_orders(found, (self.rays[0][where], self.rays[1][where]), self.rig, self.joint)
+            no_depth = np.minimum(*(np.where(one.reason == 0, Reason.NOT_ASKED, one.reason) for one in found.values()))
+            if not self.details:
+                where, found = self._narrowed(start, where, found, no_depth == Reason.NOT_ASKED, no_depth)
         rays = self.rays[0][where], self.rays[1][where]
         self.depth_mm[where], self.reason[where] = verdict(found, rays, self.plans, self.rig, self.limits)
         for direction, kept_details in self.details.items():
             one = found[direction]
             kept_details.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
             kept_details.modulation[where], kept_details.phase[where] = one.modulation, one.phase
-        return stop - start
+        return looked_at
+
+    def _narrowed(
+        self,
+        start: int,
+        where: slice | NDArray[np.intp],
+        found: dict[Direction, Coordinates],
+        open_yet: NDArray[np.bool_],
+        reason: NDArray[np.uint8],
+    ) -> tuple[slice | NDArray[np.intp], dict[Direction, Coordinates]]:
+        """A block reduced to its pixels that are ``open_yet``, where they are few; the others get their ``reason``."""
+        kept = np.flatnonzero(open_yet)
+        if len(kept) > WORTH_PICKING * len(open_yet):
+            return where, found
+        self.reason[where] = reason
+        there = kept + start if isinstance(where, slice) else where[kept]
+        return there, {direction: one.at(kept) for direction, one in found.items()}
 
     def _coordinates(self, plan: DirectionPlan, where: slice | NDArray[np.intp], count: int) -> Coordinates:
         """One direction at ``count`` pixels, its frames' grey levels gathered first."""
-        levels = np.empty((len(plan.frames), count), dtype=np.uint8)
-        for row, index in zip(levels, plan.frames, strict=True):
-            if isinstance(where, slice):
+        levels = np.empty((len(plan.rows), count), dtype=np.uint8)
+        for row, index in zip(levels, plan.rows, strict=True):
+            if index in plan.known:
+                row[:] = plan.known[index]
+            elif isinstance(where, slice):
                 row[:] = self.frames[index][where]
             else:
                 # Every index is one of the image's: "clip" only saves the check, and a copy with it.
                 self.frames[index].take(where, out=row, mode="clip")
-        return decode_direction(levels, plan, self.limits)
+        return wrapped(levels, plan, self.limits) if self.joint else decode_direction(levels, plan, self.limits)
 
     def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
         kept = self.details[direction]

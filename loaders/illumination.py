@@ -77,6 +77,13 @@ class LitPixels:
         )
 
 
+def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -> float:
+    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
+    by the inverse square of the distance."""
+    white = (lighting or Lighting()).white_grey
+    return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
+
+
 def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
     """The projector's centre of projection in camera coordinates, metres (3,)."""
     return -rig.R.T @ rig.t

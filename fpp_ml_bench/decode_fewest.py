@@ -1,0 +1,112 @@
+"""Decoding with the fewest Gray frames: bits that are known are filled in, orders come from both phases where they can.
+
+`fpp_ml_bench.fewest` says what a rig's working range needs; this is the decoder's part of it.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.decode_blocks import Coordinates, DirectionPlan, Limits, Reason, decode_direction
+from fpp_ml_bench.fewest import AXES, JointCode, gray_bits_in_view, orders_from_phases, reach_of
+from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.gray_code import binary_to_gray, cell_of
+from fpp_ml_bench.pinhole import Maps
+from fpp_ml_bench.rig import Rig
+
+
+def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPlan], JointCode | None]:
+    """The plans with as few Gray frames as the working range needs, and the joint code if it replaces them all."""
+    joint = orders_from_phases(rig) if len(plans) == 2 else None
+    if joint is not None and joint.unambiguous:
+        return [replace(plan, gray=()) for plan in plans], joint
+    return [replace(plan, known=_known_levels(rig, plan)) for plan in plans], None
+
+
+def _known_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
+    """Grey level of each Gray frame that is the same on every cell in view."""
+    needed = gray_bits_in_view(rig, plan.direction)
+    reach = reach_of(rig).near_px[plan.direction]
+    seen = reach[np.isfinite(reach)]
+    if not seen.size:
+        return {}
+    last = plan.length_px - 1
+    code = int(binary_to_gray(cell_of(np.clip(seen[0], 0, last), plan.pitch_px)))
+    bits = len(plan.gray)
+    return {
+        frame: (code >> (bits - 1 - bit) & 1) * GREY_LEVELS for bit, frame in enumerate(plan.gray) if bit not in needed
+    }
+
+
+def wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
+    """Phase and modulation of a block without Gray frames; of the reasons only those that need no order."""
+    found = decode_direction(grey, plan, limits)
+    of_order = (found.reason == Reason.INCONSISTENT_ORDER) | (found.reason == Reason.OUTSIDE_PATTERN)
+    found.reason[of_order] = 0
+    return found
+
+
+def with_orders(
+    found: dict[Direction, Coordinates], rays: Maps, rig: Rig, joint: JointCode
+) -> dict[Direction, Coordinates]:
+    """Coordinates of a block from both wrapped phases: the pair of orders within the range that lies nearest to the
+    pixel's epipolar line. Pixels without one within ``joint.tolerance_px`` are DIRECTIONS_DISAGREE."""
+    orders, off_px = nearest_pair(found, rays, rig, joint.tolerance_px)
+    result = {name: _with_order(one, orders[name], rig, name) for name, one in found.items()}
+    unclear = ~(off_px <= joint.tolerance_px)
+    for one in result.values():
+        one.reason[unclear & (one.reason == 0)] = Reason.DIRECTIONS_DISAGREE
+    return result
+
+
+def nearest_pair(
+    found: dict[Direction, Coordinates], rays: Maps, rig: Rig, tolerance_px: float
+) -> tuple[dict[Direction, NDArray[np.float64]], NDArray[np.float64]]:
+    """Orders of both directions, whole numbers as float64 (n,), and the pair's distance from the epipolar line in
+    projector px, inf where the range holds no order."""
+    joint = orders_from_phases(rig)
+    a, b = (0, 1) if joint.driver == "vertical" else (1, 0)
+    first, second = found[AXES[a]].phase, found[AXES[b]].phase
+    pitches = rig.pitch(AXES[a]), rig.pitch(AXES[b])
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    tries = math.ceil(joint.most_periods + 2 * tolerance_px / pitches[0]) + 1
+    order_a, order_b = np.zeros(first.shape), np.zeros(first.shape)
+    nearest = np.full(first.shape, np.inf)
+    if numba_enabled():
+        from fpp_ml_bench.decode_kernels import joint_orders
+
+        device = rig.projector
+        joint_orders(
+            *rays, first, second, rig.R, rig.t, a, (device.fx, device.fy), (device.cx, device.cy), (near_m, far_m),
+            pitches, tolerance_px, tries, order_a, order_b, nearest,
+        )  # fmt: skip
+        return {AXES[a]: order_a, AXES[b]: order_b}, nearest
+    x, y = rays
+    near, far = (rig.project(np.stack([x * z, y * z, np.full_like(x, z)], axis=-1)) for z in (near_m, far_m))
+    with np.errstate(all="ignore"):
+        line = far[0] - near[0], far[1] - near[1]
+        slope, share = line[b] / line[a], np.abs(line[a]) / np.hypot(*line)
+        low, high = np.minimum(near[a], far[a]) - tolerance_px, np.maximum(near[a], far[a]) + tolerance_px
+        start = np.ceil(low / pitches[0] - first / (2 * np.pi))
+        for step in range(tries):
+            order = start + step
+            one = (first + 2 * np.pi * order) * (pitches[0] / (2 * np.pi))
+            predicted = near[b] + (one - near[a]) * slope
+            other = np.floor(predicted / pitches[1] - second / (2 * np.pi) + 0.5)
+            off = np.abs((second + 2 * np.pi * other) * (pitches[1] / (2 * np.pi)) - predicted) * share
+            better = (off < nearest) & (one <= high)
+            nearest[better], order_a[better], order_b[better] = off[better], order[better], other[better]
+    return {AXES[a]: order_a, AXES[b]: order_b}, nearest
+
+
+def _with_order(found: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
+    absolute = found.phase + 2 * np.pi * order
+    coordinate = absolute * (rig.pitch(direction) / (2 * np.pi))
+    reason = found.reason.copy()
+    outside = (coordinate < -0.5) | (coordinate > rig.pattern_length(direction) - 0.5)
+    reason[(reason == 0) & outside] = Reason.OUTSIDE_PATTERN
+    return Coordinates(coordinate, found.modulation, found.phase, reason)
