@@ -27,6 +27,18 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         choices=("horizontal", "vertical", "both"),
         help="fringes to use: one direction is enough for a depth (default: both)",
     )
+    classical.add_argument(
+        "--fewest",
+        action="store_const",
+        const=True,
+        help="capture only the Gray frames that the rig's range needs: with both directions usually none",
+    )
+    classical.add_argument(
+        "--depth-noise",
+        type=float,
+        metavar="MM",
+        help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
+    )
     phase = parser.add_argument_group("phase (one fringe, nothing learned)")
     phase.add_argument("--fringe", choices=("horizontal", "vertical"), help="the one fringe (default: horizontal)")
     phase.add_argument(
@@ -130,7 +142,32 @@ def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "
 
 def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
     steps = opened.sequence.steps if args.steps is None else args.steps
-    return {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
+    if args.depth_noise is not None:
+        steps = _steps_for(args, opened)
+    chosen = {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
+    return {**chosen, **({"fewest": True} if args.fewest else {})}
+
+
+def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
+    """Steps for ``--depth-noise``, by the noise that the dataset was built with."""
+    from fpp_ml_bench.errors import PredictionError
+    from fpp_ml_bench.fewest import fewest_steps
+    from fpp_ml_bench.loaders.illumination import modulation_at
+
+    asked = args.depth_noise
+    noise_grey = opened.manifest.settings.get("noise_sigma_grey")
+    if args.steps is not None or not (asked > 0 and asked < float("inf")):
+        raise PredictionError(f"--depth-noise {asked:g}: expected mm above 0, and not together with --steps")
+    if noise_grey is None:
+        raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
+    modulation = modulation_at(opened.rig, opened.rig.working_range_mm[1])
+    steps = fewest_steps(opened.rig, args.direction or "both", asked, modulation, noise_grey)
+    if steps is None:
+        raise PredictionError(
+            f"--depth-noise {asked:g}: not even the {opened.sequence.steps} steps that were captured reach it; ask for "
+            "more, or for both directions"
+        )
+    return steps
 
 
 def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
@@ -141,7 +178,7 @@ def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
 
 _MAKERS = {"classical": _classical, "phase": _phase}
 _OPTIONS: dict[str, tuple[str, ...]] = {
-    "classical": ("steps", "direction"),
+    "classical": ("steps", "direction", "fewest", "depth_noise"),
     "phase": ("fringe", "prior", "no_shading", "min_confidence"),
     "network": ("depth_range", "frame", "device"),
 }
