@@ -211,18 +211,18 @@ def error_curves(rig: Rig, direction: Direction) -> list[ErrorCurve]:
     # The set-back is along the projector's axis, in its own frame.
     behind = replace(rig, translation_m=(rig.translation_m[0], rig.translation_m[1], rig.translation_m[2] + SET_BACK_M))
     return [
-        _curve(f"{SMALL_PERIODS:g} period", SMALL_PERIODS, distances,
+        _curve("1/64 period", SMALL_PERIODS, distances,
                depth_error_mm(rig, direction, distances, SMALL_PERIODS)),
         _curve("one period, away", 1.0, distances, away),
         _curve("one period, toward", -1.0, distances, toward),
         _curve("one period, mean of both", 1.0, distances, (away + toward) / 2),
-        _curve(f"{SMALL_PERIODS:g} period, projector {SET_BACK_M:g} m behind", SMALL_PERIODS, distances,
+        _curve(f"1/64 period, projector {SET_BACK_M:g} m behind", SMALL_PERIODS, distances,
                depth_error_mm(behind, direction, distances, SMALL_PERIODS)),
     ]  # fmt: skip
 
 
 def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: NDArray[np.float64]) -> ErrorCurve:
-    """The exponent is fitted where the local one is within `WITHIN` of 2; where it nowhere is, over all that is finite."""
+    """The exponent is fitted where the local one is within `WITHIN` of 2; where it nowhere is, over all finite errors."""
     with np.errstate(invalid="ignore"):
         local = np.gradient(np.log(error_mm), np.log(distances))
     known = np.isfinite(error_mm) & np.isfinite(local)

@@ -107,7 +107,7 @@ def _curves(curves: "Sequence[ErrorCurve]", folder: Path) -> Figure:
         errors.loglog(one.distances_m[known], one.error_mm[known], color=colour, label=one.name, linewidth=1.4)
         exponents.semilogx(one.distances_m, one.local, color=colour, linewidth=1.4)
     exponents.axhspan(1.98, 2.02, color="#dfe1e5")
-    exponents.text(0.31, 2.03, "2 within 1%", fontsize=7)
+    exponents.text(0.31, 2.2, "grey: 2 within 1%", fontsize=7)
     exponents.set_ylim(1.0, 3.5)
     figures.tidy(errors, "Depth error of a mistake", "distance, m", "mm")
     figures.tidy(exponents, "Local exponent of distance", "distance, m")
