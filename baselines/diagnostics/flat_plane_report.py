@@ -40,7 +40,7 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
         f"Answered as background: {shares[RECTANGLE]:.0%} of a rectangular plane, {shares[FRAME]:.0%} of one that "
         f"fills the frame, {shares['silhouette']:.0%} of one in an object's outline; {control['collapsed_share']:.0%} "
         f"of real objects ({control['collapsed_share_true']:.0%} in truth). The rectangle at 1.8 m is answered with a "
-        f"mean of {told}, spread {paper['answer_std']:.3g}, from {paper['answer_min']:.3g} to {paper['answer_max']:.3g}."
+        f"mean of {told}; spread {paper['answer_std']:.3g}, {paper['answer_min']:.3g} to {paper['answer_max']:.3g}."
     )
     if not normalised:
         means = ", ".join(f"{row['mean_mm']:.0f}" for row in facing)

@@ -90,6 +90,8 @@ def normals_of_depth(depth_mm: NDArray[np.float64], x: NDArray, y: NDArray) -> N
     for axis in (1, 0):
         ahead, behind = np.roll(points, -1, axis), np.roll(points, 1, axis)
         has_ahead, has_behind = np.roll(inside, -1, axis), np.roll(inside, 1, axis)
+        np.moveaxis(has_ahead, axis, 0)[-1] = False  # beyond the image's edge there is nothing
+        np.moveaxis(has_behind, axis, 0)[0] = False
         ahead = np.where(has_ahead[..., None], ahead, points)
         behind = np.where(has_behind[..., None], behind, points)
         tangents.append(ahead - behind)

@@ -222,7 +222,7 @@ def error_curves(rig: Rig, direction: Direction) -> list[ErrorCurve]:
 
 
 def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: NDArray[np.float64]) -> ErrorCurve:
-    """The exponent is fitted where the local one is within `WITHIN` of 2; where it nowhere is, over all finite errors."""
+    """The exponent is fitted where the local one is within `WITHIN` of 2; where it nowhere is, over all finite ones."""
     with np.errstate(invalid="ignore"):
         local = np.gradient(np.log(error_mm), np.log(distances))
     known = np.isfinite(error_mm) & np.isfinite(local)
