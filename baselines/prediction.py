@@ -1,5 +1,6 @@
 """Running a method over a split: one prediction a sample, timed, and a submission that says how it was made."""
 
+import json
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.methods import Method, software_of
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE
 from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.pixel_sets import object_mask
@@ -34,6 +35,9 @@ def predict_split(
     """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or
     the method's own units, and ``submission.yaml`` last.
 
+    A method that offers ``predict_reported(frames) -> (prediction, report)`` and ``summary(reports)`` gets its reports
+    written beside, by sample, as `REPORTS_FILE`, and the summary into the submission's settings.
+
     A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
     run that is not counted warms caches and compiled code up. The submission gives the median over the split.
 
@@ -42,18 +46,23 @@ def predict_split(
     """
     samples = opened.samples(split)
     _prepare(out, samples)
-    seconds = []
+    seconds, reports = [], {}
+    reported = getattr(method, "predict_reported", None)
     for number, sample in enumerate(samples):
         frames = captured_frames(opened, method, sample)
         if number == 0:
             method.predict(frames)
         started = perf_counter()
-        depth_mm = method.predict(frames)
+        if reported is None:
+            depth_mm = method.predict(frames)
+        else:
+            depth_mm, reports[sample] = reported(frames)
         seconds.append(perf_counter() - started)
         _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", depth_mm, opened.size)
         progress(1)
     median = statistics.median(seconds)
-    _write_submission(out / SUBMISSION_FILE, method, median)
+    summary = _write_reports(out / REPORTS_FILE, method, reports) if reports else {}
+    _write_submission(out / SUBMISSION_FILE, method, median, summary)
     return Run(len(samples), median)
 
 
@@ -74,7 +83,7 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
 
 def _prepare(out: Path, samples: list[str]) -> None:
     """Make ``out``, or take over one that a stopped run of the same samples left (it has no submission.yaml)."""
-    expected = {f"{sample}{PREDICTION_SUFFIX}" for sample in samples}
+    expected = {f"{sample}{PREDICTION_SUFFIX}" for sample in samples} | {REPORTS_FILE}
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -100,7 +109,16 @@ def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int
     temporary.replace(path)
 
 
-def _write_submission(path: Path, method: Method, seconds_per_sample: float) -> None:
+def _write_reports(path: Path, method: Any, reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Write what the method reports of each sample; returns its summary of them."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(reports, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
+    summary: dict[str, Any] = method.summary(list(reports.values()))
+    return summary
+
+
+def _write_submission(path: Path, method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> None:
     import yaml
 
     content: dict[str, Any] = {
@@ -114,7 +132,7 @@ def _write_submission(path: Path, method: Method, seconds_per_sample: float) -> 
         "seconds_source": "measured",
         "hardware": describe_hardware().to_dict(),
         "software": software_of(method),
-        "settings": dict(method.settings),
+        "settings": {**method.settings, **summary},
         **({"seeds": dict(seeds)} if (seeds := getattr(method, "seeds", {})) else {}),
     }
     temporary = path.with_suffix(".tmp")

@@ -7,7 +7,10 @@ Needs a generated dataset (depth_exact) at the size in question, with the frame 
 """
 
 import argparse
+import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import cv2
 import numpy as np

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission_file import SUBMISSION_FILE
+from fpp_ml_bench.evaluation.submission_file import REPORTS_FILE, SUBMISSION_FILE
 from fpp_ml_bench.evaluation.text import printable
 
 PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
@@ -43,7 +43,7 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     problems += [
         f"{printable(name)}: is extra ({_hint(name, form, samples, split, split_of)})"
         for name in names
-        if name not in expected and name != SUBMISSION_FILE
+        if name not in expected and name not in (SUBMISSION_FILE, REPORTS_FILE)
     ]
     if form in TABLES:
         return Listing(form, problems, list(samples))

@@ -7,6 +7,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
+from fpp_ml_bench.evaluation.submission_file import REPORTS_FILE as REPORTS_FILE
 from fpp_ml_bench.evaluation.submission_file import SUBMISSION_FILE as SUBMISSION_FILE
 from fpp_ml_bench.evaluation.submission_file import read_plain
 from fpp_ml_bench.evaluation.timing import HardwareInfo, Timing

@@ -14,6 +14,8 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.text import printable
 
 SUBMISSION_FILE = "submission.yaml"
+REPORTS_FILE = "per_sample.json"
+"""What a method may say of each sample, beside its predictions; it is not scored."""
 MAX_BYTES = 65536
 
 

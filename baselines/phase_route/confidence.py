@@ -59,14 +59,16 @@ def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.boo
     return clipped / np.maximum(fit.weight, 1e-3)
 
 
-def expected_error_mm(seen: Observation, margin: Image, depth_mm: NDArray) -> Image:
-    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32; 0 outside the mask."""
+def expected_error_mm(seen: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
+    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and its part that doubt about the order makes;
+    0 outside the mask."""
     layer = seen.layer
     z = np.maximum(depth_mm, 1.0) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     wrong = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    return np.where(seen.inside, mm_per_rad * (seen.uncertainty_rad + TAU * wrong), 0).astype(np.float32)
+    whole = np.where(seen.inside, mm_per_rad * (seen.uncertainty_rad + TAU * wrong), 0).astype(np.float32)
+    return whole, np.where(seen.inside, mm_per_rad * TAU * wrong, 0).astype(np.float32)
 
 
 def confidence_of(error_mm: Image) -> Image:

@@ -37,9 +37,9 @@ class Measurement:
 
     ``wrapped_phase`` float32 rad in [-pi, pi]; ``modulation`` float32 grey levels; ``order`` int32; ``candidates``: the
     orders that the working range allows; ``confidence`` float32, 0 to 1; ``expected_error_mm`` float32, what it is made
-    of; ``depth_mm`` float32, 0 = background or masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked
-    or not; ``counts``: pixels per reason; ``background_share``: of the image that calibrated its own brightness;
-    ``seconds`` per stage.
+    of, and ``order_doubt_mm``, its part that doubt about the order makes; ``depth_mm`` float32, 0 = background or
+    masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked or not; ``counts``: pixels per reason;
+    ``background_share``: of the image that calibrated its own brightness; ``seconds`` per stage.
     """
 
     wrapped_phase: Image
@@ -48,6 +48,7 @@ class Measurement:
     candidates: Candidates
     confidence: Image
     expected_error_mm: Image
+    order_doubt_mm: Image
     depth_mm: Image
     reason: NDArray[np.uint8]
     counts: dict[str, int]

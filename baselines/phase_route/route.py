@@ -147,11 +147,11 @@ class PhaseRoute:
         depth_mm = np.where(seen.inside, seen.layer.depth_mm(seen.phase_rad, order), 0.0)
         depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
         seen.watch.done("depth")
-        error_mm = confidence.expected_error_mm(seen, margin, depth_mm)
+        error_mm, doubt_mm = confidence.expected_error_mm(seen, margin, depth_mm)
         sure = confidence.confidence_of(error_mm)
         reason = confidence.reasons(seen, margin, sure, self.settings, self.period_px)
         seen.watch.done("confidence")
-        return self._whole(seen, order, sure, error_mm, depth_mm, reason)
+        return self._whole(seen, order, sure, error_mm, doubt_mm, depth_mm, reason)
 
     def _locally(
         self, greys: Sequence[Image], region: NDArray[np.bool_], mask: NDArray[np.bool_] | None, background: Background,
@@ -207,8 +207,8 @@ class PhaseRoute:
         )
 
     def _whole(
-        self, seen: Observation, order: NDArray[np.int32], sure: NDArray, error_mm: NDArray, depth_mm: NDArray,
-        reason: NDArray[np.uint8],
+        self, seen: Observation, order: NDArray[np.int32], sure: NDArray, error_mm: NDArray, doubt_mm: NDArray,
+        depth_mm: NDArray, reason: NDArray[np.uint8],
     ) -> Measurement:  # fmt: skip
         """Maps of the whole image from those of the crop."""
 
@@ -228,6 +228,7 @@ class PhaseRoute:
             candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
             confidence=paste(sure, np.float32, 0),
             expected_error_mm=paste(error_mm, np.float32, 0),
+            order_doubt_mm=paste(doubt_mm, np.float32, 0),
             depth_mm=paste(kept, np.float32, 0),
             reason=reasons,
             counts={one.name.lower(): int(counts[one]) for one in Reason},
