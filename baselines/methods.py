@@ -18,7 +18,8 @@ class Method(Protocol):
 
     A method may have besides: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
     frames that are 0 outside the object; default no), ``seeds``, ``packages`` whose versions matter (default numpy and
-    numba), ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), and ``mode`` and
+    numba), ``predict_reported`` and ``summary`` (a report of every sample, see `fpp_ml_bench.baselines.prediction`),
+    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), and ``mode`` and
     ``target``, how its row is scored.
     """
 
@@ -56,6 +57,11 @@ def method(name: str, rig: Rig, **options: Any) -> Method:
         from fpp_ml_bench.baselines.classical import ClassicalMethod
 
         return ClassicalMethod(rig, **options)
+    if name == "phase" and "error_mm" in options:
+        from fpp_ml_bench.baselines.phase_route.frame_choice import FewestFrames
+
+        choosing: Method = FewestFrames(rig, **options)
+        return choosing
     if name == "phase":
         from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 

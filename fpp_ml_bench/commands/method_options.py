@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
 METHOD_HELP = (
-    "classical (N-step phase, Gray-code order, triangulation), phase (single-shot phase), the name of weights that "
+    "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), the name of weights that "
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _RECIPE_SUFFIXES = (".yaml", ".yml")
@@ -39,8 +39,20 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
     )
-    phase = parser.add_argument_group("phase (one fringe, nothing learned)")
-    phase.add_argument("--fringe", choices=("horizontal", "vertical"), help="the one fringe (default: horizontal)")
+    phase = parser.add_argument_group("phase (nothing learned)")
+    phase.add_argument(
+        "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
+    )
+    phase.add_argument(
+        "--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)"
+    )
+    phase.add_argument(
+        "--error-mm",
+        type=float,
+        metavar="MM",
+        help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
+        "with one; may ask for the Gray code",
+    )
     phase.add_argument(
         "--prior",
         choices=("none", "standoff"),
@@ -171,7 +183,12 @@ def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
 
 
 def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    from fpp_ml_bench.errors import PredictionError
+
+    if args.frames is not None and args.error_mm is not None:
+        raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
     chosen: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
+    chosen |= {"frames": args.frames, "error_mm": args.error_mm}
     chosen["shading"] = None if args.no_shading is None else False
     return {name: value for name, value in chosen.items() if value is not None}
 
@@ -179,7 +196,7 @@ def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
 _MAKERS = {"classical": _classical, "phase": _phase}
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
-    "phase": ("fringe", "prior", "no_shading", "min_confidence"),
+    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
     "network": ("depth_range", "frame", "device"),
 }
 """What belongs to one kind of method only, by its name in the parsed arguments."""

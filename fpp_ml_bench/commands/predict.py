@@ -16,6 +16,8 @@ EXAMPLES = (
     "fpp-bench predict classical data/mini --split test --out predictions",
     "fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4",
     "fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle",
+    "fpp-bench predict phase data/mini --frames 3 --out predictions-3",
+    "fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene",
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact --json result.json",
 )
 
