@@ -203,7 +203,8 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
 
     def batch():
         features = {"here/a": torch.randn(8, 3, 12, 12), "else/b": torch.randn(8, 3, 12, 12)}
-        return features, {"edges": functional.avg_pool2d(features["here/a"][:, :1].abs(), 3, 1, 1)}
+        bumps = features["here/a"][:, :1].abs()
+        return features, {"edges": functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)}
 
     features, target = batch()
     moments = {name: convolution.Moments() for name in features}
