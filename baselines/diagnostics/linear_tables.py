@@ -25,7 +25,7 @@ _CONTROL_TITLES = {INPUT: "raw input", "position": "pixel's place alone"}
 
 def tables(linear: Scores, spatial: Scores) -> list[Table]:
     """All of them, the paper's first."""
-    return [paper_table(spatial), variance_table(spatial), *(linear_table(linear, target) for target in _asked(linear))]
+    return [paper_table(spatial), variance_table(spatial), linear_table(linear)]
 
 
 def paper_table(spatial: Scores) -> Table:
@@ -65,14 +65,19 @@ def variance_table(spatial: Scores) -> Table:
     return Table("The same probes, share of variance explained (R2)", header, rows)
 
 
-def linear_table(linear: Scores, target: str) -> Table:
-    """One target of the 1 x 1 probes: trained, random weights, and the controls."""
-    rows: list[list[Cell]] = [
-        [layer, shown(found[target]), shown(linear[UNTRAINED][layer][target])]
-        for layer, found in linear[TRAINED].items()
-    ]
-    rows += [[_CONTROL_TITLES[layer], shown(found[target]), None] for layer, found in linear[CONTROLS].items()]
-    return Table(f"Linear (1 x 1) probes for {TITLES[target]}: R2", ("Layer", "This network", "random weights"), rows)
+def linear_table(linear: Scores) -> Table:
+    """R2 of the 1 x 1 probes by layer and target, beside that of random weights; the controls below."""
+    targets = list(next(iter(linear[TRAINED].values())))
+    rows: list[list[Cell]] = []
+    for layer, found in linear[TRAINED].items():
+        pairs = [(found[target], linear[UNTRAINED][layer][target]) for target in targets]
+        rows.append([layer, *(f"{one.r2:.3f}" for pair in pairs for one in pair)])
+    for layer, found in linear[CONTROLS].items():
+        rows.append(
+            [_CONTROL_TITLES[layer], *(cell for target in targets for cell in (f"{found[target].r2:.3f}", None))]
+        )
+    header = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
+    return Table("Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)", header, rows)
 
 
 def shown(score: Score) -> str:
@@ -81,10 +86,6 @@ def shown(score: Score) -> str:
         return f"{score.r2:.3f}"
     low, high = score.r2_interval
     return f"{score.r2:.3f} ({low:.3f} to {high:.3f})"
-
-
-def _asked(linear: Scores) -> list[str]:
-    return list(next(iter(linear[TRAINED].values())))
 
 
 def _pair(scores: Scores) -> tuple[Layers, Layers]:

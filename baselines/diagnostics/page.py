@@ -12,6 +12,7 @@ _TEXT = 4000
 _STYLE = """
 .drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
 .asked { font-style: italic; color: var(--soft); }
+figure + .scroll, .scroll + .scroll { margin-top: 1.25rem; }
 ul.short { padding-left: 1.1rem; max-width: 46rem; }
 ul.short li { margin: .5rem 0; }
 """
