@@ -26,12 +26,14 @@ class Named:
     r: float
 
 
-def label_texts(marks: Sequence[Named], lines: Sequence[Box], inside: Box) -> list[str]:
+def label_texts(marks: Sequence[Named], lines: Sequence[Box], inside: Box, others: Sequence[Box] = ()) -> list[str]:
     """An SVG text for each mark that finds room, the first of ``marks`` first.
 
-    No name covers a mark, another name, or leaves ``inside``; nor one of ``lines``, unless there is no other place.
+    No name covers a mark, one of ``others``, another name, or leaves ``inside``; nor one of ``lines``, unless there is
+    no other place.
     """
     taken: list[Box] = [(m.x - m.r, m.y - m.r, m.x + m.r, m.y + m.r) for m in marks]
+    taken += others
     longest = max(_SHORTEST, int(0.42 * (inside[2] - inside[0]) / _CHARACTER_PX))
     parts = []
     for mark in marks:

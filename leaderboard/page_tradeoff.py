@@ -66,9 +66,8 @@ def _svg(found: Tradeoff, cost: Cost) -> str:
     parts += [_marker(point, *place(point)) for point in points]
     named = [Named(p.title, "", *place(p), _RADIUS) for p in front]
     others = [p for p in points if p not in front]
-    # Marks without a wish for a name still keep names away.
     taken = [(x - _RADIUS, y - _RADIUS, x + _RADIUS, y + _RADIUS) for x, y in map(place, others)]
-    parts += label_texts(named, lines + taken, (_LEFT, 0, _WIDTH, _HEIGHT - _BOTTOM))
+    parts += label_texts(named, lines, (_LEFT, 0, _WIDTH, _HEIGHT - _BOTTOM), taken)
     said = f"Object MAE in mm against {label}, both logarithmic"
     return (
         f'<svg class="scatter" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{said}">{"".join(parts)}</svg>'

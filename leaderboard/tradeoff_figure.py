@@ -165,12 +165,17 @@ def _families(axes: "Axes", points: Iterable[Point], cost: Cost, error: ErrorKey
 def _worth_a_name(point: Point) -> bool:
     """Beside the front: not the classical steps between the ends, not each precision of a network."""
     if point.group == "classical":
-        return point.title.split()[0] in ("N=3", "N=18")
+        return point.title.startswith(("classical N=3,", "classical N=18,"))
     return point.group != "networks" or point.title.endswith(", fp32")
 
 
 def _short(point: Point) -> str:
-    return point.title.removeprefix("phase ").replace(", fp32", "").replace("predicted range", "predicted")
+    return (
+        point.title.removeprefix("phase ")
+        .removeprefix("classical ")
+        .replace(", fp32", "")
+        .replace("predicted range", "predicted")
+    )
 
 
 def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks: Sequence[tuple[float, float]]) -> None:

@@ -64,7 +64,7 @@ def _measured(setting: Setting, rules: Rules) -> dict[str, object]:
     middle, low, high = spread(taken)
     found: dict[str, object] = {
         "frames": len(method.frames_used),
-        "image_px": views.rig.camera.width,
+        "image_px": int(depth[0].shape[1]),
         "runs": len(taken),
         "seconds": middle,
         "seconds_p5": low,

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.inference import fringe_batch, represent
-from fpp_ml_bench.baselines.methods import Method
+from fpp_ml_bench.baselines.methods import Method, method
 from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.network_method import DepthRange, NetworkMethod
 from fpp_ml_bench.baselines.networks import build
@@ -64,7 +64,8 @@ def trained_weights(size: tuple[int, int], runs: Path | None) -> list[WeightsFil
 def network_settings(
     views: StoredViews, threads: int, runs: Path | None = None, widths: Sequence[int] | None = None, quick: bool = False
 ) -> Iterator[Setting]:
-    """Every trained network of the views' image size in every precision, then untrained UNets of ``widths``."""
+    """Every trained network of the views' image size in every precision, the phase route with a learned order, then
+    untrained UNets of ``widths``."""
     torch.set_num_threads(threads)
     height, width = views.opened.size
     precisions = PRECISIONS[:2] if quick else PRECISIONS
@@ -81,6 +82,7 @@ def network_settings(
                 make = partial(_trained, path, depth_range, precision, views, threads)
                 key = f"network-{config.name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
                 yield Setting(key, "networks", title, make, views, note=_note(precision))
+    yield Setting("phase-net", "networks", "phase-net", partial(method, "phase-net", views.rig), views)
     for wide in widths if widths is not None else QUICK_WIDTHS if quick or height * width > LARGE_PX else WIDTHS:
         for precision in precisions:
             if precision == "bf16" and wide > EMULATED_WIDTH and bf16_note():
@@ -121,13 +123,13 @@ def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: 
     return OnnxMethod(model.network, made, calibration(views, made), threads, precision == "onnx-int8")
 
 
-def calibration(views: StoredViews, method: Method, most: int = 8) -> NDArray[np.float32]:
+def calibration(views: StoredViews, like: Method, most: int = 8) -> NDArray[np.float32]:
     """Fringes (n, 1, H, W) in [0, 1] of train samples, spread over the split, as int8 is calibrated on."""
     opened = views.opened
     samples = opened.samples("train") if "train" in opened.splits else []
     if not samples:
         raise PredictionError(f"{opened.path}: int8 is calibrated on train samples, and it has none")
-    (frame,) = method.frames_used
+    (frame,) = like.frames_used
     chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // most)][:most]]
     return fringe_batch(chosen, opened.size, "the calibration").numpy()
 
@@ -163,9 +165,9 @@ def _untrained(width: int, precision: str, views: StoredViews, threads: int) -> 
     parameters = parameter_count(network)
     if parameters > 5e8:
         raise NetworkError(f"a UNet of width {width} has {parameters:,} parameters; give a smaller one")
-    method, quantised = UntrainedMethod(network), precision == "onnx-int8"
+    untrained, quantised = UntrainedMethod(network), precision == "onnx-int8"
     if precision == "bf16":
         in_bfloat16(network)
     if not precision.startswith("onnx"):
-        return method
-    return OnnxMethod(network, method, calibration(views, method, UNTRAINED_EXAMPLES), threads, quantised)
+        return untrained
+    return OnnxMethod(network, untrained, calibration(views, untrained, UNTRAINED_EXAMPLES), threads, quantised)

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,13 @@ from fpp_ml_bench.loaders.manifest import write_atomically
 if TYPE_CHECKING:
     from rich.table import Table
 
+PICTURES: dict[str, Callable[[Tradeoff, Path], bool]] = {
+    "tradeoff.png": draw_tradeoff,
+    "tradeoff_measured.png": lambda found, path: draw_tradeoff(found, path, "measured_mae_mm"),
+    "sizes.png": draw_sizes,
+    "costs.png": lambda found, path: draw_growth(found.growth, path),
+}
+"""Name of each picture and what draws it, or says that there is nothing to draw."""
 _POINT_FIELDS = tuple(name for name in Point.model_fields if name != "interval_mm")
 
 
@@ -28,15 +35,7 @@ def write_report(found: Tradeoff, out: Path) -> list[Path]:
         written.append(_write(out / "tradeoff.csv", points_csv(found)))
     if found.growth:
         written.append(_write(out / "costs.csv", growth_csv(found.growth)))
-    for name, drawn in (
-        ("tradeoff.png", lambda path: draw_tradeoff(found, path)),
-        ("tradeoff_measured.png", lambda path: draw_tradeoff(found, path, "measured_mae_mm")),
-        ("sizes.png", lambda path: draw_sizes(found, path)),
-        ("costs.png", lambda path: draw_growth(found.growth, path)),
-    ):
-        if drawn(out / name):
-            written.append(out / name)
-    return written
+    return written + [out / name for name, draw in PICTURES.items() if draw(found, out / name)]
 
 
 def _write(path: Path, text: str) -> Path:

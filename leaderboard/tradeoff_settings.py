@@ -1,12 +1,10 @@
 """The settings that are compared: every number of steps, every filter of the phase route, precisions, image sizes."""
 
 from collections.abc import Iterator
-from dataclasses import fields
 from functools import partial
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.methods import METHODS, Method, method
-from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.methods import Method, method
 from fpp_ml_bench.constants import TEST_OBJECTS
 from fpp_ml_bench.decoding import Directions
 from fpp_ml_bench.errors import FppBenchError
@@ -17,8 +15,8 @@ from fpp_ml_bench.leaderboard.tradeoff_views import PhotographedViews, StoredVie
 from fpp_ml_bench.rig import Rig
 
 WAYS: tuple[Directions, ...] = ("vertical", "horizontal", "both")
-FEW_FRAMES = (2, 3)
-"""Frames that the phase route is also given, where it takes more than one."""
+FEW_FRAMES, QUICK_FRAMES = (2, 3, 4, 6, 9), (3,)
+"""Frames of one direction that the phase route is also given, without Gray code."""
 WINDOWS = ((0.25, 0.2), (0.5, 0.4), (0.7, 0.55))
 """First and second window of the phase route in fringe periods, beside its own (0.35, 0.27)."""
 SIZES, QUICK_SIZES = (240, 480, 960, 1920), (240, 480)
@@ -33,11 +31,11 @@ def classical_settings(views: StoredViews, threads: int, quick: bool = False) ->
     for way in WAYS:
         for steps in counts:
             make = partial(ClassicalMethod, views.rig, way, steps, threads)
-            yield Setting(f"classical-{way}-{steps:02d}", "classical", f"N={steps} {way}", make, views)
+            yield Setting(f"classical-{way}-{steps:02d}", "classical", f"classical N={steps}, {way}", make, views)
 
 
 def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:
-    """The phase route: direction, what chooses the order, frames, windows of its filters; the learned chooser."""
+    """The phase route: direction, what chooses the order, frames, windows of its filters."""
     rig = views.rig
 
     def one(key: str, title: str, note: str | None = None, **options: object) -> Setting:
@@ -46,10 +44,9 @@ def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]
     for way in DIRECTIONS:
         yield one(way, way, direction=way)
         yield one(f"{way}-no-shading", f"{way}, no shading", direction=way, shading=False)
-    if "frames" in {field.name for field in fields(Settings)}:
-        for way in DIRECTIONS:
-            for count in FEW_FRAMES:
-                yield one(f"{way}-{count}", f"{way}, {count} frames", direction=way, frames=count)
+    for way in DIRECTIONS:
+        for count in (number for number in (QUICK_FRAMES if quick else FEW_FRAMES) if number <= rig.sequence.steps):
+            yield one(f"{way}-{count}", f"{way}, {count} frames", direction=way, frames=count)
     if not quick:
         told = "told that objects stand near the rig's standoff, which is true of fixed placement"
         yield one("standoff", "horizontal, standoff", told, prior="standoff")
@@ -58,8 +55,6 @@ def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]
         for first, second in WINDOWS:
             title = f"horizontal, windows {first:g}/{second:g}"
             yield one(f"window-{first:g}", title, first_window=first, second_window=second)
-    if "phase-net" in METHODS:
-        yield Setting("phase-net", "phase", "phase-net", partial(method, "phase-net", rig), views)
 
 
 def _phase(rig: Rig, options: dict[str, object]) -> "partial[Method]":
@@ -87,6 +82,6 @@ def size_settings(rig: Rig, threads: int, quick: bool = False) -> Iterator[Setti
         views = PhotographedViews(scaled, [name for name in SIZE_OBJECTS if name in TEST_OBJECTS])
         for way, steps in (("both", most), ("vertical", 3)):
             make = partial(ClassicalMethod, scaled, way, steps, threads)  # type: ignore[arg-type]
-            yield Setting(f"size-{size:04d}-{way}-{steps}", "sizes", f"N={steps} {way}", make, views)
+            yield Setting(f"size-{size:04d}-{way}-{steps}", "sizes", f"classical N={steps}, {way}", make, views)
         phase = _phase(scaled, {"direction": "horizontal"})
         yield Setting(f"size-{size:04d}-phase", "sizes", "phase horizontal", phase, views)
