@@ -14,6 +14,8 @@ from fpp_ml_bench.baselines.diagnostics.synth import Scene
 from fpp_ml_bench.evaluation.reliance import PART_TITLES, Reliance
 from fpp_ml_bench.evaluation.uncertainty import caution
 
+_WIDE, _GAP = 11.5, 2
+"""Width of the figure of scenes in inches, and px between two scenes."""
 SCENES_FILE, PARTS_FILE = "counterfactual_scenes.png", "counterfactual_parts.png"
 _FOLLOWS = {
     "follows_phase": "phase alone", "follows_light": "brightness alone", "follows_both": "both, as in\na photograph",
@@ -94,26 +96,32 @@ def _scenes(asker: Asker, scenes: Counterfactuals, folder: Path) -> Figure:
         (f"truth, {unit}", "viridis", *depths), (f"answer, {unit}", "viridis", *depths),
         (f"change asked, {unit}", "coolwarm", -most, most), (f"change made, {unit}", "coolwarm", -most, most),
     )  # fmt: skip
-    height, width = (part.stop - part.start for part in box)
-    figure, axes = figures.drawing(5, len(shown), 11.5, 5 * (11.5 / len(shown)) * height / width * 0.9 + 0.6)
-    for place, (name, scene, true, mask) in enumerate(shown):
+    tiles: list[list[NDArray[np.float64]]] = []
+    for _, scene, true, mask in shown:
         answer, both = asker.answer(scene), mask & target
         missing = asker.metric & (answer == 0)
-        columns = (
+        column = (
             asker.room.frames(scene, [index], masked)[index],
             np.where(mask, true, np.nan),
             np.where(mask & ~missing, answer, np.nan),
             np.where(both, true - truth, np.nan),
             np.where(both & ~missing & ~(asker.metric & (before == 0)), answer - before, np.nan),
         )
-        for line, (image, (title, colours, low, high)) in enumerate(zip(columns, looks, strict=True)):
-            axis = axes[line, place]
-            drawn = figures.picture(axis, np.asarray(image)[box], name if line == 0 else "", colours, low, high)
-            axis.set_facecolor("#e8e8e8")
-            if place == 0:
-                axis.set_ylabel(title, fontsize=8)
-            if line and place == len(shown) - 1:
-                figure.colorbar(drawn, ax=axis, fraction=0.09, pad=0.04).ax.tick_params(labelsize=6)
+        tiles.append(
+            [np.pad(np.asarray(image, dtype=np.float64)[box], _GAP, constant_values=np.nan) for image in column]
+        )
+    height, width = tiles[0][0].shape
+    figure, axes = figures.drawing(5, 1, _WIDE, 5 * 0.9 * _WIDE / len(tiles) * height / width + 0.9)
+    for line, (title, colours, low, high) in enumerate(looks):
+        axis = axes[line, 0]
+        # One image a row: fifty small axes take ten times as long to lay out.
+        drawn = figures.picture(axis, np.hstack([column[line] for column in tiles]), "", colours, low, high)
+        axis.set_facecolor("#e8e8e8" if line else "white")
+        axis.set_ylabel(title, fontsize=8)
+        figure.colorbar(drawn, ax=axis, fraction=0.012, pad=0.008).ax.tick_params(labelsize=6)
+    axes[0, 0].xaxis.tick_top()
+    axes[0, 0].set_xticks([width * (place + 0.5) for place in range(len(shown))], [name for name, *_ in shown])
+    axes[0, 0].tick_params(axis="x", length=0, labelsize=7)
     figure.suptitle(
         f"{found.sample}: one thing changed at a time; {scenes.direction} phase; grey: no answer", fontsize=10
     )

@@ -2,8 +2,9 @@
 
 *A single fringe does not determine depth.* An object is photographed, and another one whose surface lies one whole
 period away on every ray. Their frames of that direction are the same bytes, noise included. Brightness would tell them
-apart, so the nearer surface is painted darker, pixel by pixel, by the factor that the inverse square and the tilt
-demand; the ambient light is a constant of this benchmark. What the other direction shows of the two differs.
+apart, so at each pixel the surface that is the brighter there is painted darker, by the factor that the inverse square
+and the tilt demand; the ambient light is a constant of this benchmark, whatever it falls on. The frames of the other
+direction differ.
 
 *A mistake of one period costs Z^2.* The depth error of a mistake of one period, at distances from 0.3 to 10 m along
 the camera's axis, through the calibration layer. In closed form, with kappa = P / (f_p b) for the paper's rig, it is
@@ -11,7 +12,9 @@ Z^2 kappa / (1 -+ Z kappa), one for each side: the exponent of Z is 2 +- Z kappa
 Z kappa, the mistake over the disparity itself, is small.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +42,8 @@ SMALL_PERIODS = 1 / 64
 """A mistake so small that the linear model holds over all distances."""
 WITHIN = 0.01
 """Relative difference from exponent 2 that still counts as quadratic."""
+STARTS_PERIODS = (0.0, -1.0, -0.5)
+"""Where the first of two scenes that are a period apart stands, in periods from the object's own place."""
 SET_BACK_M = 0.1
 """How far the projector of the rig that shows the thin-baseline limit stands behind the camera."""
 
@@ -127,7 +132,8 @@ class Theory:
 
 
 def twins_of(dataset: "DatasetFolder", room: Darkroom, direction: Direction = "horizontal") -> Twins:
-    """The first test sample that has room for a whole period within the working range, and its twin.
+    """The first test object that fits twice, a whole period apart, into the working range: where it stands and beside
+    it, or half a period to either side.
 
     Raises `DiagnosisError` where none has.
     """
@@ -136,43 +142,42 @@ def twins_of(dataset: "DatasetFolder", room: Darkroom, direction: Direction = "h
         first = original(dataset, room, sample)
         if not first.target.any():
             continue
-        for periods in (1.0, -1.0):
-            there = moved(first.surface, room.rig, direction, lambda x, y, turn=TAU * periods: np.full_like(x, turn))  # type: ignore[misc]
-            if near <= there.depth_m.min() and there.depth_m.max() <= far:
-                return _photographed(dataset, room, first, there, direction)
+        for start in STARTS_PERIODS:
+            pair = tuple(
+                moved(first.surface, room.rig, direction, partial(_constant, TAU * turns))
+                for turns in (start, start + 1)
+            )
+            if all(near <= one.depth_m.min() and one.depth_m.max() <= far for one in pair):
+                return _photographed(room, first, pair, direction)
     raise DiagnosisError(
-        f"{dataset.path}: no test sample can be moved by a period of {direction} fringes and stay within "
+        f"{dataset.path}: no test object fits twice, a period of {direction} fringes apart, within "
         f"{near:g} to {far:g} m; use a rig with a finer pitch or a wider range"
     )
 
 
-def _photographed(
-    dataset: "DatasetFolder", room: Darkroom, first: Original, there: Surface, direction: Direction
-) -> Twins:
-    lit = room.light(there)
-    ours, theirs = first.scene.lit.gain.astype(np.float64), lit.gain.astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        paint = np.where((ours > 0) & (theirs > 0), ours / theirs, 1.0)
-    # No paint is brighter than white: whichever of the two surfaces is the brighter is painted.
-    mine = replace(first.scene.lit, gain=np.minimum(ours, ours / np.maximum(paint, 1.0)).astype(np.float32))
-    other = replace(lit, gain=(theirs * np.minimum(paint, 1.0)).astype(np.float32))
-    mine, other = (
-        replace(one, gain=np.where((ours > 0) & (theirs > 0), one.gain, 0).astype(np.float32)) for one in (mine, other)
-    )
-    scenes = replace(first.scene, lit=mine), replace(first.scene, lit=other)
-    sequence = dataset.sequence
+def _constant(turn_rad: float, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.full_like(x, turn_rad)
+
+
+def _photographed(room: Darkroom, first: Original, pair: tuple[Surface, ...], direction: Direction) -> Twins:
+    lights = [room.light(surface) for surface in pair]
+    gains = [light.gain.astype(np.float64) for light in lights]
+    # No paint is brighter than white: each pixel is painted on the surface that is the brighter there.
+    least, most = np.minimum(*gains), np.maximum(*gains)
+    paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
+    scenes = [replace(first.scene, lit=replace(light, gain=least.astype(np.float32))) for light in lights]
+    sequence = room.rig.sequence
     frame = sequence.sinusoids(direction)[0]
     across = sequence.sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
     silent = Darkroom(room.rig, noise_sigma_grey=0.0)
     return Twins(
         first.sample, direction, frame, across,
-        (first.depth_mm, there.depth_mm(room.shape)),
-        _pair(room, scenes, frame), _pair(silent, scenes, frame), _pair(room, scenes, across),
-        np.minimum(paint, 1 / paint),
+        (pair[0].depth_mm(room.shape), pair[1].depth_mm(room.shape)),
+        _pair(room, scenes, frame), _pair(silent, scenes, frame), _pair(room, scenes, across), paint,
     )  # fmt: skip
 
 
-def _pair(room: Darkroom, scenes: tuple[Scene, Scene], index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _pair(room: Darkroom, scenes: Sequence[Scene], index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     first, second = (room.frames(scene, [index])[index] for scene in scenes)
     if first is None or second is None:
         raise ValueError(f"frame {index} was asked for and is missing")
