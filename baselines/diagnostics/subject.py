@@ -229,7 +229,7 @@ def subject_of_network(found: Any, dataset: "DatasetFolder", layers: Sequence[st
         normalisation=model.config.normalisation,
         network=model.network,
         layer_names=names,
-        find_layers=lambda network: network.probe_layers,  # type: ignore[return-value]
+        find_layers=lambda network: network.probe_layers,  # type: ignore[arg-type, return-value]
         untrained=untrained,
         weights_sha256=model.sha256,
     )
