@@ -1,11 +1,12 @@
 """MAE and RMSE over a set of pixels, sums that keep their digits, and unions of sets.
 
 Numerical contract: differences are formed in float64 whatever the input; every sum is float64 over blocks of
-`BLOCK` pixels that stay in the cache, the block sums added exactly (`math.fsum`). Error magnitudes from 1e-140 to 1e140
-neither overflow nor underflow.
+`BLOCK` pixels that stay in the cache, the block sums added exactly (`math.fsum`). Errors above 1e140 are refused, and
+errors so small that their squares vanish are squared as parts of the largest, so that an RMSE is never 0 by underflow.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ BLOCK = 9600
 """Pixels a block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
 would then depend on the number of cores; below that a score is the same on every machine of one kind."""
 
+_SQUARES_LOST = 1e-280
+"""Mean square below which squares have lost digits, the smallest normal number being 2e-308 and an image a million
+pixels."""
 NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
 
 
@@ -53,7 +57,7 @@ def stats_of(errors: NDArray[np.float64]) -> ErrorStats:
         block = errors[start : start + BLOCK]
         squares.append(float(block.dot(block)))
         absolute.append(float(np.abs(block).sum()))
-    return finish(errors.size, absolute, squares)
+    return finish(errors.size, absolute, squares, lambda: errors)
 
 
 def mean_of(errors: NDArray[np.float64]) -> float | None:
@@ -63,8 +67,13 @@ def mean_of(errors: NDArray[np.float64]) -> float | None:
     return math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK)) / errors.size
 
 
-def finish(pixels: int, absolute: list[float], squares: list[float]) -> ErrorStats:
-    """Statistics from the blocks' sums. Raises PredictionError where a sum is not finite."""
+def finish(
+    pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], NDArray[np.float64]]
+) -> ErrorStats:
+    """Statistics from the blocks' sums; ``errors`` gives the errors themselves (n,) where the squares underflow.
+
+    Raises PredictionError where a sum is not finite.
+    """
     if pixels == 0:
         return EMPTY
     try:
@@ -73,4 +82,8 @@ def finish(pixels: int, absolute: list[float], squares: list[float]) -> ErrorSta
         mae = mean_square = math.inf
     if not math.isfinite(mae) or not math.isfinite(mean_square):
         raise PredictionError(NOT_FINITE)
+    if mean_square < _SQUARES_LOST and any(absolute):
+        small = errors()
+        largest = float(np.abs(small).max())
+        return ErrorStats(pixels, mae, largest * (stats_of(small / largest).rmse_mm or 0.0))
     return ErrorStats(pixels, mae, math.sqrt(mean_square))

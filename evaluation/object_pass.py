@@ -65,7 +65,10 @@ def headline_stats(
     sums = np.empty((-(-prediction.size // error_stats.BLOCK), 4))
     inside = headline_pass(prediction, target, error_stats.BLOCK, sums)
     absolute, squares, outside, outside_squares = sums.T.tolist()
-    return finish(inside, absolute, squares), finish(prediction.size - inside, outside, outside_squares)
+    return (
+        finish(inside, absolute, squares, lambda: _errors(prediction, target, object_mask(target))),
+        finish(prediction.size - inside, outside, outside_squares, lambda: _background(prediction, target)),
+    )
 
 
 def compilable(*images: NDArray[np.floating[Any]]) -> bool:
@@ -96,8 +99,18 @@ def _compiled(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating
     errors = errors[:found]
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
-    background = finish(size - found, absolute.tolist(), squares.tolist())
+    background = finish(size - found, absolute.tolist(), squares.tolist(), lambda: _background(prediction, target))
     return ObjectErrors(index[:found], errors, missing[:found], background)
+
+
+def _errors(
+    prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]], where: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    return prediction[where].astype(np.float64) - target[where]
+
+
+def _background(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    return _errors(prediction, target, ~object_mask(target))
 
 
 def _background_stats(
@@ -130,4 +143,4 @@ def _background_stats(
         if signed:
             np.abs(buffer, out=buffer)
         absolute += buffer.sum(axis=1).tolist()
-    return finish(pixels, absolute, squares)
+    return finish(pixels, absolute, squares, lambda: _background(prediction, target))

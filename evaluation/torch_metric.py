@@ -33,6 +33,9 @@ KEYS = (
     "object_shift_free_mae_mm",
 )
 
+SQUARES_VANISH = 1e-140
+"""Errors below this have squares that are no normal float64 any more."""
+
 
 class DepthScores(Metric):
     """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
@@ -101,7 +104,7 @@ def sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | N
     for name, part in (("overall", error.flatten()), ("object", error[inside]), ("background", error[~inside])):
         if part.numel():
             found[f"{name}_mae_mm"] = part.abs().mean()
-            found[f"{name}_rmse_mm"] = part.square().mean().sqrt()
+            found[f"{name}_rmse_mm"] = _root_mean_square(part)
     if not bool(inside.any()):
         return found
     errors, measured = error[inside], prediction[inside] > 0
@@ -118,6 +121,13 @@ def sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | N
     found["object_bias_mm"] = errors.mean()
     found["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
     return found
+
+
+def _root_mean_square(errors: Tensor) -> Tensor:
+    """Root mean square; errors whose squares would vanish are squared as parts of the largest."""
+    largest = errors.abs().max()
+    scale = torch.where((largest > 0) & (largest < SQUARES_VANISH), largest, torch.ones_like(largest))
+    return (errors / scale).square().mean().sqrt() * scale
 
 
 def _quantile(ascending: Tensor, level: float) -> Tensor:

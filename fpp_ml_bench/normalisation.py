@@ -38,10 +38,10 @@ def normalise(
 ) -> NDArray:  # fmt: skip
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
 
-    Single precision loses nothing where depth and range are float32 themselves: the difference of two such depths within
-    a factor of two of each other is exact (Sterbenz), and the division rounds once. A range from elsewhere, or deeper
-    depths, would lose digits by being rounded first, so that is worked out in float64 and rounded at the end. Raises ``ValueError`` for an unknown name or a range that is not
-    finite and ordered.
+    Single precision loses nothing where depth and range are float32 themselves: the difference of two such depths
+    within a factor of two of each other is exact (Sterbenz), and the division rounds once. A range from elsewhere, or
+    deeper depths, would lose digits by being rounded first: that is worked out in float64 and rounded at the end.
+    Raises ``ValueError`` for an unknown name or a range that is not finite and ordered.
     """
     _check(name)
     result = np.empty(depth_mm.shape, dtype=np.float32) if out is None else out

@@ -15,6 +15,9 @@ from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.raycast import Hits, TracedObject
 from fpp_ml_bench.rig import Rig
 
+NEAREST_M = 1e-3
+"""A point nearer to a centre of projection is inside that lens and gets no light: the inverse square has no limit."""
+
 
 @dataclass(frozen=True)
 class Lighting:
@@ -89,6 +92,7 @@ def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
     return -rig.R.T @ rig.t
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # of points in a lens, which get no light
 def light_surface(
     points_m: NDArray[np.float64], normals: NDArray[np.float64], rig: Rig, lighting: Lighting,
     occluder: TracedObject | None = None,
@@ -114,7 +118,8 @@ def light_surface(
     gain = (1.0 - lighting.specular + lighting.specular * gloss) * cosine
     gain *= lighting.white_grey * reference_m**2 / squared_m
     u, v = rig.project(points_m)
-    lit = (cosine > 0) & in_pattern(u, v, rig)
+    apart = (squared_m > NEAREST_M**2) & (x * x + y * y + z * z > NEAREST_M**2)
+    lit = (cosine > 0) & apart & in_pattern(u, v, rig)
     shadow_rays = 0
     if lighting.shadows and occluder is not None:
         candidates = np.flatnonzero(lit)

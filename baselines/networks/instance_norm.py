@@ -6,18 +6,29 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+MEAN_ROUNDINGS = 16
+"""Roundings of a mean over a map, in units of the last place of its value."""
+RECENTRED_FROM = 1e-6
+"""Square of the error of the normalised map from which on it is worth another pass: a thousandth of its spread."""
+
 
 class _CpuInstanceNorm(torch.autograd.Function):
     """(x - mean) / sqrt(variance + eps) x weight + bias over the last two axes, with its gradient in closed form.
 
     Torch's kernel copies channels-last maps and reads them more often; this one takes either memory layout as it is.
-    The variance is taken of the centred map, so a constant map has variance 0 to rounding and finite gradients.
+    The variance is taken of the centred map. Where the rounding of the mean would show in it, on a map that hardly
+    varies about a large mean, the map is centred once more: a constant map then gives the bias, whatever its value.
     """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor | None, bias: Tensor | None, eps: float) -> Tensor:
-        centred = x - x.mean((2, 3), keepdim=True)
-        scale = (centred * centred).mean((2, 3), keepdim=True).add_(eps).rsqrt_()
+        mean = x.mean((2, 3), keepdim=True)
+        centred = x - mean
+        spread = (centred * centred).mean((2, 3), keepdim=True).add_(eps)
+        if bool((mean.mul_(MEAN_ROUNDINGS * torch.finfo(x.dtype).eps).square_() > RECENTRED_FROM * spread).any()):
+            centred -= centred.mean((2, 3), keepdim=True)
+            spread = (centred * centred).mean((2, 3), keepdim=True).add_(eps)
+        scale = spread.rsqrt_()
         ctx.save_for_backward(centred, scale, weight)
         if weight is None or bias is None:
             return centred * scale

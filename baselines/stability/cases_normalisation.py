@@ -56,7 +56,8 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "scored", check.scored,
-            {"mode": ("standard", "paper-individual"), "kind": ("part", "full frame", "flat plane", "one pixel", "empty")},
+            {"mode": ("standard", "paper-individual"),
+             "kind": ("part", "full frame", "flat plane", "one pixel", "empty")},
             computes="normalised predictions as the evaluator scores them", reference="the affine map, closed form",
             predicts="4 u D; no range to go back through is refused", unit="mm",
             expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either",

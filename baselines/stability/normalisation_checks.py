@@ -88,7 +88,7 @@ def scored(kind: str, mode: str) -> Outcome:
     target = depth_map(kind, 1700.0, 200.0).astype(np.float32)
     values = np.where(object_mask(target), np.float32(0.5), np.float32(0.0))
     try:
-        prediction, truth = scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
+        prediction, _ = scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
     except DatasetError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     inside = object_mask(target)

@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "reliance": ("reliance", "measure phase reliance: does an answer follow the fringes or the outline"),
     "diagnose": ("diagnose", "look into a model: does it read fringes or shapes; one HTML report"),
     "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
+    "stability": ("stability", "stiff and extreme cases against higher precision and theory"),
     "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
 }
 

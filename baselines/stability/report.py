@@ -1,0 +1,85 @@
+"""What a run of cases leaves: JSON with every case, one HTML page, and a picture of the heat maps."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.baselines.stability.case import Verdict
+from fpp_ml_bench.baselines.stability.report_html import report_page
+from fpp_ml_bench.baselines.stability.run import Row
+from fpp_ml_bench.evaluation.provenance import environment
+from fpp_ml_bench.loaders.manifest import write_atomically
+
+PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
+SCHEMA_VERSION = "1.0.0"
+
+
+def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """By group, and under "all": cases per verdict, the largest error / bound, and seconds."""
+    found: dict[str, dict[str, Any]] = {}
+    for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
+        part = [row for row in rows if group in (row.case.group, "all")]
+        ratios = [row.outcome.ratio for row in part if row.outcome.ratio is not None]
+        found[group] = {
+            "cases": len(part),
+            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
+            "largest_ratio": number(max(ratios, default=None)),
+            "seconds": round(sum(row.seconds for row in part), 2),
+        }
+    return found
+
+
+def number(value: float | None) -> float | str | None:
+    """A number that JSON knows, or the name of one that it does not."""
+    return value if value is None or math.isfinite(value) else str(value)
+
+
+def row_dict(row: Row) -> dict[str, Any]:
+    """One case as JSON values."""
+    case, outcome = row.case, row.outcome
+    return {
+        "group": case.group,
+        "family": case.family,
+        "parameters": {key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()},
+        "computes": case.computes,
+        "reference": case.reference,
+        "predicts": case.predicts,
+        "unit": case.unit,
+        "expects": case.expects,
+        "verdict": row.verdict.value,
+        "error": number(outcome.error),
+        "bound": number(outcome.bound),
+        "ratio": number(outcome.ratio),
+        "flagged_share": outcome.flagged,
+        "condition": number(outcome.condition),
+        "note": outcome.note,
+        "against": row.against,
+        "seconds": round(row.seconds, 3),
+    }  # fmt: skip
+
+
+def document(rows: Sequence[Row]) -> dict[str, Any]:
+    """The whole run as JSON values."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "summary": summary(rows),
+        "compiled_decoder": numba_enabled(),
+        "environment": environment().model_dump(mode="json"),
+        "cases": [row_dict(row) for row in rows],
+    }
+
+
+def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write `PAGE`, `DATA` and `PICTURE` into ``folder``, which is made; their paths. Raises OSError."""
+    from fpp_ml_bench.baselines.stability.picture import write_picture
+
+    folder.mkdir(parents=True, exist_ok=True)
+    content = document(rows)
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_atomically(folder / DATA, text.encode("utf-8"))
+    write_atomically(folder / PAGE, report_page(rows, content).encode("utf-8"))
+    write_picture(rows, folder / PICTURE)
+    return [folder / PAGE, folder / DATA, folder / PICTURE]
