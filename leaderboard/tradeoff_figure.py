@@ -182,7 +182,7 @@ def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks:
     """A name beside each of ``named`` (x, y, text, on the front) that finds room, the first ones first."""
     figure = axes.figure
     figure.canvas.draw()  # constrained layout has then placed the axes
-    taken = [_box(axes.transData.transform(mark), 3) for mark in marks]
+    taken = [_box(float(x), float(y), 3) for x, y in map(axes.transData.transform, marks)]
     legend = axes.get_legend()
     if legend is not None:
         taken.append(legend.get_window_extent().extents)
@@ -202,8 +202,8 @@ def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks:
             label.remove()
 
 
-def _box(at: Sequence[float], half: float) -> tuple[float, float, float, float]:
-    return at[0] - half, at[1] - half, at[0] + half, at[1] + half
+def _box(x: float, y: float, half: float) -> tuple[float, float, float, float]:
+    return x - half, y - half, x + half, y + half
 
 
 def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:

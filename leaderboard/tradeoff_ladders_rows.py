@@ -104,17 +104,23 @@ def _touch(image: NDArray[np.uint8]) -> None:
 
 
 def _read_frames(frames: int, folder: Path) -> Rung:
-    opened = DatasetFolder(written_dataset(folder, 1, 480, "all", views=1))
-    (sample,) = opened.samples("test")
-    chosen = range(frames)
-    return Rung(frames, lambda: [_touch(frame) for frame in opened.frames(sample, chosen)] and None)
+    return _reading(written_dataset(folder, 1, 480, "all", views=1), frames, frames)
 
 
 def _read_pixels(size: int, folder: Path) -> Rung:
-    opened = DatasetFolder(written_dataset(folder, 1, size, "all", views=1))
+    return _reading(written_dataset(folder, 1, size, "all", views=1), len(PAPER_SEQUENCE), size * size)
+
+
+def _reading(path: Path, frames: int, amount: int) -> Rung:
+    """The first ``frames`` frames of the dataset's one row."""
+    opened = DatasetFolder(path)
     (sample,) = opened.samples("test")
-    every = range(len(opened.sequence))
-    return Rung(size * size, lambda: [_touch(frame) for frame in opened.frames(sample, every)] and None)
+
+    def run() -> None:
+        for frame in opened.frames(sample, range(frames)):
+            _touch(frame)
+
+    return Rung(amount, run)
 
 
 def _evaluate(objects: int, folder: Path) -> Rung:

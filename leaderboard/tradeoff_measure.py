@@ -8,6 +8,7 @@ import numpy as np
 
 from fpp_ml_bench.baselines.methods import Method
 from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench.evaluation.protocol import Mode
 from fpp_ml_bench.evaluation.scores import score_sample
 from fpp_ml_bench.evaluation.text import NAME_LIMIT, printable
 from fpp_ml_bench.evaluation.uncertainty import object_interval
@@ -86,7 +87,7 @@ def _measured(setting: Setting, rules: Rules) -> dict[str, object]:
 
 def _score(method: Method, depth: np.ndarray, views: Views, name: str) -> tuple[float | None, float | None, float]:
     """Object MAE, that over measured pixels, and the share of object pixels without a depth."""
-    mode = getattr(method, "mode", "standard")
+    mode: Mode = getattr(method, "mode", "standard")
     pair = scored_pair(depth, views.target_mm(name), getattr(method, "units", "mm"), mode, name)
     found = score_sample(*pair)
     pixels = found.object.pixels

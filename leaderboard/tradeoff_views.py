@@ -20,12 +20,12 @@ Frames = Sequence[NDArray[np.uint8] | None]
 class Views(Protocol):
     """Frames and true depth of some views of one rig; ``names`` and their ``objects`` in the same order."""
 
-    names: Sequence[str]
-
+    @property
+    def names(self) -> Sequence[str]: ...
     @property
     def rig(self) -> Rig: ...
     @property
-    def objects(self) -> list[str]: ...
+    def objects(self) -> Sequence[str]: ...
     def frames(self, method: Method, name: str) -> Frames:
         """The sequence as ``method`` may see it, in memory."""
 
