@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,14 +54,15 @@ class Asker:
 
     def __init__(self, asked: Asked, room: Darkroom) -> None:
         self.asked, self.room = asked, room
-        self.units = getattr(asked, "units", "mm")
-        if self.units not in ("mm", "normalised"):
-            raise DiagnosisError(f"units {self.units!r}: reliance is measured for answers in mm, or normalised")
+        units = getattr(asked, "units", "mm")
+        if units not in ("mm", "normalised"):
+            raise DiagnosisError(f"units {units!r}: reliance is measured for answers in mm, or normalised")
+        self.units: Literal["mm", "normalised"] = units
         self._masked = bool(getattr(asked, "uses_ground_truth_mask", False))
 
     @property
     def metric(self) -> bool:
-        return bool(self.units == "mm")
+        return self.units == "mm"
 
     def answer(self, scene: Scene) -> NDArray[np.float32]:
         """Depth (H, W) in the answer's units."""
@@ -109,9 +110,9 @@ def measure_sample(asker: Asker, scenes: Counterfactuals) -> SampleReliance:
     parts["follows_constant"] = follows([change(asker.answer(m.phase), asked_of(m), target) for m in constant])
     for name, scene in scenes.reprojected.items():
         key = name.replace(" ", "_")
-        made = change(asker.answer(scene), np.zeros(target.shape), target)
-        there = made.answered
-        answered = Change(made.asked[there], made.made[there], there[there])
+        shown = change(asker.answer(scene), np.zeros(target.shape), target)
+        there = shown.answered
+        answered = Change(shown.asked[there], shown.made[there], there[there])
         parts[f"change_{key}"] = relative_change([answered], unit)
         if name.startswith("no fringe"):
             parts[f"answered_{key}"] = float(there.mean())
@@ -173,7 +174,7 @@ def measure(
 ) -> tuple[Reliance, list[SampleReliance]]:
     """The block of a method, and what every sample gave. Raises `DiagnosisError` as `Asker` and `reliance_of`."""
     asker, direction = Asker(asked, book.room), direction_read(asked.frames_used, book.dataset)
-    samples = []
+    samples: list[SampleReliance] = []
     for scenes in book.scenes(direction):
         progress(len(samples), len(book.chosen), scenes.original.sample)
         samples.append(measure_sample(asker, scenes))

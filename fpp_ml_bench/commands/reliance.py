@@ -54,13 +54,13 @@ def run(args: argparse.Namespace) -> int:
     if entry is not None:
         check_same_method(entry, method)
     book = SceneBook(opened, args.views)
-    done = 0
+    before = 0
     with progress_bar(f"asking {args.method}", len(book.chosen), "samples") as advance:
 
-        def progress(finished: int, total: int, doing: str = "") -> None:
-            nonlocal done
-            advance(finished - done)
-            done = finished
+        def progress(done: int, total: int, doing: str = "") -> None:
+            nonlocal before
+            advance(done - before)
+            before = done
 
         sha256 = method.settings.get("weights_sha256")
         found, _ = measure(method, book, sha256 if isinstance(sha256, str) else None, progress)
