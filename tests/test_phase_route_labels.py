@@ -1,9 +1,12 @@
 """Least energy over candidates: exact on chains, close to the optimum on grids, compiled or not."""
 
+import sys
 from itertools import product
 
 import numpy as np
+import pytest
 
+from fpp_ml_bench.acceleration import SWITCH
 from fpp_ml_bench.baselines.phase_route import label_kernels
 from fpp_ml_bench.baselines.phase_route.labels import least_energy
 
@@ -58,14 +61,28 @@ def test_a_weak_majority_wins_a_strongly_coupled_field() -> None:
     assert (choice == 1).all()
 
 
-def test_compiled_and_plain_lines_agree_to_rounding() -> None:
-    arrays = problem((6, 5), 3, 11)
-    unary, phase = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in arrays[:2])
+@pytest.mark.parametrize("shape", [(6, 5), (1, 7), (7, 1), (13, 20)])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_switch_to_numpy_gives_the_same_numbers(
+    shape: tuple[int, int], count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arrays = problem(shape, count, 11)
+    for link in arrays[2:]:
+        link[link < 0.1] = 0  # pixels that are not object
     results = []
-    kernel = label_kernels.iterate
-    plain = getattr(kernel, "py_func", kernel)
-    for run in (kernel, plain):
-        messages = np.zeros((6, 5, 4, 3), np.float32)
-        run(unary, phase, *arrays[2:], np.float32(1.5), 4, messages)
-        results.append(messages)
-    assert np.abs(results[0] - results[1]).max() < 1e-6
+    for switch in ("1", "0"):
+        monkeypatch.setenv(SWITCH, switch)
+        results.append(least_energy(*arrays, limit_rad=1.5))
+    assert np.array_equal(results[0][0], results[1][0])
+    assert np.array_equal(results[0][1], results[1][1])
+    assert not np.array_equal(results[0][0], arrays[0].argmin(axis=0)) or count == 1  # smoothness had a say
+
+
+def test_the_switch_keeps_the_compiled_lines_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setitem(sys.modules, label_kernels.__name__, None)  # importing it would fail
+    choice, _ = least_energy(*problem((4, 4), 2, 3), limit_rad=1.5)
+    assert choice.shape == (4, 4)
+    monkeypatch.setenv(SWITCH, "1")
+    with pytest.raises(ImportError):
+        least_energy(*problem((4, 4), 2, 3), limit_rad=1.5)

@@ -10,7 +10,7 @@ tree-reweighted kind counts every pixel's opinion once, and gets it right.
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.label_kernels import decide, iterate
+from fpp_ml_bench.acceleration import numba_enabled
 
 Image = NDArray[np.float32]
 
@@ -33,6 +33,10 @@ def least_energy(
     and ``link_y`` (H - 1, W): weight of the smoothness between neighbours, 0 where one of them is not object;
     ``limit_rad``: a jump from which on it costs no more.
     """
+    if numba_enabled():
+        from fpp_ml_bench.baselines.phase_route.label_kernels import decide, iterate
+    else:
+        from fpp_ml_bench.baselines.phase_route.label_sweeps import decide, iterate
     count, height, width = unary.shape
     costs = np.ascontiguousarray(unary.transpose(1, 2, 0), dtype=np.float32)
     phases = np.ascontiguousarray(phase_rad.transpose(1, 2, 0), dtype=np.float32)
