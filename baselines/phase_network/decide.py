@@ -10,7 +10,7 @@ from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, SHADING, S
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.samples import Geometry
 
-IMPOSSIBLE = -1e4
+IMPOSSIBLE = -np.inf
 """Logit of an order that puts its pixel out of the working range."""
 
 

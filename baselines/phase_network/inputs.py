@@ -11,28 +11,43 @@ network then serves both fringe directions.
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation
 from fpp_ml_bench.baselines.phase_route.orders import LEAST_BRIGHTNESS
-from fpp_ml_bench.baselines.phase_route.shading import irradiance
+from fpp_ml_bench.baselines.phase_route.shading import irradiance, wrapped
 from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
 
 STEPS = (-1, 0, 1)
 """The candidates: a period further than the base, the base, a period nearer."""
+SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
+"""Directions, rows and columns as the network has them, from which a pixel may take its phase instead."""
+SIDE_PERIODS = 0.45
+"""How far away the phase is taken from: a window there sees little of what lies on the pixel's other side."""
+LARGEST_RAD = 1.5708
+"""Largest correction that is proposed."""
+AROUND_PX = 1.5
+"""Gaussian over which the misfit of a proposal is averaged: one pixel's light fits many phases."""
 CHANNELS = (
     "light", "plane light", "plane misfit", "classical mask", "cos", "sin", "brightness", "window share", "fit misfit",
     "slope along", "slope across", "further: brightness misfit", "base: brightness misfit",
-    "nearer: brightness misfit", "further exists", "nearer exists", "relief",
+    "nearer: brightness misfit", "further exists", "nearer exists", "relief", "first guess",
+    *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
+    "own misfit around", *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
 )  # fmt: skip
+FIRST_SIDE = CHANNELS.index("first guess") + 1
 SHADING = (6, 11, 12, 13)
 """Channels that rest on one albedo for all surfaces; 0 for a network that is to do without."""
 LEAST_WEIGHT = 0.02
 """Least share of the fit's window on the object where its answer counts."""
+RELIEF_RAD = 1.5
+"""Residual phase that counts as one: corrections are parts of it, and the network is to see them."""
+SINE_FLOOR = 0.1
 STEP_PX = 2
 """Brightness of the candidates is computed on every second pixel."""
 
@@ -133,32 +148,24 @@ class Scene:
         return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
 
 
-def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: float) -> tuple[Image, NDArray]:
-    """Brightness that each of `STEPS` would have, in units of light, and its depth in mm: (3, h, w) float32 each.
+def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: float) -> Image:
+    """Brightness that each of `STEPS` would have, in units of light, (3, h, w) float32.
 
     ``layer``: of the scene's part of the image. NaN where a candidate lies behind a device.
     """
     height, width = scene.light.shape
     every = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
-    where = (
-        slice(scene.crop[0].start, scene.crop[0].stop, STEP_PX),
-        slice(scene.crop[1].start, scene.crop[1].stop, STEP_PX),
-    )
+    rows, columns = scene.crop
+    where = (slice(rows.start, rows.stop, STEP_PX), slice(columns.start, columns.stop, STEP_PX))
     coarse = layer.at(every)
     slopes = scene.slopes[0][every], scene.slopes[1][every]
     base = coarse.residual_phase(scene.phase_rad[every], scene.order[every])
-    bright, depth = [], []
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for step in STEPS:
-            residual = (base + sign * TAU * step).astype(np.float32)
-            bright.append(irradiance(coarse, residual, slopes, rig, where) * np.float32(rig.standoff_m**2))
-            depth.append(coarse.depth_of_residual_mm(residual))
-
-    def fine(maps: list) -> NDArray:
-        stacked = np.stack(maps).astype(np.float32)
-        return stacked.repeat(STEP_PX, axis=1).repeat(STEP_PX, axis=2)[:, :height, :width]
-
-    return fine(bright), fine(depth)
+        bright = [
+            irradiance(coarse, (base + sign * TAU * step).astype(np.float32), slopes, rig, where) for step in STEPS
+        ]
+    stacked = (np.stack(bright) * rig.standoff_m**2).astype(np.float32)
+    return stacked.repeat(STEP_PX, axis=1).repeat(STEP_PX, axis=2)[:, :height, :width]
 
 
 def channels(
@@ -168,9 +175,11 @@ def channels(
 
     The base always exists: where even it lies outside the range, nothing better is known.
     """
-    expected, depth = candidate_brightness(scene, layer, rig, rotation.sign)
+    expected = candidate_brightness(scene, layer, rig, rotation.sign)
+    residual = layer.residual_phase(scene.phase_rad, scene.order)
     near, far = rig.working_range_mm
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.stack([layer.depth_of_residual_mm(residual + rotation.sign * TAU * step) for step in STEPS])
         exists = (depth > near - slack_mm) & (depth < far + slack_mm)
     exists[1] = True
     floor = np.float32(LEAST_BRIGHTNESS * rig.standoff_m**2)
@@ -181,17 +190,53 @@ def channels(
     cosine, sine = np.cos(scene.phase_rad), np.sin(scene.phase_rad)
     misfit = (scene.light - scene.bright * (1 + cosine)) / np.maximum(bright, np.float32(0.05))
     plane_misfit = np.arcsinh((scene.light - scene.plane_light) / np.float32(scene.noise)) / 4
-    residual = layer.residual_phase(scene.phase_rad, scene.order)
-    relief = np.nan_to_num(rotation.sign * (residual - scene.middle_rad) / TAU)
+    relief = np.nan_to_num(rotation.sign * (residual - scene.middle_rad)) / RELIEF_RAD
+    # What a pixel's own light would say of the correction, were its brightness right: light = g (1 + cos(phase + c)).
+    guess = -misfit * rotation.sign * sine / (sine * sine + SINE_FLOOR)
     unit = period_px / TAU
     along, across = (1, 0) if not rotation.transposed else (0, 1)
     flip = -1.0 if rotation.reversed else 1.0
     fitted = np.stack([
         cosine, rotation.sign * sine, np.log(bright) / 2, scene.weight, np.clip(misfit, -2, 2),
         flip * rotation.sign * unit * scene.slopes[along], rotation.sign * unit * scene.slopes[across],
-        ratio[0], ratio[1], ratio[2], exists[0], exists[2], np.clip(relief, -2, 2),
+        ratio[0], ratio[1], ratio[2], exists[0], exists[2], np.clip(relief, -4, 4), np.clip(guess, -1.5, 1.5),
     ]).astype(np.float32)  # fmt: skip
     fitted *= scene.weight > LEAST_WEIGHT
     seen = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
-    whole = np.concatenate([seen, fitted])
-    return np.ascontiguousarray(rotation.turn(np.nan_to_num(whole))), np.ascontiguousarray(rotation.turn(exists))
+    whole = rotation.turn(np.nan_to_num(np.concatenate([seen, fitted])))
+    sides = from_the_sides(scene, layer, rotation, period_px)
+    return np.concatenate([whole, sides]), np.ascontiguousarray(rotation.turn(exists))
+
+
+def around(misfit: NDArray) -> Image:
+    """Root mean square of a misfit in the pixel's surroundings."""
+    square = np.clip(misfit, -2, 2).astype(np.float32) ** 2
+    return np.sqrt(cv2.GaussianBlur(square, (0, 0), AROUND_PX, borderType=cv2.BORDER_REPLICATE))
+
+
+def from_the_sides(scene: Scene, layer: CalibrationLayer, rotation: Rotation, period_px: float) -> Image:
+    """The phase that each of `SIDES` would carry on to a pixel, less its own, and how badly its light then fits:
+    (17, h', w') float32, turned. Beside a depth edge the window of a pixel sees two surfaces; one further in sees one.
+    """
+    turn, sign = rotation.turn, np.float32(rotation.sign)
+    psi = turn(sign * wrapped(scene.phase_rad - layer.infinity_rad).astype(np.float32))
+    phase = turn(sign * scene.phase_rad)
+    down, right = (1, 0) if not rotation.transposed else (0, 1)
+    flip = np.float32(-1.0 if rotation.reversed else 1.0)
+    slope_down, slope_right = turn(flip * sign * scene.slopes[down]), turn(sign * scene.slopes[right])
+    reach = max(1, round(SIDE_PERIODS * period_px))
+    maps = np.stack([psi, slope_down, slope_right, turn(scene.bright), turn(scene.inside.astype(np.float32))])
+    height, width = psi.shape
+    padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
+    light = turn(scene.light)
+    corrections, misfits = [], [around(light / np.maximum(maps[3], np.float32(0.05)) - 1 - np.cos(phase))]
+    for row, column in SIDES:
+        dy, dx = round(row * reach), round(column * reach)
+        there = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
+        known = there[4] > 0
+        step = wrapped(there[0] - there[1] * np.float32(dy) - there[2] * np.float32(dx) - psi)
+        step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * known
+        misfit = light / np.maximum(there[3], np.float32(0.05)) - 1 - np.cos(phase + step)
+        corrections.append(step)
+        misfits.append(around(np.where(known, misfit, np.float32(2))))
+    return np.stack(corrections + misfits).astype(np.float32)

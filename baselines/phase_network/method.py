@@ -30,6 +30,7 @@ class PhaseNetMethod:
     name = "phase-net"
     uses_ground_truth_range = False
     units = "mm"
+    target = "depth"
     packages = ("numpy", "numba", "torch")
     device = "cpu"
 

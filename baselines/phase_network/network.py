@@ -1,22 +1,32 @@
 """The network: a small U-Net that works on 2 x 2 blocks of pixels and answers for every pixel.
 
 Three answers a pixel: a logit for each of three neighbouring orders, a logit for being object, and a correction of the
-phase that a tanh keeps within ``bound_rad``. It starts as the measured route: at the first step it moves nothing.
+phase within ``bound_rad``.
 """
 
+from copy import deepcopy
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, STEPS
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_SIDE, SIDES, STEPS
 from fpp_ml_bench.errors import NetworkError
 
 BLOCK = 2
 """Pixels along a block that the first layer takes at once."""
-BASE_LEAD = 4.0
-"""Logit by which the base order leads before anything is learned."""
+COARSE = 4
+"""Pixels along a block that the order's branch averages."""
+ORDER_SHARE = 0.1
+"""Of the order's gradient that reaches the branch of phase and mask."""
+OWN = FIRST_SIDE + len(SIDES)
+"""First of the channels that say how badly no correction, and each that is proposed, fits."""
+TRUST = 6.0
+"""Logits by which a proposal falls behind for a misfit of its brightness, before anything is learned."""
+LEAD = 2.5
+"""Logit by which the base order, and no correction, lead before anything is learned."""
 
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
@@ -30,47 +40,92 @@ def _layers(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*parts)
 
 
-class PhaseNet(nn.Module):
-    """(B, 17, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W).
+class UNet(nn.Module):
+    """(B, inputs, h, w) -> (B, widths[0], h, w); h and w multiples of 2^(levels - 1)."""
 
-    ``widths``: channels of each level, the first at half the image's resolution; ``bound_rad``: largest correction.
-    H and W must be multiples of ``stride``.
-    """
-
-    def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 80), fine: int = 16, bound_rad: float = 1.5708) -> None:
+    def __init__(self, inputs: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        widths = tuple(widths)
-        if len(widths) < 2 or min(widths) < 1 or fine < 1 or not 0 < bound_rad < 3.1416:
-            raise NetworkError(
-                f"expected two or more positive widths, fine above 0, bound_rad between 0 and pi; got widths {widths}, "
-                f"fine {fine}, bound_rad {bound_rad}"
-            )
-        self.options: dict[str, Any] = {"widths": list(widths), "fine": fine, "bound_rad": bound_rad}
-        self.bound_rad, self.stride = bound_rad, BLOCK * 2 ** (len(widths) - 1)
-        inputs = len(CHANNELS)
         self.encoder = nn.ModuleList(
-            _layers(inputs * BLOCK**2 if level == 0 else widths[level - 1], width) for level, width in enumerate(widths)
+            _layers(inputs if level == 0 else widths[level - 1], width) for level, width in enumerate(widths)
         )
         self.decoder = nn.ModuleList(
             _layers(widths[level] + widths[level + 1], widths[level]) for level in reversed(range(len(widths) - 1))
         )
-        self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
-        self.fine = nn.Sequential(nn.Conv2d(fine + inputs, fine, 3, padding=1), nn.ReLU(inplace=True))
-        self.answer = nn.Conv2d(fine, len(STEPS) + 2, 1)
-        nn.init.zeros_(self.answer.weight)
-        with torch.no_grad():
-            self.answer.bias.copy_(torch.tensor([0.0, BASE_LEAD, 0.0, 0.0, 0.0]))
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
-            raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
-        kept = []
-        deep = functional.pixel_unshuffle(x, BLOCK)
+    def forward(self, x: Tensor) -> Tensor:
+        kept, deep = [], x
         for level, block in enumerate(self.encoder):
             deep = block(functional.max_pool2d(deep, 2) if level else deep)
             kept.append(deep)
         for level, block in zip(reversed(range(len(kept) - 1)), self.decoder, strict=True):
             deep = block(torch.cat([kept[level], functional.interpolate(deep, scale_factor=2.0)], dim=1))
+        return deep
+
+
+class PhaseNet(nn.Module):
+    """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W).
+
+    The correction is an average of those that a pixel's surroundings propose (`inputs.SIDES`) and none, by weights that
+    the network decides, plus a part of its own of at most half of ``bound_rad``, cut off at ``bound_rad``.
+
+    ``widths``: channels of each level, the first at half the image's resolution; ``squeezed`` and ``fine``: of the maps
+    at full resolution, before and after them; ``order_widths``: of the branch that looks for the order, at a quarter of
+    the resolution. H and W must be multiples of ``stride``.
+    """
+
+    def __init__(
+        self, widths: tuple[int, ...] = (24, 32, 48, 64), fine: int = 14, squeezed: int = 20,
+        order_widths: tuple[int, ...] = (32, 48, 64), bound_rad: float = 1.5708,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        widths, order_widths = tuple(widths), tuple(order_widths)
+        if min((*widths, *order_widths, fine, squeezed)) < 1 or not 0 < bound_rad < 3.1416:
+            raise NetworkError(
+                f"expected positive widths and bound_rad between 0 and pi; got widths {widths}, order_widths "
+                f"{order_widths}, fine {fine}, squeezed {squeezed}, bound_rad {bound_rad}"
+            )
+        self.options: dict[str, Any] = {
+            "widths": list(widths), "fine": fine, "squeezed": squeezed, "order_widths": list(order_widths),
+            "bound_rad": bound_rad,
+        }  # fmt: skip
+        self.bound_rad = bound_rad
+        self.stride = max(BLOCK * 2 ** (len(widths) - 1), COARSE * 2 ** (len(order_widths) - 1))
+        self.squeeze = nn.Sequential(nn.Conv2d(len(CHANNELS), squeezed, 1), nn.ReLU(inplace=True))
+        self.body = UNet(squeezed * BLOCK**2, widths)
+        self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
+        self.fine = nn.Sequential(nn.Conv2d(fine + squeezed, fine, 3, padding=1), nn.ReLU(inplace=True))
+        self.answer = nn.Conv2d(fine, len(STEPS) + 2 + 1 + len(SIDES), 1)
+        self.trust = nn.Parameter(torch.tensor(TRUST))
+        self.order_body = UNet(len(CHANNELS), order_widths)
+        self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
+        nn.init.normal_(self.answer.weight, std=0.05)
+        with torch.no_grad():
+            self.answer.bias.zero_()
+            self.answer.bias[[1, 5]] = LEAD
+
+    def folded(self) -> "PhaseNet":
+        """The same network for asking alone, its normalisation folded into the convolutions: less to compute."""
+        ready = deepcopy(self).eval()
+        for body in (ready.body, ready.order_body):
+            for block in (*body.encoder, *body.decoder):
+                for place in (0, 3):
+                    block[place] = fuse_conv_bn_eval(block[place], block[place + 1])
+                    block[place + 1] = nn.Identity()
+        return ready.to(memory_format=torch.channels_last)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
+            raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
+        seen = self.squeeze(x)
+        deep = self.body(functional.pixel_unshuffle(seen, BLOCK))
         pixels = functional.pixel_shuffle(self.spread(deep), BLOCK)
-        out = self.answer(self.fine(torch.cat([pixels, x], dim=1)))
-        return out[:, :3], out[:, 3], self.bound_rad * torch.tanh(out[:, 4])
+        out = self.answer(self.fine(torch.cat([pixels, seen], dim=1)))
+        order = self.order_answer(self.order_body(functional.avg_pool2d(x, COARSE)))
+        order = functional.interpolate(order, scale_factor=float(COARSE), mode="bilinear", align_corners=False)
+        # The order's loss is loud where a whole region is wrong; it must not drown the phase's in what they share.
+        order = order + ORDER_SHARE * out[:, :3] + (1 - ORDER_SHARE) * out[:, :3].detach()
+        proposed, misfits = x[:, FIRST_SIDE:OWN], x[:, OWN:]
+        shares = torch.softmax(out[:, 5:] - self.trust * misfits, dim=1)[:, 1:]
+        taken = (shares * proposed).sum(dim=1)
+        correction = taken + 0.5 * self.bound_rad * torch.tanh(out[:, 4])
+        return order, out[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)

@@ -15,28 +15,30 @@ from fpp_ml_bench.frames import DIRECTIONS, Direction
 class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
 
-    ``widths``, ``fine`` and ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
+    ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
     ``weight_*``: of the losses; ``averaged``: decay of the weights' moving average, which is what is kept.
     Raises `RecipeError` for values that train nothing.
     """
 
     name: str = "phase-net"
-    steps: int = 2400
-    batch: int = 8
+    steps: int = 1500
+    batch: int = 6
     window: int = 160
-    rate: float = 2e-3
+    rate: float = 3e-3
     warm_up: int = 100
     decay: float = 1e-4
-    averaged: float = 0.995
+    averaged: float = 0.99
     seed: int = 42
-    widths: tuple[int, ...] = (32, 48, 64, 80)
-    fine: int = 16
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
     bound_rad: float = math.pi / 2
     directions: tuple[Direction, ...] = DIRECTIONS
     weight_order: float = 2.0
-    weight_mask: float = 2.0
-    weight_phase: float = 1.0
-    validate_every: int = 400
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    validate_every: int = 200
     vary: Variation = field(default_factory=Variation)
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, samples_of
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, score, train
-from fpp_ml_bench.baselines.phase_network.weights import NetConfig, save_net
+from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.training.history import CURVE_FILE, LOG_FILE, write_log
 from fpp_ml_bench.errors import TrainingError
@@ -53,9 +53,10 @@ class Trained:
 
 def train_phase_net(
     recipe: Recipe, dataset: Path, out: Path, minutes: float | None = None, bar: Bar = without_bar,
-    say: Callable[[str], None] = lambda line: None,
+    say: Callable[[str], None] = lambda line: None, extra: Path | None = None, start: Path | None = None,
 ) -> Trained:  # fmt: skip
-    """Train on the dataset's training split; the same call goes on where a stopped one was.
+    """Train on the dataset's training split, and on that of ``extra`` where it is given, from the weights in ``start``
+    or from none; the same call goes on where a stopped one was.
 
     Raises `DatasetError` for a dataset without the frames in question, `TrainingError` for a folder of another recipe
     or dataset.
@@ -63,14 +64,23 @@ def train_phase_net(
     opened = DatasetFolder(dataset)
     cv2.setNumThreads(1)
     out.mkdir(parents=True, exist_ok=True)
-    _claim(out / RECIPE_FILE, {"recipe": recipe.to_dict(), "dataset_fingerprint": opened.fingerprint})
+    more = None if extra is None else DatasetFolder(extra)
+    if more is not None and more.rig != opened.rig:
+        raise TrainingError(f"{extra}: was made by another rig than {dataset}; build both with the same one")
+    begun = None if start is None else load_net(start, folded=False)
+    described = recipe.to_dict() | ({} if more is None else {"extra_fingerprint": more.fingerprint})
+    described |= {} if begun is None else {"start_sha256": begun.sha256}
+    _claim(out / RECIPE_FILE, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
     geometries = {one: Geometry.of(opened.rig, Settings(direction=one)) for one in recipe.directions}
     names, held = opened.samples("train"), opened.samples("validation")
     samples: list[Sample] = []
     validation: list[Sample] = []
-    with bar("phase of the samples", (len(names) + len(held)) * len(geometries), "samples") as advance:
+    added = [] if more is None else more.samples("train")
+    with bar("phase of the samples", (len(names) + len(held) + len(added)) * len(geometries), "samples") as advance:
         for geometry in geometries.values():
             samples += samples_of(opened, names, geometry, advance)
+            if more is not None:
+                samples += samples_of(more, added, geometry, advance)
             validation += samples_of(opened, held, geometry, advance)
 
     def report(history: list[dict[str, Any]]) -> None:
@@ -78,7 +88,9 @@ def train_phase_net(
         say("  ".join(f"{key} {value:.4g}" for key, value in history[-1].items()))
 
     with bar(f"{recipe.name}, training", recipe.steps, "steps") as advance:
-        done = train(recipe, samples, validation[::5], geometries, out, report, advance, minutes)
+        done = train(
+            recipe, samples, validation[::5], geometries, out, report, advance, minutes, begun and begun.network
+        )
     write_log(out, done.history)
     draw(out / CURVE_FILE, done.history, recipe.name)
     if done.steps < recipe.steps:
@@ -90,7 +102,7 @@ def train_phase_net(
     config = NetConfig(
         name=recipe.name, title="Fringe order, mask and bounded phase correction", options=done.network.options,
         threshold=threshold, period_px={one: g.route.period_px for one, g in geometries.items()},
-        dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=recipe.to_dict(), validation=means,
+        dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=described, validation=means,
     )  # fmt: skip
     save_net(out / WEIGHTS_FILE, done.network, config)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)

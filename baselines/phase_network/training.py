@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines.phase_network.decide import IMPOSSIBLE, Answers, ask, decided_mask, decided_order
+from fpp_ml_bench.baselines.phase_network.decide import Answers, ask, decided_mask, decided_order
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
@@ -31,7 +31,9 @@ from fpp_ml_bench.errors import TrainingError
 CHECKPOINT_FILE = "checkpoint.safetensors"
 SMALL_RAD = 0.05
 """Error of the phase below which its loss is quadratic."""
-LARGEST_GRADIENT = 5.0
+IMPOSSIBLE = -1e4
+"""Logit of an order that puts its pixel out of the working range: finite, for gradients to stay so."""
+LARGEST_GRADIENT = 50.0
 
 
 @dataclass(frozen=True)
@@ -127,13 +129,22 @@ def batches(samples: list[Sample], geometries: dict[str, Geometry], recipe: Reci
 def train(
     recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[str, Geometry], out: Path,
     report: Callable[[list[dict[str, Any]]], None] = lambda history: None, tick: Callable[[int], None] = lambda n: None,
-    minutes: float | None = None,
+    minutes: float | None = None, start: PhaseNet | None = None,
 ) -> Done:  # fmt: skip
     """Train to the recipe's end, or to the first validation after ``minutes``, from the checkpoint in ``out`` where
-    there is one. Raises `TrainingError` for a checkpoint of another recipe, and for losses that diverge."""
+    there is one, else from the weights of ``start`` or none.
+
+    Raises `TrainingError` for a checkpoint of another recipe, and for losses that diverge.
+    """
     started = perf_counter()
     torch.manual_seed(recipe.seed)
-    network = PhaseNet(recipe.widths, recipe.fine, recipe.bound_rad).to(memory_format=torch.channels_last)
+    network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad).to(
+        memory_format=torch.channels_last
+    )
+    if start is not None:
+        if start.options != network.options:
+            raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+        network.load_state_dict(start.state_dict())
     averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
     optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
     history: list[dict[str, Any]] = []

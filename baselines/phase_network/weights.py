@@ -98,8 +98,8 @@ def save_net(path: Path, network: "PhaseNet", config: NetConfig) -> str:
     return sha256(data).hexdigest()
 
 
-def load_net(name_or_path: str | Path = DEFAULT) -> NetFile:
-    """Configuration and network (float32, for asking) of shipped weights or of a file.
+def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile:
+    """Configuration and network of shipped weights or of a file, float32; `PhaseNet.folded` for asking, or to go on.
 
     Raises `WeightsError`, naming the file, what was expected, what came and the cure, for a file that is absent,
     damaged, of another kind or version, or whose tensors do not fit its configuration.
@@ -131,8 +131,7 @@ def load_net(name_or_path: str | Path = DEFAULT) -> NetFile:
         raise WeightsError(f"{shown}: its tensors are not those of its network: {printable(str(error), 300)}") from None
     if not all(bool(torch.isfinite(t).all()) for t in network.state_dict().values()):
         raise WeightsError(f"{shown}: holds values that are not finite; copy or train it again")
-    ready = network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return NetFile(path, config, ready, sha256(data).hexdigest())
+    return NetFile(path, config, network.folded() if folded else network, sha256(data).hexdigest())
 
 
 def _config(shown: str, data: bytes) -> NetConfig:

@@ -13,7 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, SHADING, STEP_PX, Image, Scene, channels
+from fpp_ml_bench.baselines.phase_network.inputs import (
+    CHANNELS,
+    FIRST_SIDE,
+    SHADING,
+    SIDES,
+    STEP_PX,
+    Image,
+    Scene,
+    channels,
+)
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.phase_route.shading import irradiance
@@ -22,19 +31,21 @@ from fpp_ml_bench.constants import MM_PER_M
 IGNORED = -100
 """Class of a pixel whose order teaches nothing: background, or none of the three candidates is right."""
 _MIRRORED = CHANNELS.index("slope across")
+_PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
+_OWN = FIRST_SIDE + len(SIDES)
+_SWAPPED = [FIRST_SIDE + place for place in _PARTNERS] + [_OWN] + [_OWN + 1 + place for place in _PARTNERS]
 
 
 @dataclass(frozen=True)
 class Variation:
     """How often (0 to 1) and how much windows are varied; 0 throughout leaves them as they were captured."""
 
-    near_edge: float = 0.6
+    near_edge: float = 0.7
     shift: float = 0.5
     margin_mm: float = 60.0
     brightness: float = 0.04
-    wrong_window: float = 0.1
-    wrong_patch: float = 0.25
-    patch_periods: float = 2.0
+    wrong_window: float = 0.15
+    wrong_patch: float = 0.3
     no_shading: float = 0.1
     mirror: float = 0.5
 
@@ -171,4 +182,5 @@ def _labelled(
 def _mirrored(window: Window) -> Window:
     flipped = {name: getattr(window, name)[..., ::-1].copy() for name in Window.__dataclass_fields__}
     flipped["x"][_MIRRORED] *= -1
+    flipped["x"][FIRST_SIDE:] = flipped["x"][_SWAPPED]
     return Window(**flipped)

@@ -29,6 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minutes", type=float, metavar="M", help="stop before an epoch that would outlast them, everything saved"
     )
+    parser.add_argument(
+        "--extra",
+        type=Path,
+        metavar="DATASET",
+        help="phase-net: a dataset whose training split is learned from besides",
+    )
+    parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,6 +52,9 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     if args.recipe == PHASE_NET:
         return _phase_net(args)
+    for option in ("extra", "start"):
+        if getattr(args, option) is not None:
+            raise RecipeError(f"--{option} is an option of phase-net; leave it out")
     recipe = load_recipe(args.recipe, args.preset)
     done = train(recipe, args.dataset, args.out, minutes=args.minutes)
     if not PartialState().is_main_process:
@@ -69,7 +79,7 @@ def _phase_net(args: argparse.Namespace) -> int:
     from fpp_ml_bench.commands.console import progress_bar
 
     recipe = Recipe()
-    done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print)
+    done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
     if done.weights is None:
         print(f"{args.out}: stopped after {done.steps} of {recipe.steps} steps, all saved; the same command goes on")
         return CHECK_FAILED

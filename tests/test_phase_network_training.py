@@ -1,0 +1,156 @@
+"""Training phase-net: windows that are what another scene would show, stopping and going on, weights on disk."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from flat_planes import plane_depth_m, plane_fringe
+
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Rotation
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.recipe import Recipe
+from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sample_of
+from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, train
+from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
+from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
+from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.weights_file import SHIPPED
+from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
+from fpp_ml_bench.rig import paper_rig
+
+RIG = paper_rig(240)
+AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, no_shading=0, mirror=0, brightness=0)
+OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0}
+SMALL = Recipe(
+    steps=4, batch=2, window=48, warm_up=1, widths=(4, 6), fine=4, squeezed=6, order_widths=(4, 6), bound_rad=1.0,
+    validate_every=2, directions=("horizontal",),
+)  # fmt: skip
+CONFIG = NetConfig(
+    name="small", title="Small", options=OPTIONS, threshold=-1.0,
+    period_px={"horizontal": 5.6}, dataset_fingerprint="0" * 64,
+)  # fmt: skip
+
+
+def geometry(direction: str = "horizontal") -> Geometry:
+    return Geometry.of(RIG, Settings(direction=direction))  # type: ignore[arg-type]
+
+
+def plane(distance_m: float, direction: str = "horizontal") -> Sample:
+    """A tilted plane that fills the frame."""
+    tilt = (0.1, -0.1)
+    depth_m = plane_depth_m(RIG, distance_m, tilt)
+    image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3)
+    return sample_of(image, (1000 * depth_m).astype(np.float32), "plane_A0", geometry(direction))
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> None:
+    """Against the benchmark's own light and sensor on a plane at the other distance: fringe, brightness, candidates."""
+    here = geometry(direction)
+    moved = replace(AS_CAPTURED, shift=1.0, margin_mm=300.0)  # the range's middle: 1.8 m
+    random = [np.random.default_rng(1) for _ in range(2)]
+    made = draw([plane(1.7, direction)], {direction: here}, 240, moved, random[0])
+    real = draw([plane(1.8, direction)], {direction: here}, 240, AS_CAPTURED, random[1])
+    lit = made.fitted & real.fitted & (made.x[CHANNELS.index("window share")] > 0.9)
+    lit &= made.x[CHANNELS.index("brightness")] > -0.5  # the projector's field ends before the camera's
+    assert lit.mean() > 0.5
+    for name, tolerance in (("brightness", 0.03), ("base: brightness misfit", 0.05), ("slope along", 0.02)):
+        channel = CHANNELS.index(name)
+        assert np.abs(np.median(made.x[channel][lit] - real.x[channel][lit])) < tolerance, name
+    # Fringe and phase part by what an object keeps and a frame-filling plane does not: its place in the image.
+    assert np.abs(made.x[CHANNELS.index("fit misfit")][lit]).mean() < 0.03
+    assert (made.order[lit] == 1).mean() > 0.99
+    assert np.abs(made.correction_rad[lit]).mean() < 0.05
+
+
+def test_wrong_first_orders_are_labelled_as_such() -> None:
+    vary = replace(AS_CAPTURED, wrong_window=1.0)
+    samples, here = [plane(1.8)], {"horizontal": geometry()}
+    orders = []
+    for seed in range(4):
+        window = draw(samples, here, 96, vary, np.random.default_rng(seed))
+        assert np.take_along_axis(window.exists, np.maximum(window.order, 0)[None], 0)[0][window.fitted].all()
+        orders += [window.order[window.fitted]]
+    found = np.unique(np.concatenate(orders))
+    assert {0, 2} & set(found.tolist())
+    captured = draw(samples, here, 96, AS_CAPTURED, np.random.default_rng(0))
+    assert (captured.order[captured.fitted] == 1).mean() > 0.95
+
+
+def test_turning_for_the_network_and_back() -> None:
+    image = np.arange(24.0).reshape(2, 3, 4)
+    for transposed in (False, True):
+        for reverse in (False, True):
+            turn = Rotation(transposed, reverse, 1.0)
+            assert np.array_equal(turn.back(turn.turn(image)), image)
+            assert turn.turn(image).shape == ((2, 4, 3) if transposed else (2, 3, 4))
+
+
+def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
+    samples, here = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    at_once = train(SMALL, samples, samples[:1], here, tmp_path / "a")
+    first = train(SMALL, samples, samples[:1], here, tmp_path / "b", minutes=0.0)
+    assert (first.steps, at_once.steps) == (2, 4)
+    second = train(SMALL, samples, samples[:1], here, tmp_path / "b")
+    assert [record["step"] for record in second.history] == [2, 4]
+    for name, value in at_once.network.state_dict().items():
+        assert torch.equal(value, second.network.state_dict()[name]), name
+    assert at_once.history[-1]["loss_phase"] == second.history[-1]["loss_phase"]
+    with pytest.raises(TrainingError, match="another recipe"):
+        train(replace(SMALL, seed=1), samples, samples[:1], here, tmp_path / "b")
+    assert (tmp_path / "b" / CHECKPOINT_FILE).exists()
+
+
+def test_recipes_that_train_nothing_are_refused() -> None:
+    for wrong in ({"steps": 0}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0}):
+        with pytest.raises(RecipeError):
+            replace(SMALL, **wrong)  # type: ignore[arg-type]
+    assert SMALL.digest != replace(SMALL, rate=1e-3).digest
+    assert SMALL.rate_at(0) > SMALL.rate_at(3) > 0
+
+
+def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
+    network = PhaseNet(**OPTIONS)
+    torch.nn.init.normal_(network.answer.weight)
+    network(torch.rand(2, len(CHANNELS), 24, 24))  # the normalisation has seen something
+    path = tmp_path / "small.safetensors"
+    digest = save_net(path, network, CONFIG)
+    assert save_net(tmp_path / "again.safetensors", network, CONFIG) == digest
+    found = load_net(path)
+    assert (found.sha256, found.config) == (digest, CONFIG)
+    x = torch.rand(1, len(CHANNELS), 24, 24)
+    with torch.inference_mode():
+        for mine, theirs in zip(network.eval()(x), found.network(x), strict=True):
+            assert torch.allclose(mine, theirs, atol=5e-3)
+            assert mine.std() > 0.01
+
+
+def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "small.safetensors"
+    save_net(path, PhaseNet(**OPTIONS), CONFIG)
+    data = path.read_bytes()
+    cut, junk, wider = tmp_path / "cut.safetensors", tmp_path / "junk.safetensors", tmp_path / "wider.safetensors"
+    cut.write_bytes(data[:-100])
+    junk.write_bytes(b"not weights at all")
+    save_net(wider, PhaseNet(**OPTIONS), replace(CONFIG, options=OPTIONS | {"widths": [4, 8]}))
+    unet = next(SHIPPED.glob("*.safetensors"))
+    for file, said in (
+        (tmp_path / "none.safetensors", "found nothing"), (cut, "damaged"), (junk, "cut off|damaged"),
+        (unet, "expected fpp-ml-bench phase-net"), (wider, "not those of its network"),
+    ):  # fmt: skip
+        with pytest.raises(WeightsError, match=said):
+            load_net(file)
+    with pytest.raises(WeightsError, match="phase-nut"):
+        load_net("phase-nut")
+    bad = PhaseNet(**OPTIONS)
+    with torch.no_grad():
+        bad.answer.bias[0] = float("nan")
+    with pytest.raises(WeightsError, match="not finite"):
+        save_net(path, bad, CONFIG)
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    assert header["__metadata__"]["format"] == "fpp-ml-bench phase-net"
