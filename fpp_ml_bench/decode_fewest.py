@@ -50,19 +50,6 @@ def wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coo
     return found
 
 
-def with_orders(
-    found: dict[Direction, Coordinates], rays: Maps, rig: Rig, joint: JointCode
-) -> dict[Direction, Coordinates]:
-    """Coordinates of a block from both wrapped phases: the pair of orders within the range that lies nearest to the
-    pixel's epipolar line. Pixels without one within ``joint.tolerance_px`` are DIRECTIONS_DISAGREE."""
-    orders, off_px = nearest_pair(found, rays, rig, joint.tolerance_px)
-    result = {name: _with_order(one, orders[name], rig, name) for name, one in found.items()}
-    unclear = ~(off_px <= joint.tolerance_px)
-    for one in result.values():
-        one.reason[unclear & (one.reason == 0)] = Reason.DIRECTIONS_DISAGREE
-    return result
-
-
 def nearest_pair(
     found: dict[Direction, Coordinates], rays: Maps, rig: Rig, tolerance_px: float
 ) -> tuple[dict[Direction, NDArray[np.float64]], NDArray[np.float64]]:
@@ -103,7 +90,8 @@ def nearest_pair(
     return {AXES[a]: order_a, AXES[b]: order_b}, nearest
 
 
-def _with_order(found: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
+def with_order(found: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
+    """Coordinates of one direction from its wrapped phase and its orders (n,), as the Gray code would have given."""
     absolute = found.phase + 2 * np.pi * order
     coordinate = absolute * (rig.pitch(direction) / (2 * np.pi))
     reason = found.reason.copy()

@@ -206,6 +206,7 @@ def joint_orders(  # type: ignore[no-untyped-def]
     fa, fb, ca, cb = focal[axis], focal[other], centre[axis], centre[other]
     near, far = depths
     pa, pb = pitches
+    inverse_a, inverse_b, per_rad_a, per_rad_b = 1.0 / pa, 1.0 / pb, pa / _TAU, pb / _TAU
     for i in range(len(x)):
         a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
         b = rotation[other, 0] * x[i] + rotation[other, 1] * y[i] + rotation[other, 2]
@@ -219,12 +220,13 @@ def joint_orders(  # type: ignore[no-untyped-def]
         along, across = a_far - a_near, b_far - b_near
         slope, share = across / along, abs(along) / math.sqrt(along * along + across * across)
         low, high = min(a_near, a_far) - tolerance, max(a_near, a_far) + tolerance
-        start = math.ceil(low / pa - first[i] / _TAU)
+        start = math.ceil((low - first[i] * per_rad_a) * inverse_a)
+        one = first[i] * per_rad_a + start * pa
+        offset = b_near - second[i] * per_rad_b
         for step in range(tries):
-            order = start + step
-            one = (first[i] + _TAU * order) * (pa / _TAU)
-            predicted = b_near + (one - a_near) * slope
-            found = math.floor(predicted / pb - second[i] / _TAU + 0.5)
-            off = abs((second[i] + _TAU * found) * (pb / _TAU) - predicted) * share
+            beyond = offset + (one - a_near) * slope  # of the other direction's zeroth order, in its px
+            found = math.floor(beyond * inverse_b + 0.5)
+            off = abs(found * pb - beyond) * share
             if (off < nearest[i]) & (one <= high):
-                nearest[i], order_first[i], order_second[i] = off, order, found
+                nearest[i], order_first[i], order_second[i] = off, start + step, found
+            one += pa

@@ -13,17 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decode_blocks import (
-    Coordinates,
-    DirectionPlan,
-    Limits,
-    Reason,
-    decode_direction,
-    plan_direction,
-    verdict,
-)  # fmt: skip
-from fpp_ml_bench.decode_fewest import fewest_plans, with_orders, wrapped
-from fpp_ml_bench.decode_reach import reach_is_bounded, within_reach
+from fpp_ml_bench.decode_blocks import Limits, Reason, plan_direction
+from fpp_ml_bench.decode_fewest import fewest_plans
+from fpp_ml_bench.decode_image import BLOCK_PX, WORTH_PICKING, DecodedImage, Measured
+from fpp_ml_bench.decode_reach import reach_is_bounded
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.fewest import JointCode
 from fpp_ml_bench.frame_check import check_frames
@@ -32,22 +25,6 @@ from fpp_ml_bench.rig import Rig
 from fpp_ml_bench.skipping import skipping_enabled
 
 Directions = Literal["horizontal", "vertical", "both"]
-
-BLOCK_PX = 1 << 15
-"""Pixels worked off at a time: the grey levels of a block, 0.8 MB a direction, and its results stay in the cache."""
-WORTH_PICKING = 0.6
-"""Up to this part of a block, its pixels are picked out one by one for the second direction; beyond, reading the whole
-block in order is faster."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One direction of the image: ``coordinate_px`` float64 (NaN = not decoded), ``modulation`` float32 grey levels and
-    ``phase`` float64 rad in [-pi, pi), each (H, W)."""
-
-    coordinate_px: NDArray[np.float64]
-    modulation: NDArray[np.float32]
-    phase: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -133,9 +110,9 @@ def decode_stack(
     ``steps``: how many of the N sinusoids a direction to use, 3 to N (default: all), spread as evenly as they go; where
     they are not quite even (N not a multiple), the phase is the least-squares one.
 
-    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and cost nothing. ``threads``: the result
-    is the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return coordinates,
-    modulation and wrapped phase.
+    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and have no influence. ``threads``: the
+    result is the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return
+    coordinates, modulation and wrapped phase.
 
     ``reasons`` False: depth is all that is asked for. Then a pixel that one direction already shows to lie outside the
     working range (`fpp_ml_bench.decode_reach`), or to have no coordinate, is not looked at in the other direction:
@@ -168,7 +145,13 @@ def decode_stack(
     for plan in plans:
         check_frames(flat, plan, chosen, rig.sequence)
     depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
-    image = _Image(flat, rig, plans, limits, chosen, details, depth_alone and joint is None, joint)
+    # A mask that leaves little out: whole blocks, and the rest thrown away, is faster than picking pixels out.
+    dense = (
+        chosen is not None and not details and len(chosen) > WORTH_PICKING * shape[0] * shape[1] and skipping_enabled()
+    )
+    image = DecodedImage(
+        flat, rig, plans, limits, None if dense else chosen, details, depth_alone and joint is None, joint
+    )
     starts, second_px = range(0, image.pixels, BLOCK_PX), 0
     if threads == 1 or len(starts) < 2:
         for start in starts:
@@ -176,6 +159,8 @@ def decode_stack(
     else:
         with ThreadPoolExecutor(threads) as pool:
             second_px = sum(pool.map(image.decode_from, starts))
+    if dense and mask is not None:
+        image.keep(np.asarray(mask).reshape(-1))
     counts = np.bincount(image.reason, minlength=len(Reason))
     return Decoded(
         depth_mm=image.depth_mm.reshape(shape),
@@ -185,95 +170,3 @@ def decode_stack(
         details={one: image.measured(one, shape) for one in asked} if details else {},
         second_px=second_px if len(plans) == 2 else 0,
     )
-
-
-class _Image:
-    """The flat results, and the work on one block of them; blocks touch disjoint pixels."""
-
-    def __init__(
-        self,
-        frames: dict[int, NDArray],
-        rig: Rig,
-        plans: list[DirectionPlan],
-        limits: Limits,
-        chosen: NDArray[np.intp] | None,
-        details: bool,
-        depth_alone: bool,
-        joint: JointCode | None,
-    ) -> None:
-        size = rig.camera.height * rig.camera.width
-        self.frames, self.rig, self.plans, self.limits, self.chosen = frames, rig, plans, limits, chosen
-        self.depth_alone, self.joint = depth_alone, joint
-        self.pixels = size if chosen is None else len(chosen)
-        self.depth_mm = np.zeros(size, dtype=np.float32)
-        self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
-        self.rays = tuple(axis.reshape(-1) for axis in rig.camera.rays())
-        self.details: dict[Direction, Coordinates] = {}
-        if details:
-            for plan in plans:
-                u, b, phi = (np.full(size, np.nan) for _ in range(3))
-                self.details[plan.direction] = Coordinates(u, b, phi, reason=np.zeros(size, dtype=np.uint8))
-
-    def decode_from(self, start: int) -> int:
-        """Decode one block; returns of how many of its pixels every direction was looked at."""
-        stop = min(start + BLOCK_PX, self.pixels)
-        where = slice(start, stop) if self.chosen is None else self.chosen[start:stop]
-        found = {self.plans[0].direction: self._coordinates(self.plans[0], where, stop - start)}
-        if self.depth_alone:
-            first = found[self.plans[0].direction]
-            rays = self.rays[0][where], self.rays[1][where]
-            reached = within_reach(first.coordinate_px, rays, self.plans[0], self.rig, self.limits)
-            no_depth = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
-            where, found = self._narrowed(start, where, found, reached & (first.reason == 0), no_depth)
-        looked_at = len(next(iter(found.values())).reason)
-        for plan in self.plans[1:]:
-            found[plan.direction] = self._coordinates(plan, where, looked_at)
-        if self.joint:
-            found = with_orders(found, (self.rays[0][where], self.rays[1][where]), self.rig, self.joint)
-            no_depth = np.minimum(*(np.where(one.reason == 0, Reason.NOT_ASKED, one.reason) for one in found.values()))
-            if not self.details:
-                where, found = self._narrowed(start, where, found, no_depth == Reason.NOT_ASKED, no_depth)
-        rays = self.rays[0][where], self.rays[1][where]
-        self.depth_mm[where], self.reason[where] = verdict(found, rays, self.plans, self.rig, self.limits)
-        for direction, kept_details in self.details.items():
-            one = found[direction]
-            kept_details.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
-            kept_details.modulation[where], kept_details.phase[where] = one.modulation, one.phase
-        return looked_at
-
-    def _narrowed(
-        self,
-        start: int,
-        where: slice | NDArray[np.intp],
-        found: dict[Direction, Coordinates],
-        open_yet: NDArray[np.bool_],
-        reason: NDArray[np.uint8],
-    ) -> tuple[slice | NDArray[np.intp], dict[Direction, Coordinates]]:
-        """A block reduced to its pixels that are ``open_yet``, where they are few; the others get their ``reason``."""
-        kept = np.flatnonzero(open_yet)
-        if len(kept) > WORTH_PICKING * len(open_yet):
-            return where, found
-        self.reason[where] = reason
-        there = kept + start if isinstance(where, slice) else where[kept]
-        return there, {direction: one.at(kept) for direction, one in found.items()}
-
-    def _coordinates(self, plan: DirectionPlan, where: slice | NDArray[np.intp], count: int) -> Coordinates:
-        """One direction at ``count`` pixels, its frames' grey levels gathered first."""
-        levels = np.empty((len(plan.rows), count), dtype=np.uint8)
-        for row, index in zip(levels, plan.rows, strict=True):
-            if index in plan.known:
-                row[:] = plan.known[index]
-            elif isinstance(where, slice):
-                row[:] = self.frames[index][where]
-            else:
-                # Every index is one of the image's: "clip" only saves the check, and a copy with it.
-                self.frames[index].take(where, out=row, mode="clip")
-        return wrapped(levels, plan, self.limits) if self.joint else decode_direction(levels, plan, self.limits)
-
-    def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
-        kept = self.details[direction]
-        return Measured(
-            kept.coordinate_px.reshape(shape),
-            kept.modulation.astype(np.float32).reshape(shape),
-            kept.phase.reshape(shape),
-        )

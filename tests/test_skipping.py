@@ -11,7 +11,7 @@ from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 from fpp_ml_bench.acceleration import SWITCH as COMPILED
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.prediction import captured_frames
-from fpp_ml_bench.decode_blocks import Limits
+from fpp_ml_bench.decode_blocks import Limits, Reason
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.backdrop import Backdrop
 from fpp_ml_bench.loaders.build import build
@@ -166,6 +166,20 @@ def test_inside_a_mask_the_bytes_are_those_of_the_whole_image():
     # Frames in which everything outside the mask is destroyed: nothing there is looked at.
     destroyed = [np.where(mask, frame, 255 - frame).astype(np.uint8) for frame in frames]
     np.testing.assert_array_equal(decode_stack(destroyed, PAPER, mask=mask).depth_mm, part.depth_mm)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_a_mask_costs_nothing_in_exactness_however_much_it_covers(share):
+    frames = capture(PAPER, tilted(PAPER))
+    mask = np.zeros(tilted(PAPER).shape, dtype=bool)
+    mask[: int(share * len(mask))] = True
+    whole = decode_stack(frames, PAPER)
+    with skipping(False):
+        off = decode_stack(frames, PAPER, mask=mask)
+    for found in (off, decode_stack(frames, PAPER, mask=mask)):
+        np.testing.assert_array_equal(found.depth_mm, np.where(mask, whole.depth_mm, 0))
+        np.testing.assert_array_equal(found.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
+        assert sum(found.counts.values()) == mask.size and found.counts["not_asked"] == (~mask).sum()
 
 
 def test_an_image_without_object_never_reads_the_second_direction():
