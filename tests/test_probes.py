@@ -154,7 +154,8 @@ def test_pixels_of_a_coarse_layer_are_those_of_the_upsampled_one():
 
 def test_activations_are_taken_before_a_later_layer_works_in_place_on_them():
     network = nn.Sequential(nn.Conv2d(1, 2, 1), nn.ReLU(inplace=True))
-    image = torch.randn(1, 1, 4, 4)
+    network[0].weight.data[:] = torch.tensor([1.0, -1.0]).view(2, 1, 1, 1)
+    image = torch.linspace(-2, 3, 16).view(1, 1, 4, 4)
     expected = network[0](image)
     assert (expected < 0).any()
     with tapped({"conv": network[0]}, lambda features: at_size(features, (4, 4))) as caught:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
 BATCH = 8
+PIXELS_AT_ONCE = BATCH * 224 * 224
+"""Images in a batch at most, and their pixels: a full-width network at 960 px is looked into one image at a time."""
 INPUT = "input"
 """The raw input as a layer of its own: the control that every layer is measured against."""
 
@@ -57,12 +59,18 @@ def run(network: nn.Module, fringe: Tensor, layers: Sequence[str], caught: dict[
 
 
 def batches(
-    subject: Subject, dataset: "DatasetFolder", samples: Sequence[str], size: int = BATCH
+    subject: Subject, dataset: "DatasetFolder", samples: Sequence[str], size: int | None = None
 ) -> Iterator[tuple[list[str], Tensor]]:
-    """``samples`` in batches, with their input (B, 1, H, W)."""
+    """``samples`` in batches of ``size`` (default: `batch_size`), with their input (B, 1, H, W)."""
+    size = batch_size(subject) if size is None else size
     for start in range(0, len(samples), size):
         names = list(samples[start : start + size])
         yield names, subject.input_batch([subject.captured(dataset, name) for name in names])
+
+
+def batch_size(subject: Subject) -> int:
+    """Images in a batch, for networks that keep what they compute."""
+    return max(1, min(BATCH, PIXELS_AT_ONCE // (subject.image_size[0] * subject.image_size[1])))
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:

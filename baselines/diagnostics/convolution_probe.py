@@ -2,9 +2,10 @@
 
 The paper (Section 7.1) says "four convolutional layers" and no more; the rest is ours. 1 x 1 to `WIDTH` channels, two
 of 3 x 3, 1 x 1 to the target, ReLU between: the first is narrow so that layers of 8 and of 1024 channels get probes of
-about the same power, and the reach is 5 x 5 grid points. Activations are brought to `SHARE` of the image's sides (mean
-over areas where finer, bilinear where coarser), targets to the same grid, channels to mean 0 and spread 1 on training
-samples. Adam, cosine decay. All probes learn from one pass of the network over a batch, so that no activation is kept.
+about the same power, and the reach is 5 x 5 grid points. Activations are brought to a grid of a quarter of the image's
+sides (`grid_step`): mean over areas where finer, bilinear where coarser; targets too. Channels get mean 0 and spread 1
+over the training samples. Adam, cosine decay. All probes learn from one pass of the network over a batch, so that no
+activation is kept.
 """
 
 from collections.abc import Mapping
@@ -14,12 +15,17 @@ import torch
 from torch import Tensor, nn
 
 WIDTH = 16
-SHARE = 4
-"""Image px a grid step."""
+SHARE, LONGEST = 4, 120
+"""Image px a grid step, and grid points along a side at most, above which a step holds more px."""
 LEARNING_RATE = 3e-3
 EPOCHS = 6
 BATCH = 4
 _LEAST_SPREAD = 1e-6
+
+
+def grid_step(size: tuple[int, int]) -> int:
+    """Image px a grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
+    return max(SHARE, -(-max(size) // LONGEST))
 
 
 @dataclass

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.activations import BATCH, batches
+from fpp_ml_bench.baselines.diagnostics.activations import batch_size, batches
 from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, correlation
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
 from fpp_ml_bench.baselines.diagnostics.subject import Subject
@@ -113,7 +113,7 @@ def maps(
 ) -> Iterator[tuple[str, dict[str, Image]]]:
     """Each sample with its heatmaps by layer, float32 (H, W), ReLU taken, a batch at a time."""
     found = subject.layers_of(network)
-    for names, fringe in batches(subject, dataset, samples, BATCH):
+    for names, fringe in batches(subject, dataset, samples):
         heat = heatmaps(network, {name: found[name] for name in layers}, fringe)
         for place, sample in enumerate(names):
             yield sample, {layer: one[place].clamp(min=0).numpy() for layer, one in heat.items()}
@@ -144,8 +144,9 @@ def measure(
     found = Correlations(tuple(layers), [split_sample_name(name)[0] for name in samples])
     total, done = len(samples) * (1 + seeds), 0
     others: list[Any] = [untrained(seed) for seed in range(seeds)]
-    for start in range(0, len(samples), BATCH):
-        part = samples[start : start + BATCH]
+    batch = batch_size(subject)
+    for start in range(0, len(samples), batch):
+        part = samples[start : start + batch]
         own = dict(maps(subject, network, dataset, part, layers))
         known = {sample: references(subject, dataset, sample) for sample in part}
         for sample in part:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpp_ml_bench.baselines.diagnostics.activations import INPUT
-from fpp_ml_bench.baselines.diagnostics.convolution_probe import BATCH, EPOCHS, SHARE, WIDTH
+from fpp_ml_bench.baselines.diagnostics.convolution_probe import BATCH, EPOCHS, WIDTH, grid_step
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
 from fpp_ml_bench.baselines.diagnostics.scores import (
     CONTROLS,
@@ -65,7 +65,8 @@ class LinearProbing:
             {
                 "protocol": {
                     "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
-                    "epochs": epochs, "batch": BATCH, "probe_width": WIDTH, "image_px_a_grid_step": SHARE,
+                    "epochs": epochs, "batch": BATCH, "probe_width": WIDTH,
+                    "image_px_a_grid_step": grid_step(subject.image_size),
                 },
                 "four_convolutions": _plain(spatial),
                 "ratio": mean_ratio(spatial[TRAINED]),

@@ -160,8 +160,8 @@ def spatial_errors(
     """Errors of the four-convolution probes of each of ``networks``, by network, layer, target and seed, and of the
     mean; the raw input is network and layer `INPUT`. Trained on ``train`` side by side for ``epochs``, as often as
     ``seeds`` says of each network."""
-    height, width = subject.image_size
-    side = max(1, height // convolution.SHARE), max(1, width // convolution.SHARE)
+    step = convolution.grid_step(subject.image_size)
+    side = max(1, subject.image_size[0] // step), max(1, subject.image_size[1] // step)
 
     def stream(samples: Sequence[str], doing: str, use: Callable[[dict[str, Tensor], dict[str, Tensor]], None]) -> None:
         for names, fringe in batches(subject, dataset, samples, convolution.BATCH):
