@@ -57,6 +57,9 @@ class Moments:
 class ConvolutionProbe(nn.Module):
     """Four convolutions from activations (B, C, h, w) to one target (B, 1, h, w); starts at ``target_mean``."""
 
+    mean: Tensor
+    factor: Tensor
+
     def __init__(self, moments: Moments, target_mean: float) -> None:
         super().__init__()
         mean, factor = moments.standard()

@@ -67,9 +67,9 @@ def edge_map(depth_mm: NDArray) -> Image:
     depth = np.asarray(depth_mm, dtype=np.float32)
     across = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=3)
     down = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=3)
-    strength = np.sqrt(across * across + down * down)
+    strength = np.hypot(across, down).astype(np.float32)
     top = float(strength.max())
-    return strength / np.float32(top) if top > 0 else strength
+    return (strength / top).astype(np.float32) if top > 0 else strength
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
