@@ -32,9 +32,13 @@ from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.network_method import NetworkMethod
 from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
 from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.reliance import RELIANCE_VERSION
+from fpp_ml_bench.leaderboard.columns import reliance_interval
+from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
+from fpp_ml_bench.loaders.manifest import write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.normalisation import denormalise
 
@@ -142,6 +146,31 @@ def fill(bench: Bench, path: Path, again: bool) -> str:
     return f"{found.score:.3f} ({low} to {high}), {time.perf_counter() - started:.1f} s"
 
 
+def table(entries: list[Entry]) -> str:
+    """Every row that has a phase reliance as Markdown, the highest score first."""
+    titles = ("Row", "Reliance", "95% interval", "Periods aside", "Follows phase", "Follows brightness",
+              "Change by outline", "No fringe inside", "No fringe outside", "Object MAE, mm", "Track")  # fmt: skip
+    measured = [(entry, entry.reliance) for entry in entries if entry.reliance is not None]
+    measured.sort(key=lambda one: (-one[1].score, one[0].name))
+    lines = []
+    for entry, found in measured:
+        parts = found.parts
+        values = (parts.follows_phase, parts.follows_light, parts.change_outline, parts.change_no_fringe_inside,
+                  parts.change_no_fringe_outside)  # fmt: skip
+        cells = [entry.name, f"{found.score:.3f}", reliance_interval(entry), _two(found.order_free_score)]
+        cells += [*map(_two, values), millimetres(entry.value("object_mae_mm")), entry.result.track]
+        lines.append([markdown_text(cell) for cell in cells])
+    right = [0 < place < len(titles) - 1 for place in range(len(titles))]
+    made = (
+        "Made by `python benchmarks/reliance_rows.py --table docs/tables/reliance.md` from the rows that have a block."
+    )
+    return "\n".join([*markdown_rows(titles, right, lines), "", made]) + "\n"
+
+
+def _two(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__.split("\n", 1)[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
@@ -151,11 +180,14 @@ def main() -> int:
     parser.add_argument("--rows", type=Path, default=SHIPPED_ROWS, help="folder of the rows")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows alone, by file name without .json")
     parser.add_argument("--views", type=int, default=VIEWS_PER_OBJECT, help="samples of each test object")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="write the rows' reliance as Markdown here")
     parser.add_argument("--again", action="store_true", help="measure rows that have a block anew")
     args = parser.parse_args()
     bench = Bench(args.data, args.runs, args.views)
     paths = [path for path in sorted(args.rows.glob("*.json")) if not args.only or path.stem in args.only]
     left = _each(paths, lambda path: fill(bench, path, args.again))
+    if args.table is not None:
+        write_atomically(args.table, table([read_entry(path) for path in paths]).encode("utf-8"))
     print(f"{len(paths) - left} rows have a phase reliance, {left} have not")
     return 0 if paths else REFUSED
 
