@@ -81,8 +81,11 @@ class Case:
 
 
 def shown(value: Scalar) -> str:
-    """A parameter as people write it."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    """A parameter as people write it: in six digits where those are all, else in all that there are."""
+    if not isinstance(value, float):
+        return str(value)
+    short = f"{value:.6g}"
+    return short if float(short) == value or value != value else repr(value)
 
 
 def family(

@@ -87,6 +87,12 @@ def cases() -> list[Case]:
             predicts="10 u32 x 1810 mm: the last layer runs in float32; bfloat16 alone would be 4 mm off", unit="mm",
         ),
         *family(
+            group, "phase route", check.phase_output,
+            {"name": ("phase", "phase-net"), "image": ("black", "white", "constant", "noise", "checkerboard")},
+            computes="depth of an image without an object", reference="0, or a depth in the working range",
+            predicts="exact: no other number may come out, and none that is not finite", unit="mm", expects="either",
+        ),
+        *family(
             group, "training metric", check.metric_scale, {"scale": (1.0, 1e-30, 1e30, 1e-160, 1e-300)},
             computes="mean RMSE of 50 samples as a torchmetrics metric", reference="exactly rounded sums",
             predicts="gamma of 460 roundings", unit="relative",

@@ -3,9 +3,12 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from fpp_ml_bench.baselines.methods import method
 from fpp_ml_bench.baselines.networks import build
 from fpp_ml_bench.baselines.networks.base import in_full_precision
 from fpp_ml_bench.baselines.networks.instance_norm import RECENTRED_FROM, InstanceNorm
@@ -14,7 +17,7 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCali
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, UB16, gamma
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.evaluation.torch_metric import DepthScores
 from fpp_ml_bench.rig import paper_rig
 
@@ -292,3 +295,26 @@ def metric_refuses(value: float) -> Outcome:
     prediction = target.clone()
     prediction[0, 1, 2] = value
     return refusal(lambda: DepthScores().update(prediction, target), PredictionError)
+
+
+def phase_output(name: str, image: str) -> Outcome:
+    """Depth of an image that shows no object, or nothing at all: 0 or a depth in the working range, pixel by pixel."""
+    rig = paper_rig(480)
+    side = rig.camera.width
+    grey = {
+        "black": lambda: np.zeros((side, side)),
+        "white": lambda: np.full((side, side), 255.0),
+        "constant": lambda: np.full((side, side), 128.0),
+        "noise": lambda: np.random.default_rng(1).uniform(0, 256, (side, side)),
+        "checkerboard": lambda: 255.0 * (np.indices((side, side)).sum(axis=0) % 2),
+    }[image]()
+    try:
+        made = method(name, rig)
+        frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
+        frames[made.frames_used[0]] = grey.astype(np.uint8)
+        depth = made.predict(frames)
+    except FppBenchError as error:
+        return Outcome(None, flagged=1.0, note=str(error))
+    near, far = rig.working_range_mm
+    legal = (depth == 0) | ((depth >= near * (1 - U32)) & (depth <= far * (1 + U32)))
+    return worst(np.where(legal, 0.0, np.inf), 0.0, depth == 0, 1.0)

@@ -18,7 +18,7 @@ SCHEMA_VERSION = "1.0.0"
 
 
 def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """By group, and under "all": cases per verdict, the largest error / bound, and seconds."""
+    """By group, and under "all": cases per verdict, the largest error / bound, and processor time."""
     found: dict[str, dict[str, Any]] = {}
     for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
         part = [row for row in rows if group in (row.case.group, "all")]
@@ -27,7 +27,7 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
             "cases": len(part),
             **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
             "largest_ratio": number(max(ratios, default=None)),
-            "seconds": round(sum(row.seconds for row in part), 2),
+            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
         }
     return found
 
@@ -43,7 +43,9 @@ def row_dict(row: Row) -> dict[str, Any]:
     return {
         "group": case.group,
         "family": case.family,
-        "parameters": {key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()},
+        "parameters": {
+            key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()
+        },
         "computes": case.computes,
         "reference": case.reference,
         "predicts": case.predicts,
@@ -57,7 +59,7 @@ def row_dict(row: Row) -> dict[str, Any]:
         "condition": number(outcome.condition),
         "note": outcome.note,
         "against": row.against,
-        "seconds": round(row.seconds, 3),
+        "cpu_seconds": round(row.cpu_seconds, 3),
     }  # fmt: skip
 
 

@@ -11,13 +11,14 @@ from fpp_ml_bench.evaluation.report_html import escaped, page
 _LONG = 400
 
 _STYLE = (
-    "".join(f".{name} {{ background: {colour}; }}\n" for name, _, colour in LEVELS)
+    "".join(f".cell.{name} {{ background: {colour}; }}\n" for name, _, colour in LEVELS)
     + """
 .cells { display: flex; flex-wrap: wrap; gap: 2px; }
 .cell { width: 1.05rem; height: 1.05rem; border-radius: 3px; flex: none; }
 .cell.fail { outline: 2px solid #7d0c15; }
 .heat td { vertical-align: middle; padding-top: .2rem; padding-bottom: .2rem; }
 .heat tbody th { width: 19rem; font-weight: 400; }
+@media (max-width: 46rem) { .heat tbody th { width: 9rem; font-size: .8125rem; padding-left: 0; } }
 .key { display: flex; flex-wrap: wrap; gap: .25rem 1.25rem; list-style: none; padding: 0; margin: .75rem 0; }
 .key li { display: flex; align-items: center; gap: .4rem; }
 details { margin: .5rem 0; }
@@ -39,9 +40,11 @@ def report_page(rows: Sequence[Row], content: Mapping[str, Any]) -> str:
     machine = content["environment"]
     intro = (
         f"<p>{verdict} {total['within']} of {total['cases']} cases are within the error that theory predicts, "
-        f"{total['flagged']} are refused or masked as they should be. {total['seconds']:.0f} seconds.</p>"
-        '<p class="soft">Each square is one stiff or extreme case: computed by the benchmark, compared with a reference '
-        "of higher precision or a closed form, and with a bound from theory. Point at a square to read it.</p>"
+        f"{total['flagged']} are refused or masked as they should be. {total['cpu_seconds']:.0f} s of "
+        "processor time.</p>"
+        '<p class="soft">Each square is one stiff or extreme case: computed by the benchmark, compared with a '
+        "reference of higher precision or a closed form, and with a bound from theory. Point at a square to read it."
+        "</p>"
         f'<p class="soft small">{escaped(machine_line(machine), 300)}</p>'
     )
     body = (
@@ -53,8 +56,10 @@ def report_page(rows: Sequence[Row], content: Mapping[str, Any]) -> str:
 
 def machine_line(machine: Mapping[str, Any]) -> str:
     """What ran this, on one line."""
-    software = machine.get("software", {})
-    parts = [f"{name} {version}" for name, version in software.items() if isinstance(version, str)]
+    hardware = machine.get("hardware", {})
+    parts = [f"{hardware.get('cpu', 'unknown processor')}, {hardware.get('cores', '?')} cores"]
+    parts += [f"Python {machine.get('python', '?')}"]
+    parts += [f"{name} {version}" for name, version in machine.get("packages", {}).items()]
     return ", ".join(parts)
 
 
@@ -111,8 +116,8 @@ def _tables(rows: Sequence[Row]) -> str:
 def _family(name: str, members: Sequence[Row]) -> str:
     case = members[0].case
     about = (
-        f'<p class="about small">Computes {escaped(case.computes, _LONG)}; compared with {escaped(case.reference, _LONG)}. '
-        f"Bound: {escaped(case.predicts, _LONG)}.</p>"
+        f'<p class="about small">Computes {escaped(case.computes, _LONG)}; compared with '
+        f"{escaped(case.reference, _LONG)}. Bound: {escaped(case.predicts, _LONG)}.</p>"
     )
     keys = list(case.parameters)
     head = "".join(f'<th scope="col">{escaped(key)}</th>' for key in keys)
@@ -120,11 +125,11 @@ def _family(name: str, members: Sequence[Row]) -> str:
     head += '<th scope="col">error / bound</th><th scope="col">masked</th><th scope="col">condition</th>'
     head += '<th scope="col" class="text">verdict</th>'
     lines = "".join(_line(row, keys) for row in members)
-    table = f'<div class="scroll"><table class="dense small"><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table></div>'
+    table = f'<table class="dense small"><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table>'
     opened = " open" if any(row.verdict is Verdict.FAIL for row in members) else ""
     worst = max((row.outcome.ratio for row in members if row.outcome.ratio is not None), default=None)
     title = f'{escaped(name)} <span class="soft small">({len(members)}; largest error / bound {figure(worst)})</span>'
-    return f"<details{opened}><summary>{title}</summary>{about}{table}</details>"
+    return f'<details{opened}><summary>{title}</summary>{about}<div class="scroll">{table}</div></details>'
 
 
 def _line(row: Row, keys: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What the scene cases compute: depth of surfaces that are edge-on, thin, broken, huge in number, or around the camera."""
+"""What the scene cases compute: depth of surfaces edge-on, thin, broken, huge in number, or around the camera."""
 
 import math
 
@@ -14,6 +14,7 @@ from fpp_ml_bench.loaders.scene import SolidMesh, place
 from fpp_ml_bench.rig import paper_rig
 
 RIG = paper_rig(176)
+AHEAD_M = np.array([0.0, 0.0, 1.8])
 EMBREE_PX = 0.02
 """Where Embree's float32 may take a ray to the wrong side of an edge: 2^-24 of coordinates up to 2 m, several times
 over, at 419 px focal length, is under a hundredth of a pixel."""
@@ -92,7 +93,7 @@ def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[NDArray[np.flo
     import trimesh
 
     mesh = trimesh.creation.icosphere(subdivisions, radius_m)
-    return np.asarray(mesh.vertices) + [0.0, 0.0, 1.8], np.asarray(mesh.faces, np.int32)
+    return np.asarray(mesh.vertices) + AHEAD_M, np.asarray(mesh.faces, np.int32)
 
 
 def broken(kind: str) -> Outcome:
@@ -121,7 +122,7 @@ def broken(kind: str) -> Outcome:
         vertices = np.concatenate([vertices, [[0.0, 0.0, 1.8]]])
         faces = np.concatenate([faces, np.array([[edge[0], edge[1], len(vertices) - 1]], np.int32)])
     elif kind == "loose vertices":
-        vertices = np.concatenate([vertices, rng.uniform(-0.1, 0.1, (200, 3)) + [0, 0, 1.8]])
+        vertices = np.concatenate([vertices, rng.uniform(-0.1, 0.1, (200, 3)) + AHEAD_M])
     elif kind == "open back":
         centre = vertices[faces].mean(axis=1)
         faces = faces[centre[:, 2] < 1.8 + 0.05]
@@ -177,8 +178,8 @@ def camera_inside(turn_deg: float) -> Outcome:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     angle = math.radians(turn_deg)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-             [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+             [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
     hits = traced(corners @ turn.T, faces).primary(*RIG.camera.rays())
     x, y = (axis.ravel() for axis in RIG.camera.rays())
     if len(hits.pixels) != x.size:
@@ -192,9 +193,9 @@ def camera_inside(turn_deg: float) -> Outcome:
 def placed_around(name: str) -> Outcome:
     """The builder's own placement refuses what does not fit: an object around the camera, behind it, or of 1 m."""
     vertices, faces = _ball(1, {"around the camera": 2.5, "too large": 0.8, "shifted out": 0.05}[name])
-    vertices = vertices - [0.0, 0.0, 1.8]
+    vertices = vertices - AHEAD_M
     if name == "shifted out":
-        vertices = vertices + [5.0, 0.0, 0.0]
+        vertices = vertices + np.array([5.0, 0.0, 0.0])
     return refusal(lambda: place(SolidMesh("thing", vertices, faces), "A0", RIG, "fixed", 0), MeshError)
 
 
@@ -206,7 +207,7 @@ def behind_camera() -> Outcome:
 def light_at_projector() -> Outcome:
     """A surface point in the projector's own centre, where light falls from nowhere at distance 0."""
     centre = projector_centre_m(RIG)
-    points = np.array([centre, centre + [0, 0, 1e-200], centre + [0, 0, 1e-6], [0.0, 0.0, 0.0], [0.0, 0.0, 1.8]])
+    points = np.array([centre, centre + 1e-200 * AHEAD_M, centre + 1e-6 * AHEAD_M, 0.0 * AHEAD_M, AHEAD_M])
     lit = light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, Lighting())
     bad = ~np.isfinite(lit.gain) | (lit.gain < 0)
     return worst(np.where(bad, math.inf, 0.0), 0.0)

@@ -78,13 +78,13 @@ def _show(rows: "Sequence[Row]") -> None:
     from fpp_ml_bench.evaluation.console import show
 
     table = Table()
-    for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "seconds"):
+    for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
         table.add_column(title, justify="left" if title == "group" else "right")
     for group, found in summary(rows).items():
         ratio = found["largest_ratio"]
         table.add_row(
             group, str(found["cases"]), str(found["within"]), str(found["flagged"]), str(found["FAIL"]),
-            ratio if isinstance(ratio, str) else figure(ratio), f"{found['seconds']:.1f}",
+            ratio if isinstance(ratio, str) else figure(ratio), f"{found['cpu_seconds']:.1f}",
         )  # fmt: skip
     show(table)
     for row in rows:
