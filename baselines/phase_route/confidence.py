@@ -49,7 +49,8 @@ def phase_uncertainty_rad(
     sigma_phase = np.sqrt(averaged + systematic) / bright
     steep = np.hypot(slopes[0], slopes[1])
     rim = np.clip(1 - fit.weight, 0, 1)
-    return sigma_phase * (0.3 + rim) + steep * rim
+    expected: Image = sigma_phase * (0.3 + rim) + steep * rim  # type: ignore[assignment]  # float32 all through
+    return expected
 
 
 def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.bool_], window: Window) -> Image:

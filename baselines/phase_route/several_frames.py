@@ -73,8 +73,8 @@ def differs(
         around += cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2
     noise = background.noise_grey**2
     seen = (around > _limit(noise / SQUARE_PX**2, len(greys))).astype(np.uint8)
-    seen = cv2.erode(seen, np.ones((SQUARE_PX, SQUARE_PX), np.uint8))
-    return (alone > _limit(noise, len(greys))) | (seen > 0)
+    kept = cv2.erode(seen, np.ones((SQUARE_PX, SQUARE_PX), np.uint8)) > 0
+    return (alone > _limit(noise, len(greys))) | kept
 
 
 def _limit(variance: float, count: int) -> float:
