@@ -9,8 +9,9 @@ from test_probes import oracle
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, correlation, ratio
+from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, Mean, correlation, ratio
 from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam, chosen, heatmaps, measure
+from fpp_ml_bench.baselines.diagnostics.grad_cam_report import ratio_said
 from fpp_ml_bench.baselines.diagnostics.probe import silent
 from fpp_ml_bench.baselines.diagnostics.user_module import randomised
 from fpp_ml_bench.errors import DiagnosisError
@@ -124,3 +125,15 @@ def test_the_papers_six_layers_are_taken_where_there_are_nine(opened):
     assert chosen(subject) == ("enc3", "enc4", "bottleneck", "dec4", "dec2", "dec1")
     object.__setattr__(subject, "network", None)
     assert "no gradient" in GradCam().applies_to(subject)
+
+
+@pytest.mark.parametrize(
+    ("fringes", "says"),
+    [
+        (Mean(0.1, (0.05, 0.2), 3), "ratio 2.00"),
+        (Mean(0.1, (-0.05, 0.2), 3), "ratio 2.00, which says nothing: the second can't be told from 0"),
+        (Mean(None, None, 0), "no ratio"),
+    ],
+)
+def test_a_ratio_over_something_near_zero_says_so(fringes, says):
+    assert ratio_said(Mean(0.2, (0.1, 0.3), 3), fringes) == says

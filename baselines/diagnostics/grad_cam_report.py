@@ -24,17 +24,26 @@ def summary(found: Correlations) -> str:
     """What the numbers say, and what they can't."""
     edges, fringes = found.average(EDGES), found.average(FRINGES)
     random = found.average(EDGES, trained=False), found.average(FRINGES, trained=False)
-    quotient, own = ratio(edges.r, fringes.r), found.average(OWN, trained=False).r
-    said = f"{quotient:.2f}" if quotient is not None else "not defined"
+    own = found.average(OWN, trained=False).r
     text = (
         f"Over the layers, heatmaps correlate with edges by {_r(edges.r)} and with fringe variation by "
-        f"{_r(fringes.r)}, ratio {said} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: {_r(random[0].r)} and "
-        f"{_r(random[1].r)}; edges and fringe variation themselves correlate by {_r(found.references.r)}, for both are "
-        "strong where the object is."
+        f"{_r(fringes.r)}, {ratio_said(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: "
+        f"{_r(random[0].r)} and {_r(random[1].r)}; edges and fringe variation themselves correlate by "
+        f"{_r(found.references.r)}, for both are strong where the object is."
     )
     if own is not None:
         text += f" Random weights' heatmaps agree with the trained ones by {own:.2f}."
     return text
+
+
+def ratio_said(edges: Mean, fringes: Mean) -> str:
+    """The ratio, and whether it can be one: a divisor whose interval holds 0 divides by anything."""
+    quotient, span = ratio(edges.r, fringes.r), fringes.interval
+    if quotient is None:
+        return "no ratio"
+    if span is not None and span[0] <= 0 <= span[1]:
+        return f"ratio {quotient:.2f}, which says nothing: the second can't be told from 0"
+    return f"ratio {quotient:.2f}"
 
 
 def tables(found: Correlations) -> list[Table]:

@@ -82,20 +82,14 @@ def run(args: argparse.Namespace) -> int:
 @contextmanager
 def _bars() -> "Iterator[Callable[[Probe], Progress]]":
     """A bar for each probe, on standard error."""
+    from rich import progress as bar
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+        bar.TextColumn("{task.description}"), bar.BarColumn(), bar.TaskProgressColumn(), bar.TimeElapsedColumn(),
+        bar.TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    with bar.Progress(*columns, console=Console(stderr=True)) as bars:
 
         def started(probe: "Probe") -> "Progress":
             task = bars.add_task(probe.title, total=None)
