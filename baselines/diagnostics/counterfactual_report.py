@@ -71,9 +71,9 @@ def tables(found: Reliance, samples: Sequence[SampleReliance]) -> list[Table]:
 def draw(
     asked: Asked, book: SceneBook, found: Reliance, samples: Sequence[SampleReliance], folder: Path
 ) -> list[Figure]:
-    """Both figures, written into ``folder``; the scenes are those of the sample with the middle score."""
-    scored = sorted((one for one in samples if one.score is not None), key=lambda one: (one.score or 0.0, one.sample))
-    middle = scored[(len(scored) - 1) // 2].sample
+    """Both figures, written into ``folder``; the scenes are those of the sample in the middle of the list, the same for
+    every method."""
+    middle = samples[len(samples) // 2].sample
     shown = next(scenes for scenes in book.scenes(found.direction) if scenes.original.sample == middle)
     return [_scenes(Asker(asked, book.room), shown, folder), _parts(found, samples, folder)]
 
@@ -93,8 +93,8 @@ def _scenes(asker: Asker, scenes: Counterfactuals, folder: Path) -> Figure:
     most = max(float(np.abs(move[target]).max()) for move in moves)
     looks = (
         ("captured", "gray", 0.0, 255.0),
-        (f"truth, {unit}", "viridis", *depths), (f"answer, {unit}", "viridis", *depths),
-        (f"change asked, {unit}", "coolwarm", -most, most), (f"change made, {unit}", "coolwarm", -most, most),
+        (f"truth,\n{unit}", "viridis", *depths), (f"answer,\n{unit}", "viridis", *depths),
+        (f"change asked,\n{unit}", "coolwarm", -most, most), (f"change made,\n{unit}", "coolwarm", -most, most),
     )  # fmt: skip
     tiles: list[list[NDArray[np.float64]]] = []
     for _, scene, true, mask in shown:

@@ -52,6 +52,7 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
 def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> list[Table]:
     """A row a plane; silhouettes as means over objects."""
     unit = "of range" if normalised else "mm"
+    values = f"Least to most, {unit}"
     lines: list[list[Cell]] = []
     for kind in (FRAME, RECTANGLE, "silhouette"):
         seen = _of(rows, kind)
@@ -74,7 +75,7 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
     return [
         Table(
             "Answers to planes" + (", mm by the mean range of the test split" if normalised else ""),
-            ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Range, {unit}",
+            ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", values,
              "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm"),
             lines,
         ),
