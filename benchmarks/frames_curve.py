@@ -45,6 +45,9 @@ SETTINGS: dict[str, tuple[str, dict]] = {
     **{f"phase-net {way} 1": ("phase-net", {"direction": way}) for way in ("horizontal", "vertical")},
 }  # fmt: skip
 """Line and point of each setting: its method, and its options."""
+ERROR_TICKS = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+FRAME_TICKS = (1, 2, 3, 4, 6, 9, 13, 18, 25, 32, 50)
+MS_TICKS = (20, 30, 50, 100, 200, 300, 500, 1000, 2000)
 STYLES = {
     "phase horizontal": ("tab:orange", "o-", "phase route, horizontal"),
     "phase vertical": ("tab:blue", "o-", "phase route, vertical"),
@@ -130,8 +133,9 @@ def point(opened: DatasetFolder, split: str, setting: str, work: Path) -> Point 
 
 def draw(points: list[Point], path: Path) -> None:
     from matplotlib.figure import Figure
-    from matplotlib.ticker import ScalarFormatter
+    from matplotlib.ticker import FuncFormatter, NullFormatter
 
+    fastest, slowest = (1000 * pick(p.seconds for p in points) for pick in (min, max))
     figure = Figure(figsize=(12.5, 5.4), dpi=110, layout="constrained")
     by_frames, by_time = figure.subplots(1, 2, sharey=True)
     for line, (colour, style, label) in STYLES.items():
@@ -145,8 +149,7 @@ def draw(points: list[Point], path: Path) -> None:
         error = found.errors_mm["object_mae_mm"]
         title = PAPER_HEADING if number == 0 else None
         by_frames.plot(1, error, "D", color="k", fillstyle="none", label=title)
-        # Errors of 12 to 16 mm lie close together: every other label is set further right.
-        right = 8 if number % 2 == 0 else 120
+        right = 150 if row == "hybrid_l1_0.7" else 8  # beside its neighbours' labels, which lie close above and below
         text = f"{label}: {error:g}"
         by_frames.annotate(text, (1, error), xytext=(right, -3), textcoords="offset points", fontsize=7)
     by_frames.set_xlabel("frames captured")
@@ -156,14 +159,14 @@ def draw(points: list[Point], path: Path) -> None:
     for axes in (by_frames, by_time):
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.grid(True, which="both", alpha=0.25)
+        axes.grid(True, alpha=0.25)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(ScalarFormatter())
-            axis.set_minor_formatter(ScalarFormatter())
-        axes.tick_params(which="both", labelsize=7)
-    frames = sorted({p.frames for p in points})
-    by_frames.set_xticks(frames, [str(one) for one in frames], minor=False)
-    by_frames.set_xticks([], minor=True)
+            axis.set_minor_formatter(NullFormatter())
+            axis.set_major_formatter(FuncFormatter(lambda value, place: f"{value:g}"))
+        axes.tick_params(labelsize=8)
+        axes.set_yticks(ERROR_TICKS)
+    by_frames.set_xticks(FRAME_TICKS)
+    by_time.set_xticks([tick for tick in MS_TICKS if 0.6 * fastest <= tick <= 1.5 * slowest])
     figure.savefig(path)
 
 
