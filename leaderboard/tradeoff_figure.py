@@ -56,7 +56,11 @@ def draw_tradeoff(found: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm"
     by_time.legend(fontsize=7.5, loc="best", framealpha=0.85)
     for axes, cost, scale in panels:
         front = found.front(cost, error)
-        named = [*front, *(point for point in points if point not in front and _worth_a_name(point))]
+        others = [point for point in points if point not in front and _worth_a_name(point)]
+        # A network's other precisions differ from its float32 in time: named there, after all others.
+        precisions = [point for point in others if point.group == "networks" and not _is_float32(point)]
+        named = [*front, *(point for point in others if point not in precisions)]
+        named += precisions if cost == "seconds" else []
         _label(
             axes, [(scale * getattr(p, cost), getattr(p, error), _short(p), p in front) for p in named],
             [(scale * getattr(p, cost), getattr(p, error)) for p in points],
@@ -84,6 +88,7 @@ def draw_sizes(found: Tradeoff, path: Path) -> bool:
                 xytext=(4, 4), textcoords="offset points",
             )  # fmt: skip
     for axes in (by_size, by_time):
+        axes.margins(x=0.08)
         _log(axes)
     by_size.set_xlabel("image width (px)")
     by_time.set_xlabel(f"milliseconds a view ({_clock(found)}); numbers: image width")
@@ -163,13 +168,19 @@ def _families(axes: "Axes", points: Iterable[Point], cost: Cost, error: ErrorKey
 
 
 def _worth_a_name(point: Point) -> bool:
-    """Beside the front: not the classical steps between the ends, not each precision of a network."""
+    """Beside the front: not the classical steps between the ends."""
     if point.group == "classical":
         return point.title.startswith(("classical N=3,", "classical N=18,"))
-    return point.group != "networks" or point.title.endswith(", fp32")
+    return True
+
+
+def _is_float32(point: Point) -> bool:
+    return point.title.endswith(", fp32") or ", " not in point.title
 
 
 def _short(point: Point) -> str:
+    if point.group == "networks" and not _is_float32(point):
+        return point.title.rsplit(", ", 1)[-1]
     return (
         point.title.removeprefix("phase ")
         .removeprefix("classical ")

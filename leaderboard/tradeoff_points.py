@@ -23,6 +23,8 @@ Cost = Literal["seconds", "frames"]
 ErrorKey = Literal["object_mae_mm", "measured_mae_mm"]
 SLOWED = 1.25
 """A setting is marked when the machine ran slower by this factor beside it than in the run's median."""
+MOST_LEFT_OUT = 0.05
+"""Share of the object's pixels without a depth up to which an error over the others is compared."""
 TRADEOFF_FILE = "tradeoff.json"
 TRADEOFF_SCHEMA: Literal["1.0.0"] = "1.0.0"
 
@@ -111,13 +113,13 @@ class Tradeoff(StrictModel):
     def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
         """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
 
-        Not the precisions: they are the classical method's arithmetic once more, in plain NumPy.
+        Not the precisions: they are the classical method's arithmetic once more, in plain NumPy. Over measured pixels
+        alone, nor who leaves out more than `MOST_LEFT_OUT` of them: leaving the hard ones out is no exactness.
         """
-        return [
-            point
-            for point in self.points
-            if point.group not in ("precision", "sizes") and point.seconds and getattr(point, error) and not point.given
-        ]
+        points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
+        if error == "measured_mae_mm":
+            points = [point for point in points if (point.missing_share or 0) <= MOST_LEFT_OUT]
+        return [point for point in points if point.seconds and getattr(point, error)]
 
     def front(self, cost: Cost = "seconds", error: ErrorKey = "object_mae_mm") -> list[Point]:
         """The comparable points that none beats in both, the cheapest first."""

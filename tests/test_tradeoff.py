@@ -152,8 +152,10 @@ def test_only_comparable_points_are_on_a_front(small):
         point("arithmetic", 0.1, 1, 0.1, group="precision"),
         Point(key="absent", group="networks", title="Absent", failed="onnxruntime is not installed"),
     ]
-    made = whole(small, points)
-    assert [p.key for p in made.front("seconds")] == [p.key for p in made.front("frames")] == ["a"]
+    sparse = point("sparse", 0.1, 1, 5.0).model_copy(update={"measured_mae_mm": 0.1, "missing_share": 0.5})
+    made = whole(small, [*points, sparse])
+    assert [p.key for p in made.front("seconds")] == [p.key for p in made.front("frames")] == ["sparse", "a"]
+    assert [p.key for p in made.front("seconds", "measured_mae_mm")] == ["a"]
     assert any("onnxruntime is not installed" in line for line in remarks(made))
 
 
