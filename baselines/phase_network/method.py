@@ -54,7 +54,8 @@ class PhaseNetMethod:
                 "train phase-net), or use the measured route (phase)"
             )
         chosen = levers or Levers(shading=shading)
-        self.route = NetworkRoute(rig, self.options, self.file.network, self.file.config.threshold, chosen)
+        config = self.file.config
+        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, chosen, config.lead)
 
     @property
     def frames_used(self) -> tuple[int, ...]:
@@ -71,7 +72,8 @@ class PhaseNetMethod:
         return {
             "direction": self.options.direction, "shading": self.options.shading,
             "min_confidence": self.options.min_confidence, "weights": self.file.config.name,
-            "weights_sha256": self.file.sha256, "mask_threshold": self.file.config.threshold, "threads": self.threads,
+            "weights_sha256": self.file.sha256, "mask_threshold": self.file.config.threshold,
+            "order_lead": self.file.config.lead, "threads": self.threads,
         }  # fmt: skip
 
     @property

@@ -6,6 +6,7 @@ what the calibration layer makes of both.
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,7 @@ from fpp_ml_bench.baselines.phase_route.confidence import MARGIN_SCALE
 from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
 from fpp_ml_bench.baselines.phase_route.observation import Observation
+from fpp_ml_bench.baselines.phase_route.orders import spread_over_pixels
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.phase_route.shading import wrapped
 from fpp_ml_bench.rig import Rig
@@ -33,7 +35,8 @@ class Levers:
     """What the network decides; False: the measured route's own answer stays.
 
     ``order``, ``mask``, ``phase``; ``shading``: whether it sees brightness, and the first order may use it; ``graph``:
-    weight of smoothness between neighbours in a least-energy labelling of its orders, 0: each pixel's likeliest;
+    weight of smoothness between neighbours in a least-energy labelling of its orders (depth may jump), 0: each pixel's
+    likeliest;
     ``bound_rad``: corrections are cut off there, None: the network's own bound.
     """
 
@@ -41,7 +44,7 @@ class Levers:
     mask: bool = True
     phase: bool = True
     shading: bool = True
-    graph: float = 0.0
+    graph: float = 3.0
     bound_rad: float | None = None
 
 
@@ -61,11 +64,17 @@ class NetworkRoute:
     """One rig, one fringe direction, one network."""
 
     def __init__(
-        self, rig: Rig, settings: Settings, network: PhaseNet, threshold: float = 0.0, levers: Levers | None = None
+        self,
+        rig: Rig,
+        settings: Settings,
+        network: PhaseNet,
+        threshold: float = 0.0,
+        levers: Levers | None = None,
+        lead: float = 0.0,
     ) -> None:
         self.levers = levers or Levers()
         self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading))
-        self.network, self.threshold = network, threshold
+        self.network, self.threshold, self.lead = network, threshold, lead
 
     def measure(self, image: NDArray[np.uint8]) -> Measurement:
         """Everything about one captured fringe uint8 (H, W). Raises `DecodeError` for another dtype or shape."""
@@ -80,7 +89,7 @@ class NetworkRoute:
         if seen.empty:
             return Asked(seen, base, margin, None, None)
         scene = Scene.of(seen, base, geometry.rig)
-        answers = ask(self.network, scene, geometry, self.levers.shading)
+        answers = ask(self.network, scene, geometry, self.levers.shading, self.lead)
         seen.watch.done("network")
         return Asked(seen, base, margin, scene, answers)
 
@@ -112,14 +121,34 @@ class NetworkRoute:
         odds /= odds.sum(axis=0)
         place = answers.logits.argmax(axis=0)
         if graph > 0:
-            cost = np.where(inside, np.minimum(-np.log(odds + 1e-9), LARGE), 0).astype(np.float32)
-            zero = seen.layer.residual_phase(seen.phase_rad, scene.order)
-            phases = np.stack([zero + TAU * step for step in STEPS]).astype(np.float32)
-            links = [
-                (a & b).astype(np.float32) * np.float32(graph)
-                for a, b in ((inside[:, 1:], inside[:, :-1]), (inside[1:], inside[:-1]))
-            ]
-            place, _ = least_energy(cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad)
+            place = self._labelled(odds, scene, inside, seen, graph)
         chance = np.clip(np.take_along_axis(odds, place[None].astype(np.intp), axis=0)[0], LEAST_ODDS, 1 - LEAST_ODDS)
         margin = np.float32(MARGIN_SCALE) * np.log(chance / (1 - chance))
         return scene.order + np.array(STEPS, np.int32)[place], np.maximum(margin, 0).astype(np.float32)
+
+    def _labelled(
+        self, odds: NDArray, scene: Scene, inside: NDArray[np.bool_], seen: Observation, graph: float
+    ) -> NDArray[np.intp]:
+        """Places of the orders of least energy, on a grid of every few pixels, brought to the pixels."""
+        stride = seen.question.stride
+        every = (slice(None, None, stride), slice(None, None, stride))
+        weight = inside.astype(np.float32)
+        size = (stride, stride)
+        share = cv2.blur(weight, size)
+        cost = np.stack([cv2.blur((-np.log(one + 1e-9) * weight).astype(np.float32), size) for one in odds])
+        cost = (cost / np.maximum(share, 1e-3))[:, *every] * np.float32(stride**2)
+        here = inside[every]
+        zero = seen.layer.residual_phase(seen.phase_rad, 0.0)
+        coarse = (zero + TAU * scene.order)[every]
+        phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)
+        links = [
+            (a & b).astype(np.float32) * np.float32(graph * stride)
+            for a, b in ((here[:, 1:], here[:, :-1]), (here[1:], here[:-1]))
+        ]
+        cost = np.where(here, np.minimum(cost, LARGE), 0).astype(np.float32)
+        choice, margin = least_energy(cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad)
+        question = replace(seen.question, residual_rad=phases, inside=here)
+        order, _ = spread_over_pixels(question, choice, margin, zero)
+        wanted = np.clip(order - scene.order, -1, 1) + 1
+        possible = np.take_along_axis(odds, wanted[None], axis=0)[0] > 0
+        return np.where(possible, wanted, odds.argmax(axis=0))

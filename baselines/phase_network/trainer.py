@@ -6,7 +6,7 @@
 import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from fpp_ml_bench.loaders.store import DatasetFolder
 WEIGHTS_FILE, RECIPE_FILE = "phase-net.safetensors", "recipe.json"
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
+LEADS = tuple(float(value) for value in range(8))
 _TYPICAL_MM = 1800.0
 
 
@@ -97,11 +98,13 @@ def train_phase_net(
         return Trained(None, done.steps, 0.0, {})
     found = [ask(done.network, one.scene.single(), geometries[one.direction]) for one in validation]
     threshold = chosen_threshold(found, validation, opened.size[0] * opened.size[1])
+    lead = chosen_lead(found, validation, geometries)
+    found = [led(answers, lead) for answers in found]
     rows = [score(a, s, geometries[s.direction], threshold) for a, s in zip(found, validation, strict=True)]
     means = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
     config = NetConfig(
         name=recipe.name, title="Fringe order, mask and bounded phase correction", options=done.network.options,
-        threshold=threshold, period_px={one: g.route.period_px for one, g in geometries.items()},
+        threshold=threshold, lead=lead, period_px={one: g.route.period_px for one, g in geometries.items()},
         dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=described, validation=means,
     )  # fmt: skip
     save_net(out / WEIGHTS_FILE, done.network, config)
@@ -121,6 +124,27 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
             missed, invented = (sample.target & ~found).sum(), (found & ~sample.target).sum()
             totals[number] += _TYPICAL_MM * (missed / inside + invented / (pixels - inside))
     return THRESHOLDS[int(totals.argmin())]
+
+
+def led(answers: Answers, lead: float) -> Answers:
+    """With ``lead`` added to the logit of the first order."""
+    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
+
+
+def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: dict[str, Geometry]) -> float:
+    """Of `LEADS` the one with the fewest wrong orders, mean over the samples."""
+    shares = [
+        float(
+            np.mean(
+                [
+                    score(led(answer, lead), sample, geometries[sample.direction])["wrong_percent"]
+                    for answer, sample in zip(answers, samples, strict=True)
+                ]
+            )
+        )
+        for lead in LEADS
+    ]
+    return LEADS[int(np.argmin(shares))]
 
 
 def draw(path: Path, history: list[dict[str, Any]], title: str) -> None:

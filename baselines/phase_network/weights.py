@@ -32,7 +32,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 @checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class NetConfig:
-    """``options``: what `PhaseNet` takes; ``threshold``: logit from which on a pixel is object; ``period_px``: image px
+    """``options``: what `PhaseNet` takes; ``threshold``: logit from which on a pixel is object; ``lead``: logit that is
+    added to the first order's, both chosen on the validation split; ``period_px``: image px
     per fringe period it learned from, by direction; ``recipe``: the resolved training recipe; ``dataset_fingerprint``;
     ``validation``: scores."""
 
@@ -42,6 +43,7 @@ class NetConfig:
     threshold: Finite
     period_px: dict[Text, Finite]
     dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    lead: Finite = 0.0
     steps: Count = 0
     recipe: dict[Text, Any] = field(default_factory=dict)
     validation: dict[Text, Scalar] = field(default_factory=dict)
