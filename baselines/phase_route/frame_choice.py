@@ -25,7 +25,7 @@ Frames = Sequence[NDArray[np.uint8] | None]
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
 """Of the error that doubt about the order makes one expect: what 1, 2, and 3 or more frames really had of it, over
-training and validation views (``benchmarks/frames_choice.py --calibrate``). A margin knows that an order is doubtful;
+training views (``benchmarks/frames_choice.py --calibrate`` counts it again). A margin knows that an order is doubtful;
 that most doubtful orders are right, only counting tells."""
 
 
