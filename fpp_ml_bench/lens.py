@@ -71,7 +71,7 @@ def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients
 
     reach = wanted
     for _ in range(MAX_ITERATIONS):  # a radius that is distorted beyond all of the points, or the fold
-        if reach >= fold or float(distorted(np.float64(reach))) >= wanted:
+        if reach >= fold or float(distorted(np.array(reach))) >= wanted:
             break
         reach *= 2
     radius = np.linspace(0.0, min(reach, fold), START_TABLE)

@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.phase_route.observation import Observation
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decode_blocks import MIN_MODULATION
+from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
 
@@ -77,8 +78,16 @@ def confidence_of(error_mm: Image) -> Image:
     return (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)
 
 
-def reasons(seen: Observation, margin: Image, sure: Image, settings: Settings, period_px: float) -> NDArray[np.uint8]:
-    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` where nothing speaks against it."""
+def reasons(
+    seen: Observation, margin: Image, sure: Image, depth_mm: NDArray, rig: Rig, settings: Settings, period_px: float
+) -> NDArray[np.uint8]:
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` where nothing speaks against it.
+
+    A depth outside the working range speaks against it even where some order would have given one inside: a chooser
+    that corrects the phase can leave the range that its orders were chosen for.
+    """
+    near, far = rig.working_range_mm
+    outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
     slopes = seen.slopes
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
@@ -92,7 +101,7 @@ def reasons(seen: Observation, margin: Image, sure: Image, settings: Settings, p
         (margin < LEAST_MARGIN, Reason.AMBIGUOUS),
         ((frequency < SLOWEST) | (frequency > FASTEST), Reason.TOO_STEEP),
         (~wide, Reason.THIN),
-        (seen.candidates.count == 0, Reason.OUT_OF_RANGE),
+        ((seen.candidates.count == 0) | outside, Reason.OUT_OF_RANGE),
         (seen.clipped > SATURATED_SHARE, Reason.SATURATED),
         (seen.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
         (~seen.inside, Reason.BACKGROUND),

@@ -149,7 +149,7 @@ class PhaseRoute:
         seen.watch.done("depth")
         error_mm, doubt_mm = confidence.expected_error_mm(seen, margin, depth_mm)
         sure = confidence.confidence_of(error_mm)
-        reason = confidence.reasons(seen, margin, sure, self.settings, self.period_px)
+        reason = confidence.reasons(seen, margin, sure, depth_mm, self.rig, self.settings, self.period_px)
         seen.watch.done("confidence")
         return self._whole(seen, order, sure, error_mm, doubt_mm, depth_mm, reason)
 

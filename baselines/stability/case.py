@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from itertools import product
 from typing import Literal
 
@@ -115,7 +116,7 @@ def family(
                 reference,
                 predicts,
                 unit,
-                lambda parameters=parameters: run(**parameters),
+                partial(run, **parameters),
                 wanted,
                 heavy(**parameters),
             )

@@ -89,8 +89,9 @@ def cases() -> list[Case]:
         *family(
             group, "phase route", check.phase_output,
             {"name": ("phase", "phase-net"), "image": ("black", "white", "constant", "noise", "checkerboard")},
-            computes="depth of an image without an object", reference="0, or a depth in the working range",
-            predicts="exact: no other number may come out, and none that is not finite", unit="mm", expects="either",
+            computes="depth of an image without an object", unit="mm", expects="either",
+            reference="a depth in the working range and its slack of 15 mm, or a reason why it is not to be trusted",
+            predicts="exact: no other number may count as measured, and none that is not finite",
         ),
         *family(
             group, "training metric", check.metric_scale, {"scale": (1.0, 1e-30, 1e30, 1e-160, 1e-300)},

@@ -14,6 +14,8 @@ from fpp_ml_bench.baselines.networks.base import in_full_precision
 from fpp_ml_bench.baselines.networks.instance_norm import RECENTRED_FROM, InstanceNorm
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCalibrationLayer
+from fpp_ml_bench.baselines.phase_route.measurement import Reason
+from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, UB16, gamma
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
@@ -298,7 +300,7 @@ def metric_refuses(value: float) -> Outcome:
 
 
 def phase_output(name: str, image: str) -> Outcome:
-    """Depth of an image that shows no object, or nothing at all: 0 or a depth in the working range, pixel by pixel."""
+    """Depth of an image that shows no object: what counts as measured must lie in the working range and its slack."""
     rig = paper_rig(480)
     side = rig.camera.width
     grey = {
@@ -312,9 +314,10 @@ def phase_output(name: str, image: str) -> Outcome:
         made = method(name, rig)
         frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
         frames[made.frames_used[0]] = grey.astype(np.uint8)
-        depth = made.predict(frames)
+        found = made.measure(frames)  # type: ignore[attr-defined]
     except FppBenchError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     near, far = rig.working_range_mm
-    legal = (depth == 0) | ((depth >= near * (1 - U32)) & (depth <= far * (1 + U32)))
-    return worst(np.where(legal, 0.0, np.inf), 0.0, depth == 0, 1.0)
+    slack, depth = Settings().slack_mm * (1 + U32), found.depth_mm
+    legal = np.isfinite(depth) & ((depth == 0) | ((depth >= near - slack) & (depth <= far + slack)))
+    return worst(np.where(legal, 0.0, np.inf), 0.0, found.reason != Reason.MEASURED, 1.0)

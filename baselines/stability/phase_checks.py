@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
+from fpp_ml_bench.baselines.stability.case import Expects, Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.frames import (
     MEAN,
     coded_rig,
@@ -73,7 +73,7 @@ def modulation_8bit(modulation: float) -> Outcome:
     return worst(error, worst_angle(shift, modulation), flagged, may_flag)
 
 
-def expects_modulation(modulation: float) -> str:
+def expects_modulation(modulation: float) -> Expects:
     shift = 0.5 * frame_gain(18)
     if modulation + shift < MIN_MODULATION:
         return "refusal"
@@ -95,7 +95,7 @@ def noise(modulation: float, noise_grey: float = 1.0) -> Outcome:
     return Outcome(float(np.sqrt(np.mean(kept**2))), bound, float(flagged.mean()), may_flag)
 
 
-def expects_noise(modulation: float) -> str:
+def expects_noise(modulation: float) -> Expects:
     sigma = math.sqrt(2 / 18) * math.hypot(1.0, math.sqrt(1 / 12))
     if modulation + 6 * sigma < MIN_MODULATION:
         return "refusal"
@@ -141,7 +141,7 @@ def saturation_decoder(share: float) -> Outcome:
     return worst(error, worst_angle(leak + 0.5 * frame_gain(18), left), flagged, may_flag)
 
 
-def expects_saturation(share: float) -> str:
+def expects_saturation(share: float) -> Expects:
     return "refusal" if math.floor(18 * share) > 2 else "number" if math.floor(18 * share) + 1 <= 2 else "either"
 
 

@@ -5,6 +5,7 @@ import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def intrinsics(focal_px: float, centre_px: float) -> Outcome:
     return worst(back - u, bound, condition=float(np.max((np.abs(u - centre_px) + abs(centre_px)) / 960)))
 
 
-def _tilted(off: float, kind: str) -> list[list[float]]:
+def _tilted(off: float, kind: str) -> Any:
     turn = rotation_matrix((0.05, -0.09, 0.12))
     if kind == "scaled":  # R R^T - I is (1 + s)^2 - 1
         return (turn * (1 + off / 2)).tolist()
@@ -78,8 +79,8 @@ def rotation_vector(angle_rad: float) -> Outcome:
     first = mp.sin(angle) / angle if angle != 0 else mp.mpf(1)
     second = (1 - mp.cos(angle)) / angle**2 if angle != 0 else mp.mpf(0.5)
     exact = mp.eye(3) + first * cross + second * cross * cross
-    error = difference(found.ravel(), [exact[i, j] for i in range(3) for j in range(3)])
-    return worst(error, 8 * U64 * (1 + angle_rad), condition=angle_rad)
+    errors = difference(found.ravel(), [exact[i, j] for i in range(3) for j in range(3)])
+    return worst(errors, 8 * U64 * (1 + angle_rad), condition=angle_rad)
 
 
 def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:

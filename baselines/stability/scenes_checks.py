@@ -46,12 +46,12 @@ def edge_on(off_deg: float) -> Outcome:
     corners = [middle + s * 0.1 * along + r * up for s, r in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     hits = _quad(corners).primary(*RIG.camera.rays())
     x, y = (axis.ravel()[hits.pixels] for axis in RIG.camera.rays())
-    corners = np.asarray(corners, dtype=np.longdouble)
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    wide = np.asarray(corners, dtype=np.longdouble)
+    normal = np.cross(wide[1] - wide[0], wide[2] - wide[0])
     facing = normal[0] * x + normal[1] * y + normal[2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        exact = np.asarray((normal @ corners[0]) / facing, float)
-    low, high = float(corners[:, 2].min()), float(corners[:, 2].max())
+        exact = np.asarray((normal @ wide[0]) / facing, float)
+    low, high = float(wide[:, 2].min()), float(wide[:, 2].max())
     if not len(hits.pixels):
         # The whole wall is then thinner than the gap between two pixel columns.
         seen = abs(corners[0][0] / corners[0][2] - corners[1][0] / corners[1][2]) * RIG.camera.fx

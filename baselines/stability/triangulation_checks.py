@@ -28,7 +28,7 @@ def scaled_baseline(baseline_mm: float, ahead: float = 0.0, turned: bool = False
     t = np.array([*rig.translation_m[:2], -ahead * rig.baseline_m])
     t *= baseline_mm / MM_PER_M / np.linalg.norm(t)
     turn = rotation_matrix((0.05, -0.09, 0.12)) if turned else np.eye(3)
-    return replace(rig, rotation=turn.tolist(), translation_m=tuple(float(value) for value in t))
+    return replace(rig, rotation=turn.tolist(), translation_m=(float(t[0]), float(t[1]), float(t[2])))
 
 
 def rays(count: int = 40) -> Maps:
