@@ -47,8 +47,8 @@ class Method(Protocol):
         """Depth float32 (H, W) in mm, 0 = background or not measured; frames not in `frames_used` are None."""
 
 
-METHODS = ("classical", "phase")
-"""The methods that need no trained weights of a network; with those it is a `NetworkMethod`."""
+METHODS = ("classical", "phase", "phase-net")
+"""The methods by name; with the weights of a network from image to depth it is a `NetworkMethod`."""
 
 
 def method(name: str, rig: Rig, **options: Any) -> Method:
@@ -67,6 +67,11 @@ def method(name: str, rig: Rig, **options: Any) -> Method:
 
         made: Method = PhaseMethod(rig, **options)
         return made
+    if name == "phase-net":
+        from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
+
+        learned: Method = PhaseNetMethod(rig, **options)
+        return learned
     raise FppBenchError(f"unknown method {name!r}; there are {', '.join(METHODS)}")
 
 

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
 METHOD_HELP = (
-    "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), the name of weights that "
+    "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
+    "(single-shot phase; order, mask and correction learned), the name of weights that "
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _RECIPE_SUFFIXES = (".yaml", ".yml")
@@ -39,7 +40,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
     )
-    phase = parser.add_argument_group("phase (nothing learned)")
+    phase = parser.add_argument_group("phase and phase-net")
     phase.add_argument(
         "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
     )
@@ -64,6 +65,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     phase.add_argument(
         "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
     )
+    phase.add_argument(
+        "--weights", type=Path, metavar="FILE", help="weights of phase-net (default: those that come with the package)"
+    )
     network = parser.add_argument_group("trained networks")
     network.add_argument(
         "--range",
@@ -87,8 +91,8 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
     kind = args.method if args.method in METHODS else "network"
     weights = _weights(args.method, opened.size[1]) if kind == "network" else None
     for other, options in _OPTIONS.items():
-        given = [option for option in options if getattr(args, option) is not None]
-        if other != kind and given:
+        given = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
+        if given:
             raise PredictionError(
                 f"{_flag(given[0])} is an option of {_KINDS[other]}, not of {args.method}; leave it out"
             )
@@ -193,14 +197,21 @@ def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
     return {name: value for name, value in chosen.items() if value is not None}
 
 
-_MAKERS = {"classical": _classical, "phase": _phase}
+def _phase_net(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    chosen = {"direction": args.fringe, "min_confidence": args.min_confidence, "weights": args.weights}
+    chosen["shading"] = None if args.no_shading is None else False
+    return {"threads": args.threads} | {name: value for name, value in chosen.items() if value is not None}
+
+
+_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net}
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
     "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
+    "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
     "network": ("depth_range", "frame", "device"),
 }
 """What belongs to one kind of method only, by its name in the parsed arguments."""
-_KINDS = {"classical": "classical", "phase": "phase", "network": "trained networks"}
+_KINDS = {"classical": "classical", "phase": "phase", "phase-net": "phase-net", "network": "trained networks"}
 
 
 def _flag(option: str) -> str:
