@@ -21,6 +21,8 @@ from fpp_ml_bench.triangulation import depth_from_both
 
 OBJECT, VIEW = "power_drill", "A60"
 SIZES, QUICK_SIZES = (240, 360, 480, 720, 960), (240, 320, 480)
+NETWORK_SIZES = (240, 320, 480, 640, 960)
+"""Multiples of 16, as a UNet takes them."""
 STEPS, QUICK_STEPS = (4, 8, 16, 32), (4, 8, 16)
 """Sinusoids a direction, with 7 Gray bits each, black and white: 24 to 80 frames."""
 FRAMES_SIZE = 360
@@ -36,7 +38,7 @@ def pixel_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
     yield Ladder("decode: triangulate from both (NumPy)", "pixels", sizes, partial(_triangulate, rig))
     yield Ladder("phase route", "pixels", sizes, partial(_phase_route, rig))
     yield Ladder("score a view", "pixels", sizes, partial(_score, rig))
-    yield Ladder("UNet width 8, untrained", "pixels", sizes, partial(_network, rig))
+    yield Ladder("UNet width 8, untrained", "pixels", NETWORK_SIZES[: 3 if quick else None], partial(_network, rig))
     yield Ladder("UNet width 8, untrained", "rows", BATCHES[: 3 if quick else None], partial(_network_batch, rig))
 
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.inference import fringe_batch, represent
-from fpp_ml_bench.baselines.methods import Method, method
+from fpp_ml_bench.baselines.methods import METHODS, Method, method
 from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.network_method import DepthRange, NetworkMethod
 from fpp_ml_bench.baselines.networks import build
@@ -82,7 +82,8 @@ def network_settings(
                 make = partial(_trained, path, depth_range, precision, views, threads)
                 key = f"network-{config.name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
                 yield Setting(key, "networks", title, make, views, note=_note(precision))
-    yield Setting("phase-net", "networks", "phase-net", partial(method, "phase-net", views.rig), views)
+    if "phase-net" in METHODS:
+        yield Setting("phase-net", "networks", "phase-net", partial(method, "phase-net", views.rig), views)
     for wide in widths if widths is not None else QUICK_WIDTHS if quick or height * width > LARGE_PX else WIDTHS:
         for precision in precisions:
             if precision == "bf16" and wide > EMULATED_WIDTH and bf16_note():

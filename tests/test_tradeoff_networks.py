@@ -9,12 +9,15 @@ import pytest
 from scored_dataset import make_dataset
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
+from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.weights_file import save_weights
 from fpp_ml_bench.leaderboard import tradeoff_networks
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
+from fpp_ml_bench.leaderboard.tradeoff_ladders import frame_ladders, pixel_ladders
 from fpp_ml_bench.leaderboard.tradeoff_measure import measured
 from fpp_ml_bench.leaderboard.tradeoff_networks import calibration, network_settings
 from fpp_ml_bench.leaderboard.tradeoff_views import some_views
+from fpp_ml_bench.rig import paper_rig
 
 SIZE = (32, 48)
 QUICK = Rules(runs=3, limit_s=0.05)
@@ -116,6 +119,18 @@ def test_a_processor_without_bf16_is_named(monkeypatch, tmp_path):
     assert "no bf16 instructions" in tradeoff_networks.bf16_note()
     Cpu.text = "flags\t\t: fpu avx2 amx_bf16"
     assert tradeoff_networks.bf16_note() is None
+
+
+def test_every_rung_of_every_ladder_can_be_prepared(tmp_path):
+    """The smallest rung is run, and a network takes each of its sizes."""
+    ladders = [*pixel_ladders(paper_rig(480)), *frame_ladders(paper_rig(480))]
+    for number, ladder in enumerate(ladders):
+        rung = ladder.prepare(ladder.steps[0], tmp_path / str(number))
+        rung.run()
+        assert rung.amount > 0 and list(ladder.steps) == sorted(set(ladder.steps)) and len(ladder.steps) >= 3
+    (unet,) = (ladder for ladder in ladders if "UNet" in ladder.stage and ladder.over == "pixels")
+    for size in unet.steps:
+        networks.build("unet", width=1).check_size(size, size)
 
 
 def test_torch_is_left_alone_unless_networks_are_measured(views):
