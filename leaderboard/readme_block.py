@@ -20,7 +20,7 @@ _NOTE = (
     f"median latency of one image. \\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and "
     "nothing else, 0 does not follow it (docs/reliance.md)."
 )
-SHOWN = 10
+SHOWN = 5
 """Rows of a group that README shows; the page shows them all."""
 _NOBODY = f"No row yet. {_MADE_BY}"
 
