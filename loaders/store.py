@@ -180,6 +180,8 @@ class DatasetFolder:
             for column in self.record_batches(shard)[0].schema.names:
                 if (shard.path, column) in self._images:
                     let_go(self._row_of(shard, column, row), whole.address, whole.size)
+            if row - shard.first_row == shard.rows - 1:
+                self.forget(shard)  # what stands between its images stays mapped as long as the file is
 
     def _image(self, sample: str, group: str, column: str) -> NDArray:
         split, row = self._find(sample)
