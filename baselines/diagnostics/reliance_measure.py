@@ -57,7 +57,7 @@ class Asker:
         units = getattr(asked, "units", "mm")
         if units not in ("mm", "normalised"):
             raise DiagnosisError(f"units {units!r}: reliance is measured for answers in mm, or normalised")
-        self.units: Literal["mm", "normalised"] = units
+        self.units: Literal["mm", "normalised"] = "mm" if units == "mm" else "normalised"
         self._masked = bool(getattr(asked, "uses_ground_truth_mask", False))
 
     @property

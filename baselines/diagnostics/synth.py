@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface
+from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import Lighting, LitPixels, background_plane, light_surface
 from fpp_ml_bench.loaders.sensor import Noise
@@ -116,6 +117,6 @@ class Darkroom:
         frame = sequence.frames[index]
         if frame.direction is None:
             return index
-        other = "vertical" if frame.direction == "horizontal" else "horizontal"
+        other: Direction = "vertical" if frame.direction == "horizontal" else "horizontal"
         run = sequence.sinusoids(other) if frame.kind == "sinusoid" else sequence.gray(other)
         return run[min(frame.step, len(run) - 1)]
