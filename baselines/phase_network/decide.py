@@ -13,6 +13,9 @@ from fpp_ml_bench.baselines.phase_network.samples import Geometry
 IMPOSSIBLE = -np.inf
 """Logit of an order that puts its pixel out of the working range."""
 
+DENIED = 5.0
+"""Logits below the threshold from which on a pixel of the measured route's mask is background after all."""
+
 
 @dataclass(frozen=True)
 class Answers:
@@ -57,5 +60,8 @@ def decided_order(answers: Answers, scene: Scene) -> NDArray[np.int32]:
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> NDArray[np.bool_]:
-    """Object: likelier than ``threshold`` (a logit), where the fit has something to stand on."""
-    return (answers.object_logit > threshold) & (scene.weight > LEAST_WEIGHT)
+    """Object: what the network holds likelier than ``threshold`` (a logit), and what the measured route's mask has and
+    the network does not clearly deny; where the fit has something to stand on."""
+    logit = answers.object_logit
+    found = (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
+    return found & (scene.weight > LEAST_WEIGHT)

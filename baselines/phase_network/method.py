@@ -65,7 +65,8 @@ class PhaseNetMethod:
     @property
     def title(self) -> str:
         blind = "" if self.options.shading else ", without brightness"
-        return f"Phase route, one {self.options.direction} fringe; order, mask and correction learned{blind}"
+        more = "" if self.file.config.name == DEFAULT else f" ({self.file.config.name})"
+        return f"Phase route, one {self.options.direction} fringe; order, mask and correction learned{more}{blind}"
 
     @property
     def settings(self) -> dict[str, Any]:

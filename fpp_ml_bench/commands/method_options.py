@@ -66,7 +66,10 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
     )
     phase.add_argument(
-        "--weights", type=Path, metavar="FILE", help="weights of phase-net (default: those that come with the package)"
+        "--weights",
+        metavar="FILE",
+        help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
+        "phase-net-fresh, which learned from other objects besides)",
     )
     network = parser.add_argument_group("trained networks")
     network.add_argument(
