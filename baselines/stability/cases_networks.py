@@ -1,6 +1,7 @@
 """Losses and networks: zero residual, empty mask, constant input, overflow of half precisions, gradients."""
 
 from fpp_ml_bench.baselines.networks import NETWORKS
+from fpp_ml_bench.baselines.stability import losses_checks as losses
 from fpp_ml_bench.baselines.stability import networks_checks as check
 from fpp_ml_bench.baselines.stability.case import Case, family
 from fpp_ml_bench.baselines.training.tables import LOSSES
@@ -13,24 +14,24 @@ def cases() -> list[Case]:
     group = "networks"
     return [
         *family(
-            group, "zero residual", check.zero_residual, {"name": LOSSES},
+            group, "zero residual", losses.zero_residual, {"name": LOSSES},
             computes="loss and gradient of a perfect prediction", reference="1e-4 for RMSE, else 0; gradient exactly 0",
             predicts="4 u32: one root of e = 1e-8", unit="1",
         ),
         *family(
-            group, "empty mask", check.empty_mask, {"name": LOSSES},
+            group, "empty mask", losses.empty_mask, {"name": LOSSES},
             computes="loss and gradient without one object pixel", reference="exactly rounded sums; 0 where masked",
             predicts="32 u32: torch's pairwise sums", unit="1",
         ),
         *family(
-            group, "loss magnitude", check.loss_magnitude,
+            group, "loss magnitude", losses.loss_magnitude,
             {"name": ("rmse", "hybrid_l1"), "scale": (1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25)},
             computes="float32 loss of errors of this size", reference="exactly rounded sums in float64",
             predicts="2 (log2 n + 16) u32: pairwise sums; beyond 1e19 the square is infinite, and training stops",
             unit="1", expects=lambda name, scale: "either" if scale > 1e19 else "number",
         ),
         *family(
-            group, "half-precision loss", check.loss_half,
+            group, "half-precision loss", losses.loss_half,
             {"name": ("rmse", "hybrid_l1"), "dtype": ("float16", "bfloat16"), "scale": (1.0, 2e3, 3e4, 1e5)},
             computes="loss of half-precision tensors in mm", reference="exactly rounded sums of the same input",
             predicts="2 (log2 n + 16) u32: computed in float32; infinite input gives an infinite loss", unit="1",
@@ -55,7 +56,7 @@ def cases() -> list[Case]:
             predicts="12 u sum |seed|", unit="1",
         ),
         *family(
-            group, "loss gradient", check.loss_gradient, {"name": LOSSES},
+            group, "loss gradient", losses.loss_gradient, {"name": LOSSES},
             computes="directional derivative in float64", reference="Richardson's extrapolated differences",
             predicts=RICHARDSON, unit="1",
         ),
@@ -94,12 +95,12 @@ def cases() -> list[Case]:
             predicts="exact: no other number may count as measured, and none that is not finite",
         ),
         *family(
-            group, "training metric", check.metric_scale, {"scale": (1.0, 1e-30, 1e30, 1e-160, 1e-300)},
+            group, "training metric", losses.metric_scale, {"scale": (1.0, 1e-30, 1e30, 1e-160, 1e-300)},
             computes="mean RMSE of 50 samples as a torchmetrics metric", reference="exactly rounded sums",
             predicts="gamma of 460 roundings", unit="relative",
         ),
         *family(
-            group, "training metric, not a number", check.metric_refuses,
+            group, "training metric, not a number", losses.metric_refuses,
             {"value": (float("nan"), float("inf"), 1e200)},
             computes="a score of a prediction with one such pixel", reference="there is none",
             predicts="must be refused", unit="mm", expects="refusal",

@@ -1,7 +1,6 @@
-"""What the network cases compute: losses, normalisation layers, gradients and half precisions where they are stiff."""
+"""What the network cases compute: normalisation layers, gradients, half precisions, images that show nothing."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,101 +15,18 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLaye
 from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCalibrationLayer
 from fpp_ml_bench.baselines.phase_route.measurement import Reason
 from fpp_ml_bench.baselines.phase_route.settings import Settings
-from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
+from fpp_ml_bench.baselines.stability.case import Outcome, worst
+from fpp_ml_bench.baselines.stability.losses_checks import directional, seeded
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, UB16, gamma
-from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
-from fpp_ml_bench.errors import FppBenchError, PredictionError
-from fpp_ml_bench.evaluation.torch_metric import DepthScores
+from fpp_ml_bench.baselines.training.losses import loss_function
+from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.rig import paper_rig
 
-_SHAPE = (2, 1, 24, 32)
 SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
     "hformer": {"width": 8}, "pix2pix": {"width": 4},
 }  # fmt: skip
 """Widths at which the networks are run here: the arithmetic is the paper's, layer by layer."""
-
-
-def _alpha(name: str) -> float | None:
-    return 0.7 if name.startswith("hybrid") else None
-
-
-def _seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def _scene(scale: float, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    target = torch.rand(_SHAPE, generator=_seeded(1), dtype=torch.float64) + 0.5
-    target[..., :9, :] = 0
-    prediction = target + 0.1 * torch.randn(_SHAPE, generator=_seeded(2), dtype=torch.float64)
-    return (scale * prediction).to(dtype), (scale * target).to(dtype)
-
-
-def _exact_loss(name: str, prediction: Tensor, target: Tensor) -> float:
-    """The loss by exactly rounded sums in float64."""
-    errors = (prediction.double() - target.double()).flatten().tolist()
-    inside = [error for error, depth in zip(errors, target.flatten().tolist(), strict=True) if depth > 0]
-
-    def part(values: list[float]) -> float:
-        if not values:
-            return 0.0
-        if name.endswith("rmse"):
-            return math.sqrt(math.fsum(value * value for value in values) / len(values) + EPSILON)
-        return math.fsum(map(abs, values)) / len(values)
-
-    alpha = _alpha(name)
-    if alpha is not None:
-        return alpha * part(inside) + (1 - alpha) * part(errors)
-    return part(inside) if name.startswith("masked") else part(errors)
-
-
-def zero_residual(name: str) -> Outcome:
-    """Value and gradient where the prediction is perfect: 0/0 for a bare square root."""
-    _, target = _scene(1.0)
-    prediction = target.clone().requires_grad_()
-    loss = loss_function(name, _alpha(name))(prediction, target)
-    loss.backward()
-    gradient = prediction.grad
-    if gradient is None or not bool(torch.isfinite(gradient).all()):
-        return Outcome(math.inf, 0.0, note="a gradient that is not finite")
-    wanted = math.sqrt(EPSILON) if name.endswith("rmse") else 0.0
-    return worst([float(loss.detach()) - wanted, float(gradient.abs().max())], [4 * U32 * wanted, 0.0])
-
-
-def empty_mask(name: str) -> Outcome:
-    """No object pixel at all: a masked mean is 0/0."""
-    prediction, _ = _scene(1.0)
-    target = torch.zeros(_SHAPE)
-    prediction = prediction.clone().requires_grad_()
-    loss = loss_function(name, _alpha(name))(prediction, target)
-    loss.backward()
-    each = sample_losses(name, _alpha(name), prediction.detach(), target)
-    if prediction.grad is None or not bool(torch.isfinite(prediction.grad).all() and torch.isfinite(each).all()):
-        return Outcome(math.inf, 0.0, note="a loss or gradient that is not finite")
-    wanted = _exact_loss(name, prediction.detach(), target)
-    return worst([float(loss.detach()) - wanted], [gamma(32, U32) * wanted])
-
-
-def loss_magnitude(name: str, scale: float) -> Outcome:
-    prediction, target = _scene(scale)
-    found = float(loss_function(name, _alpha(name))(prediction, target))
-    wanted = _exact_loss(name, prediction, target)
-    if math.isinf(found):
-        return Outcome(None, flagged=1.0, note="an infinite loss, on which training stops")
-    # Torch sums in vectors and pairs: log2(n) + 16 roundings, doubled by the square.
-    return worst([found - wanted], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * wanted])
-
-
-def loss_half(name: str, dtype: str, scale: float) -> Outcome:
-    """Half-precision input of this size: 2,100 mm squared is beyond float16."""
-    prediction, target = _scene(scale, getattr(torch, dtype))
-    found = float(loss_function(name, _alpha(name))(prediction, target))
-    if not math.isfinite(float(prediction.float().abs().max())):
-        if math.isfinite(found):
-            return Outcome(found, 0.0)
-        return Outcome(None, flagged=1.0, note="infinite input gives an infinite loss")
-    wanted = _exact_loss(name, prediction, target)
-    return worst([found - wanted], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * wanted])
 
 
 def constant_input(value: float, dtype: str) -> Outcome:
@@ -121,7 +37,7 @@ def constant_input(value: float, dtype: str) -> Outcome:
         layer.bias.copy_(torch.tensor([0.5, -1.0, 2.0]))
     x = torch.full((1, 3, 56, 56), value, dtype=kind, requires_grad=True)
     out = layer(x)
-    (out * torch.randn(out.shape, generator=_seeded(3), dtype=kind)).sum().backward()
+    (out * torch.randn(out.shape, generator=seeded(3), dtype=kind)).sum().backward()
     if x.grad is None or not bool(torch.isfinite(x.grad).all()):
         return Outcome(math.inf, 0.0, note="a gradient that is not finite")
     unit = U32 if dtype == "float32" else U64
@@ -136,7 +52,7 @@ def constant_input(value: float, dtype: str) -> Outcome:
 
 def nearly_constant(offset: float) -> Outcome:
     """A pattern of amplitude 1 on a large offset: its variance is a small difference for one-pass formulas."""
-    pattern = torch.randn((1, 2, 48, 48), generator=_seeded(4), dtype=torch.float64)
+    pattern = torch.randn((1, 2, 48, 48), generator=seeded(4), dtype=torch.float64)
     x = (pattern + offset).float()
     found = InstanceNorm(2, affine=False)(x).double()
     wide = x.double()
@@ -153,10 +69,10 @@ def instance_norm_gradient() -> Outcome:
     mine, theirs = InstanceNorm(3, affine=True).double(), torch.nn.InstanceNorm2d(3, affine=True).double()
     with torch.no_grad():
         for parameter, other in zip(mine.parameters(), theirs.parameters(), strict=True):
-            parameter.copy_(torch.randn(3, generator=_seeded(5), dtype=torch.float64))
+            parameter.copy_(torch.randn(3, generator=seeded(5), dtype=torch.float64))
             other.copy_(parameter)
-    x = torch.randn((2, 3, 12, 10), generator=_seeded(6), dtype=torch.float64)
-    seed = torch.randn(x.shape, generator=_seeded(7), dtype=torch.float64)
+    x = torch.randn((2, 3, 12, 10), generator=seeded(6), dtype=torch.float64)
+    seed = torch.randn(x.shape, generator=seeded(7), dtype=torch.float64)
     results = []
     for layer in (mine, theirs):
         inner = x.clone().requires_grad_()
@@ -167,63 +83,35 @@ def instance_norm_gradient() -> Outcome:
     return worst(errors, gamma(12) * torch.tensor(sizes).numpy())
 
 
-def _directional(function: Callable[[Tensor], Tensor], x: Tensor, smooth: bool) -> Outcome:
-    """Autograd's derivative along a random direction against Richardson's extrapolated difference quotient."""
-    step = 1e-3 if smooth else 1e-7
-    seed = torch.randn(x.shape, generator=_seeded(8), dtype=x.dtype)
-    seed = seed / seed.norm()
-    inner = x.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(function(inner), inner)
-    slope = float((gradient * seed).sum())
-
-    def quotient(h: float) -> float:
-        with torch.no_grad():
-            return float(function(x + h * seed) - function(x - h * seed)) / (2 * h)
-
-    one, two, four = quotient(step), quotient(2 * step), quotient(4 * step)
-    with torch.no_grad():
-        value = abs(float(function(x)))
-    first, second = (4 * one - two) / 3, (4 * two - four) / 3
-    rounding = 64 * U64 * max(value, 1e-300) * math.sqrt(x.numel()) / step
-    return worst([slope - first], [abs(first - second) + abs(one - two) * 1e-3 + rounding])
-
-
-def loss_gradient(name: str) -> Outcome:
-    prediction, target = _scene(1.0, torch.float64)
-    prediction = target + torch.sign(prediction - target) * (0.05 + (prediction - target).abs())  # away from |.|'s kink
-    loss = loss_function(name, _alpha(name))
-    return _directional(lambda x: loss(x, target), prediction, smooth=True)
-
-
 def layer_gradient(direction: str) -> Outcome:
     """d depth / d phase of the calibration layer."""
     rig = paper_rig(16)
     layer = TorchCalibrationLayer(rig, direction, torch.float64)  # type: ignore[arg-type]
     total = torch.from_numpy(CalibrationLayer.of(rig, direction).absolute_phase(1800.0))  # type: ignore[arg-type]
     order = torch.floor(total / (2 * math.pi) + 0.5)
-    return _directional(lambda phase: layer(phase, order).sum(), total - 2 * math.pi * order, smooth=True)
+    return directional(lambda phase: layer(phase, order).sum(), total - 2 * math.pi * order, smooth=True)
 
 
 def network_gradient(name: str) -> Outcome:
     """The whole network in float64, along a random direction of its input."""
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).double().eval()
-    x = torch.rand((1, 1, 64, 64), generator=_seeded(9), dtype=torch.float64)
-    seed = torch.randn((1, 1, 64, 64), generator=_seeded(10), dtype=torch.float64)
-    return _directional(lambda image: (network(image) * seed).sum(), x, smooth=False)
+    x = torch.rand((1, 1, 64, 64), generator=seeded(9), dtype=torch.float64)
+    seed = torch.randn((1, 1, 64, 64), generator=seeded(10), dtype=torch.float64)
+    return directional(lambda image: (network(image) * seed).sum(), x, smooth=False)
 
 
 def network_single(name: str) -> Outcome:
     """float32 against float64, beside what rounding every weight and pixel once does to the float64 result."""
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).double().eval()
-    x = torch.rand((1, 1, 64, 64), generator=_seeded(11), dtype=torch.float64)
+    x = torch.rand((1, 1, 64, 64), generator=seeded(11), dtype=torch.float64)
     with torch.no_grad():
         exact = network(x)
         spread = torch.zeros_like(exact)
         weights = [parameter.clone() for parameter in network.parameters()]
         for trial in range(3):
-            generator = _seeded(20 + trial)
+            generator = seeded(20 + trial)
 
             def rounded(values: Tensor, generator: torch.Generator = generator) -> Tensor:
                 noise = torch.rand(values.shape, generator=generator, dtype=torch.float64) * 2 - 1
@@ -257,11 +145,11 @@ def network_half(name: str, dtype: str) -> Outcome:
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).eval()
     head = torch.nn.Conv2d(8, 1, 1)
-    features = torch.rand((1, 8, 16, 16), generator=_seeded(12)).to(getattr(torch, dtype))
+    features = torch.rand((1, 8, 16, 16), generator=seeded(12)).to(getattr(torch, dtype))
     with torch.no_grad():
         head.bias.fill_(1800.0)  # type: ignore[union-attr]
         with torch.autocast("cpu", dtype=getattr(torch, dtype)):
-            out = network(torch.rand((1, 1, 64, 64), generator=_seeded(13)))
+            out = network(torch.rand((1, 1, 64, 64), generator=seeded(13)))
             found = in_full_precision(head, features)
         exact = torch.nn.functional.conv2d(
             features.double(), head.weight.double(), None if head.bias is None else head.bias.double()
@@ -269,34 +157,6 @@ def network_half(name: str, dtype: str) -> Outcome:
     if out.dtype != torch.float32 or not bool(torch.isfinite(out).all()):
         return Outcome(math.inf, 0.0, note=f"the network gives {out.dtype}, or numbers that are not finite")
     return worst((found.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
-
-
-def metric_scale(scale: float) -> Outcome:
-    """The evaluator's scores as a training metric, over many updates."""
-    metric = DepthScores()
-    target = torch.zeros((1, 20, 20), dtype=torch.float64)
-    target[:, 5:15, 5:15] = 4096 * scale
-    errors = scale * torch.randint(1, 999, (50, 20, 20), generator=_seeded(14)).double()
-    try:
-        for error in errors:
-            metric.update(target + error[None], target)
-    except PredictionError as error:
-        return Outcome(None, flagged=1.0, note=str(error))
-    found = float(metric.compute()["overall_rmse_mm"])
-    exact = (target + errors) - target
-    roots = [
-        scale * math.sqrt(math.fsum((value / scale) ** 2 for value in one.flatten().tolist()) / one.numel())
-        for one in exact
-    ]
-    wanted = math.fsum(roots) / len(roots)
-    return worst([found / wanted - 1], [gamma(460) + 2 * 2.0**-1074 / max(wanted, 2.0**-1074)])
-
-
-def metric_refuses(value: float) -> Outcome:
-    target = torch.full((1, 8, 8), 1800.0, dtype=torch.float64)
-    prediction = target.clone()
-    prediction[0, 1, 2] = value
-    return refusal(lambda: DepthScores().update(prediction, target), PredictionError)
 
 
 def phase_output(name: str, image: str) -> Outcome:
