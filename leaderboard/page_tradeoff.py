@@ -3,7 +3,7 @@
 The numbers come from a file of `fpp-bench tradeoff`; its texts are shown as text and nothing else.
 """
 
-from fpp_ml_bench.evaluation.numbers import millimetres, percent
+from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.report_html import escaped
 from fpp_ml_bench.leaderboard.log_axis import LogAxis
 from fpp_ml_bench.leaderboard.page_labels import Box, Named, label_texts
@@ -113,7 +113,7 @@ def _front_table(found: Tradeoff) -> str:
         cells = (
             millimetres(point.object_mae_mm),
             millimetres(point.measured_mae_mm),
-            "-" if point.missing_share is None else percent(point.missing_share),
+            "-" if point.missing_share is None else f"{100 * point.missing_share:.2g}%",
             f"{1000 * (point.seconds or 0):.3g}",
             f"{low:.3g} to {high:.3g}",
             str(point.frames),
