@@ -1,7 +1,8 @@
 """What the cases of losses and training metrics compute: values and gradients where they are stiff."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -13,6 +14,17 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.torch_metric import DepthScores
 
 _SHAPE = (2, 1, 24, 32)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread: at 64 px threads wait for each other longer than they work."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _alpha(name: str) -> float | None:

@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCali
 from fpp_ml_bench.baselines.phase_route.measurement import Reason
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.stability.case import Outcome, worst
-from fpp_ml_bench.baselines.stability.losses_checks import directional, seeded
+from fpp_ml_bench.baselines.stability.losses_checks import directional, one_thread, seeded
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, UB16, gamma
 from fpp_ml_bench.baselines.training.losses import loss_function
 from fpp_ml_bench.errors import FppBenchError
@@ -92,6 +92,7 @@ def layer_gradient(direction: str) -> Outcome:
     return directional(lambda phase: layer(phase, order).sum(), total - 2 * math.pi * order, smooth=True)
 
 
+@one_thread()
 def network_gradient(name: str) -> Outcome:
     """The whole network in float64, along a random direction of its input."""
     torch.manual_seed(4)
@@ -101,6 +102,7 @@ def network_gradient(name: str) -> Outcome:
     return directional(lambda image: (network(image) * seed).sum(), x, smooth=False)
 
 
+@one_thread()
 def network_single(name: str) -> Outcome:
     """float32 against float64, beside what rounding every weight and pixel once does to the float64 result."""
     torch.manual_seed(4)
@@ -128,6 +130,7 @@ def network_single(name: str) -> Outcome:
     return worst([float((found - exact).abs().max())], [16 * scale], condition=scale / U32 / float(exact.abs().max()))
 
 
+@one_thread()
 def network_constant(name: str, value: float) -> Outcome:
     """A constant image, and one gradient step's worth of numbers from it: nothing may be NaN or infinite."""
     torch.manual_seed(4)
@@ -140,6 +143,7 @@ def network_constant(name: str, value: float) -> Outcome:
     return worst([float(sum(int((~torch.isfinite(one)).sum()) for one in tensors))], [0.0])
 
 
+@one_thread()
 def network_half(name: str, dtype: str) -> Outcome:
     """Inference under autocast, raw depth out (a bias of 1,800): the last layer must not round to steps of 8 mm."""
     torch.manual_seed(4)
@@ -159,6 +163,7 @@ def network_half(name: str, dtype: str) -> Outcome:
     return worst((found.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
 
 
+@one_thread()
 def phase_output(name: str, image: str) -> Outcome:
     """Depth of an image that shows no object: what counts as measured must lie in the working range and its slack."""
     rig = paper_rig(480)
