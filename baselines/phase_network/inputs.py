@@ -144,7 +144,7 @@ class Scene:
         maps = {
             name: getattr(self, name).astype(real) for name in ("light", "plane_light", "phase_rad", "bright", "weight")
         }
-        slopes = (self.slopes[0].astype(real), self.slopes[1].astype(real))
+        slopes: tuple[Image, Image] = (self.slopes[0].astype(real), self.slopes[1].astype(real))
         return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
 
 

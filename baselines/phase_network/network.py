@@ -99,9 +99,9 @@ class PhaseNet(nn.Module):
         self.order_body = UNet(len(CHANNELS), order_widths)
         self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
         nn.init.normal_(self.answer.weight, std=0.05)
-        with torch.no_grad():
-            self.answer.bias.zero_()
-            self.answer.bias[[1, 5]] = LEAD
+        bias = torch.zeros(self.answer.out_channels)
+        bias[[1, 5]] = LEAD
+        self.answer.bias = nn.Parameter(bias)
 
     def folded(self) -> "PhaseNet":
         """The same network for asking alone, its normalisation folded into the convolutions: less to compute."""
@@ -111,7 +111,7 @@ class PhaseNet(nn.Module):
                 for place in (0, 3):
                     block[place] = fuse_conv_bn_eval(block[place], block[place + 1])
                     block[place + 1] = nn.Identity()
-        return ready.to(memory_format=torch.channels_last)
+        return ready.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if x.shape[-2] % self.stride or x.shape[-1] % self.stride:

@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, sa
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.training.history import CURVE_FILE, LOG_FILE, write_log
 from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.manifest import write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
 
@@ -89,7 +90,15 @@ def train_phase_net(
 
     with bar(f"{recipe.name}, training", recipe.steps, "steps") as advance:
         done = train(
-            recipe, samples, validation[::5], geometries, out, report, advance, minutes, begun and begun.network
+            recipe,
+            samples,
+            validation[::5],
+            geometries,
+            out,
+            report,
+            advance,
+            minutes,
+            begun.network if begun is not None else None,
         )
     write_log(out, done.history)
     draw(out / CURVE_FILE, done.history, recipe.name)
@@ -105,7 +114,7 @@ def train_phase_net(
     config = NetConfig(
         name=name, title="Fringe order, mask and bounded phase correction", options=done.network.options,
         threshold=threshold, lead=lead, period_px={one: g.route.period_px for one, g in geometries.items()},
-        dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=described, validation=means,
+        dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=described, validation=dict(means),
     )  # fmt: skip
     save_net(out / WEIGHTS_FILE, done.network, config)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)
@@ -133,7 +142,7 @@ def led(answers: Answers, lead: float) -> Answers:
     return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
 
 
-def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: dict[str, Geometry]) -> float:
+def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: dict[Direction, Geometry]) -> float:
     """Of `LEADS` the one with the fewest wrong orders, mean over the samples."""
     shares = [
         float(

@@ -27,6 +27,7 @@ from fpp_ml_bench.baselines.training.checkpoint import (
     save_checkpoint,
 )  # fmt: skip
 from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.frames import Direction
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 SMALL_RAD = 0.05
@@ -78,7 +79,7 @@ def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str
     return {"order": by_order, "mask": by_mask, "phase": (by_phase * batch.fitted).sum() / pixels}
 
 
-def scores(network: PhaseNet, samples: list[Sample], geometries: dict[str, Geometry]) -> dict[str, float]:
+def scores(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> dict[str, float]:
     """Means over whole images of what is being learned: object MAE mm, wrong orders %, missed %, invented px."""
     rows = []
     for sample in samples:
@@ -110,7 +111,9 @@ def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float
     }
 
 
-def batches(samples: list[Sample], geometries: dict[str, Geometry], recipe: Recipe, first: int) -> Iterator[Batch]:
+def batches(
+    samples: list[Sample], geometries: dict[Direction, Geometry], recipe: Recipe, first: int
+) -> Iterator[Batch]:
     """Batch of step ``first``, ``first + 1``, ...: each is a function of seed and step alone, made one step ahead."""
 
     def make(step: int) -> Batch:
@@ -127,7 +130,7 @@ def batches(samples: list[Sample], geometries: dict[str, Geometry], recipe: Reci
 
 
 def train(
-    recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[str, Geometry], out: Path,
+    recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry], out: Path,
     report: Callable[[list[dict[str, Any]]], None] = lambda history: None, tick: Callable[[int], None] = lambda n: None,
     minutes: float | None = None, start: PhaseNet | None = None,
 ) -> Done:  # fmt: skip
@@ -138,14 +141,14 @@ def train(
     """
     started = perf_counter()
     torch.manual_seed(recipe.seed)
-    network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad).to(
-        memory_format=torch.channels_last
-    )
+    network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad)
+    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if start is not None:
         if start.options != network.options:
             raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
         network.load_state_dict(start.state_dict())
     averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+    kept: PhaseNet = averaged.module  # type: ignore[assignment]
     optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
     history: list[dict[str, Any]] = []
     first = _restore(out / CHECKPOINT_FILE, recipe, network, averaged, optimizer, history)
@@ -172,14 +175,14 @@ def train(
             count = done % recipe.validate_every or recipe.validate_every
             record: dict[str, Any] = {"step": done, "rate": recipe.rate_at(step), "seconds": perf_counter() - since}
             record |= {f"loss_{name}": value / count for name, value in sums.items()}
-            record |= scores(averaged.module.eval(), validation, geometries) if validation else {}
+            record |= scores(kept.eval(), validation, geometries) if validation else {}
             history.append(record)
             report(history)
             _save(out / CHECKPOINT_FILE, recipe, done, network, averaged, optimizer, history)
             sums, since = dict.fromkeys(weights, 0.0), perf_counter()
             if minutes is not None and perf_counter() - started > 60 * minutes:
-                return Done(averaged.module.eval(), history, done)
-    return Done(averaged.module.eval(), history, recipe.steps)
+                return Done(kept.eval(), history, done)
+    return Done(kept.eval(), history, recipe.steps)
 
 
 def _save(

@@ -27,6 +27,7 @@ from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.phase_route.shading import irradiance
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.frames import Direction
 
 IGNORED = -100
 """Class of a pixel whose order teaches nothing: background, or none of the three candidates is right."""
@@ -66,7 +67,11 @@ class Window:
 
 
 def draw(
-    samples: list[Sample], geometries: dict[str, Geometry], size: int, vary: Variation, random: np.random.Generator
+    samples: list[Sample],
+    geometries: dict[Direction, Geometry],
+    size: int,
+    vary: Variation,
+    random: np.random.Generator,
 ) -> Window:
     """A random window of ``size`` px of one of ``samples``."""
     sample = samples[random.integers(len(samples))]
@@ -129,7 +134,7 @@ def _moved(
     phase = scene.phase_rad + delta
     carry = np.rint(phase / TAU)
     return replace(
-        scene, light=np.where(target, light, scene.light), bright=scene.bright * ratio,
+        scene, light=np.where(target, light, scene.light), bright=(scene.bright * ratio).astype(np.float32),
         phase_rad=(phase - TAU * carry).astype(np.float32), order=scene.order + carry.astype(np.int32),
         middle_rad=scene.middle_rad + float(delta),
     )  # fmt: skip
@@ -140,14 +145,14 @@ def _wrong(
     random: np.random.Generator,
 ) -> tuple[Scene, Image]:  # fmt: skip
     """Wrong first orders, where the range allows them."""
-    off = np.zeros(scene.light.shape, np.int32)
+    height, width = scene.light.shape
+    off = np.zeros((height, width), np.int32)
     middle = 0
     if random.random() < vary.wrong_window:
         middle = int(random.choice((-1, 1)))
         off += middle
     elif random.random() < vary.wrong_patch:
         coarse = random.standard_normal((12, 12)).astype(np.float32)
-        height, width = off.shape
         noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
         off += (noise > random.uniform(0.5, 1.5)) * int(random.choice((-1, 1)))
     if not off.any():
