@@ -1,6 +1,7 @@
 """What leaving out saves on a sparse scene, and what it costs on a full one: the same work with skipping on and off.
 
-    python benchmarks/skipping.py [--size 960] [--repeats 5] [--folder DIR] [--json FILE]
+    python benchmarks/skipping.py [--size 960] [--repeats 5] [--scenes pen,drum] [--no-builds]
+        [--folder DIR] [--json FILE]
 
 Two scenes go through everything: a pen (about 3% of the image) and the largest drum that still fits the image and the
 working range (about three quarters of it). Each piece of work runs with skipping on and off in turns, in this one
@@ -83,7 +84,9 @@ def switched(work: Work) -> tuple[Work, Work]:
     return lambda: run(True), lambda: run(False)
 
 
-def measure(name: str, mesh: Path, folder: Path, size: int, repeats: int) -> tuple[str, list[dict[str, Any]]]:
+def measure(
+    name: str, mesh: Path, folder: Path, size: int, repeats: int, builds: bool
+) -> tuple[str, list[dict[str, Any]]]:
     """All pieces of work on one scene; its title, and a row each."""
     user = single_mesh(mesh)
     rows: list[dict[str, Any]] = []
@@ -95,7 +98,7 @@ def measure(name: str, mesh: Path, folder: Path, size: int, repeats: int) -> tup
         rows.append({"what": what, "on_s": first, "off_s": second, "ratio": second / first, "compared": compared})
         print(f"  {what:44s} {1000 * first:9.1f} {1000 * second:9.1f} ms {second / first:6.2f}", flush=True)
 
-    for stored in ("all", "single_shot"):
+    for stored in ("all", "single_shot") if builds else ():
         settings = BuildSettings(paper_rig(size), (user.name,), stored=stored, user_meshes=(user,))
 
         def made(settings: BuildSettings = settings) -> list[str]:
@@ -105,7 +108,7 @@ def measure(name: str, mesh: Path, folder: Path, size: int, repeats: int) -> tup
 
         add(f"build, 6 views, {'52 frames' if stored == 'all' else 'frame 0'}", *switched(made),
             rounds=max(1, repeats // 2))  # fmt: skip
-        build(folder / name / stored, settings, workers=1)
+    build(folder / name / "all", BuildSettings(paper_rig(size), (user.name,), user_meshes=(user,)), workers=1)
     opened = DatasetFolder(folder / name / "all")
     rig, samples = opened.rig, opened.samples("test")
     stacks = {sample: [frame.copy() for frame in opened.frames(sample, range(52))] for sample in samples[:2]}
@@ -143,6 +146,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=960)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--scenes", default="pen,drum")
+    parser.add_argument("--no-builds", action="store_true", help="leave out the builds, which take the longest")
     parser.add_argument("--folder", type=Path, help="where the datasets go (default: a temporary folder)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
@@ -151,8 +156,10 @@ def main() -> int:
     content: dict[str, Any] = {"size": args.size, "machine": machine.to_dict(), "scenes": {}}
     with tempfile.TemporaryDirectory(prefix="fpp-skipping-", dir=args.folder) as scratch:
         for name, mesh in scenes(Path(scratch)).items():
+            if name not in args.scenes.split(","):
+                continue
             print(name)
-            title, rows = measure(name, mesh, Path(scratch), args.size, args.repeats)
+            title, rows = measure(name, mesh, Path(scratch), args.size, args.repeats, not args.no_builds)
             print(f"  = {title}")
             content["scenes"][title] = rows
     if args.json is not None:
