@@ -95,7 +95,7 @@ def table(rows: dict[str, list[dict[str, float]]]) -> None:
 
 def by_object(rows: list[dict[str, float]], names: list[str]) -> None:
     objects = list(dict.fromkeys(name.rsplit("_A", 1)[0] for name in names))
-    print("\n| object | " + " | ".join(key for key in COLUMNS if key in rows[0]) + " |")
+    print("| object | " + " | ".join(key for key in COLUMNS if key in rows[0]) + " |")
     print("|---|" + "---|" * sum(key in rows[0] for key in COLUMNS))
     for one in objects:
         own = [row for row, name in zip(rows, names, strict=True) if name.rsplit("_A", 1)[0] == one]
@@ -189,7 +189,9 @@ def main() -> None:
     )
     table(rows)
     if args.per_object:
-        by_object(rows[FULL], names)
+        for title in ("nothing learned", FULL):
+            print(f"\n{title}")
+            by_object(rows[title], names)
     if args.pictures:
         pictures(opened, method, args.pictures)
 
