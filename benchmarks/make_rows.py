@@ -27,10 +27,18 @@ CLASSICAL = (
     (3, "vertical"),
 )  # fmt: skip
 """Steps and directions of the classical method; 18 is divisible by all but 4, whose phases are not evenly spaced."""
+FEW = ((2, "horizontal"), (3, "horizontal"), (3, "vertical"))
+"""Frames of the phase route beyond one."""
 METHODS: dict[str, tuple[object, ...]] = {
     **{f"classical-{n:02d}-{way}": ("classical", "--steps", n, "--direction", way) for n, way in CLASSICAL},
     **{f"phase-{way}": ("phase", "--fringe", way) for way in ("horizontal", "vertical")},
+    **{f"phase-{n:02d}-{way}": ("phase", "--frames", n, "--fringe", way) for n, way in FEW},
     **{f"phase-net-{way}": ("phase-net", "--fringe", way) for way in ("horizontal", "vertical")},
+    **{
+        f"phase-net-fresh-{way}": ("phase-net", "--weights", "phase-net-fresh", "--fringe", way)
+        for way in ("horizontal", "vertical")
+    },
+    "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
 """File name of a row: method and options."""
 

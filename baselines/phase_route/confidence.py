@@ -58,7 +58,8 @@ def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.boo
     """Share of the window's weight on the object that is saturated in any of the frames, float32 (h, w)."""
     anywhere = np.any([grey >= GREY_LEVELS for grey in greys], axis=0)
     clipped = window.moment((anywhere & inside).astype(np.float32))
-    return clipped / np.maximum(fit.weight, 1e-3)
+    share: Image = (clipped / np.maximum(fit.weight, 1e-3)).astype(np.float32)
+    return share
 
 
 def expected_error_mm(seen: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
