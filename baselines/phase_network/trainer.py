@@ -72,6 +72,10 @@ def train_phase_net(
     described = recipe.to_dict() | ({} if more is None else {"extra_fingerprint": more.fingerprint})
     described |= {} if begun is None else {"start_sha256": begun.sha256}
     _claim(out / RECIPE_FILE, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
+    if (out / WEIGHTS_FILE).exists():
+        ready = load_net(out / WEIGHTS_FILE).config
+        had = {key: float(value or 0) for key, value in ready.validation.items()}
+        return Trained(out / WEIGHTS_FILE, ready.steps, ready.threshold, had)
     geometries = {one: Geometry.of(opened.rig, Settings(direction=one)) for one in recipe.directions}
     names, held = opened.samples("train"), opened.samples("validation")
     samples: list[Sample] = []
