@@ -120,7 +120,7 @@ def test_steps_out_of_bounds(opened, steps):
 
 
 def test_methods_by_name(opened):
-    assert METHODS == ("classical", "phase")
+    assert METHODS == ("classical", "phase", "phase-net")
     assert method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
     with pytest.raises(FppBenchError, match="there are classical"):
         method("magic", opened.rig)
