@@ -124,8 +124,12 @@ class Bench:
         return SharedPass(once, settings.get("depth_range"), settings.get("frame")), book
 
 
+_SAID_ONLY = ("weights_sha256", "device", "mask_threshold", "order_lead")
+"""Settings that say what the weights are; they are no options."""
+
+
 def _options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in ("weights_sha256", "device")}
+    return {key: value for key, value in settings.items() if key not in _SAID_ONLY}
 
 
 def fill(bench: Bench, path: Path, again: bool) -> str:
