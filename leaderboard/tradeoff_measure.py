@@ -1,7 +1,9 @@
 """One setting measured: seconds a view on frames in memory, and the error, by the leaderboard's scoring."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import shorten
 
 import numpy as np
@@ -16,6 +18,9 @@ from fpp_ml_bench.evaluation.units import scored_pair
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules, load, pace_ms, spread
 from fpp_ml_bench.leaderboard.tradeoff_points import Group, Point
 from fpp_ml_bench.leaderboard.tradeoff_views import Views
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+"""Where this package lies is nothing that a result need tell."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,8 @@ def measured(setting: Setting, rules: Rules) -> Point:
         pace = (before + pace_ms(rules)) / 2
         return Point.model_validate({**about, "pace_ms": float(f"{pace:.4g}"), **found})
     except FppBenchError as error:
-        reason = shorten(printable(" ".join(str(error).split()), 1000), NAME_LIMIT, placeholder=" ...")
+        said = " ".join(str(error).split()).replace(f"{_PACKAGE}{os.sep}", "")
+        reason = shorten(printable(said, 1000), NAME_LIMIT, placeholder=" ...")
         return Point.model_validate({**about, "failed": reason})
 
 
