@@ -17,7 +17,7 @@ EXAMPLES = (
 )
 _BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Where the linear algebra below NumPy looks how many threads it may start: left alone it takes all cores, also for
-systems of four unknowns, and the phase route is then twice as slow."""
+small systems, and the phase route is then slower."""
 _GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 
 
