@@ -143,19 +143,19 @@ def open_weights(path: str | Path) -> WeightsFile:
     return WeightsFile(path, config, tensors, heads, sha256(data).hexdigest())
 
 
-def shipped_names() -> list[str]:
-    """Names of the weights that come with the package, sorted."""
-    return sorted(path.name.removesuffix(SUFFIX) for path in SHIPPED.glob(f"*{SUFFIX}"))
+def shipped_names(folder: Path | None = None) -> list[str]:
+    """Names of the weights in ``folder``, by default the networks that come with the package, sorted."""
+    return sorted(path.name.removesuffix(SUFFIX) for path in (folder or SHIPPED).glob(f"*{SUFFIX}"))
 
 
-def weights_path(name_or_path: str | Path) -> Path:
+def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
     """Path of the file that ``name_or_path`` means: a path where it ends in ``.safetensors`` or leads somewhere, else
-    a shipped name. Raises `WeightsError`, listing what ships, for a name that does not."""
+    a name that ships in ``folder`` (None: `SHIPPED`). Raises `WeightsError`, listing what ships, for any other."""
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(SUFFIX) or "/" in text or "\\" in text:
         return Path(name_or_path)
-    if text in (names := shipped_names()):
-        return SHIPPED / f"{text}{SUFFIX}"
+    if text in (names := shipped_names(folder)):
+        return (folder or SHIPPED) / f"{text}{SUFFIX}"
     if Path(text).exists():
         return Path(text)
     from difflib import get_close_matches

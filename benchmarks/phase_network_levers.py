@@ -15,6 +15,7 @@ from time import process_time
 import cv2
 import numpy as np
 import torch
+from phase_pictures import draw_panels
 from phase_route_stages import SHOWN
 
 from fpp_ml_bench.baselines.model import load
@@ -109,7 +110,6 @@ def pictures(opened: DatasetFolder, method: PhaseNetMethod, folder: Path) -> Non
     import matplotlib
 
     matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
     for sample in SHOWN:
         image, target = np.array(opened.frame(sample, method.frames_used[0])), opened.depth_mm(sample)
@@ -131,16 +131,9 @@ def pictures(opened: DatasetFolder, method: PhaseNetMethod, folder: Path) -> Non
             ("error, mm", np.where(shown, found.depth_mm - target, np.nan)[box], error),
             ("correction, rad", correction[box] * none, {"cmap": "PuOr", "vmin": -0.6, "vmax": 0.6}),
         )
-        height, width = image[box].shape
-        figure, axes = plt.subplots(1, 6, figsize=(18, 18 / 6 * height / width + 0.9), layout="constrained")
-        for axis, (title, values, style) in zip(axes, panels, strict=True):
-            drawn = axis.imshow(values, interpolation="nearest", **style)
-            axis.set_title(title, fontsize=11)
-            axis.set_axis_off()
-            figure.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.05)
-        figure.suptitle(f"{sample}, phase-net, one {method.options.direction} fringe")
-        figure.savefig(folder / f"phase_net_{sample}.png", dpi=60)
-        plt.close(figure)
+        draw_panels(
+            panels, f"{sample}, phase-net, one {method.options.direction} fringe", folder / f"phase_net_{sample}.png"
+        )
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import cv2
 import numpy as np
+from phase_pictures import draw_panels
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
@@ -127,16 +128,7 @@ def pictures(opened: DatasetFolder, options: dict, folder: Path, sparse: list[tu
             ),
             ("confidence", found.confidence[box] * none, {"vmin": 0, "vmax": 1}),
         )
-        height, width = image[box].shape
-        figure, axes = plt.subplots(1, 6, figsize=(18, 18 / 6 * height / width + 0.9), layout="constrained")
-        for axis, (title, values, style) in zip(axes, panels, strict=True):
-            drawn = axis.imshow(values, interpolation="nearest", **style)
-            axis.set_title(title, fontsize=11)
-            axis.set_axis_off()
-            figure.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.05)
-        figure.suptitle(f"{sample}, one {method.options.direction} fringe")
-        figure.savefig(folder / f"phase_{sample}.png", dpi=60)
-        plt.close(figure)
+        draw_panels(panels, f"{sample}, one {method.options.direction} fringe", folder / f"phase_{sample}.png")
     shares = np.linspace(0.02, 1, 99)
     by_confidence, best = sparsification(sparse, shares)
     figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")

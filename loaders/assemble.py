@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.linear_algebra import THREAD_COUNTS
 from fpp_ml_bench.loaders.card import write_card
 from fpp_ml_bench.loaders.folder_lock import writing
 from fpp_ml_bench.loaders.manifest import (
@@ -39,7 +40,6 @@ Work = Callable[[Path, Path, ShardPlan, Callable[[], None]], Receipt]
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
 _POLL_S = 0.2
-_THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,8 @@ def _run(
 @contextmanager
 def _one_thread_a_process() -> Iterator[None]:
     """Workers started inside get a single-threaded BLAS: its idle threads spin, and cost more than they help here."""
-    before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
-    os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
+    before = {name: os.environ.get(name) for name in THREAD_COUNTS}
+    os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:
         yield
     finally:

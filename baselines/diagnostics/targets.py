@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.normalisation import normalise
@@ -13,7 +14,6 @@ from fpp_ml_bench.pixel_sets import object_mask
 from fpp_ml_bench.rig import Rig
 
 Image = NDArray[np.float32]
-TAU = 2 * np.pi
 
 
 @dataclass(frozen=True)

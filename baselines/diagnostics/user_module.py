@@ -149,7 +149,7 @@ def _run(name: str, network: nn.Module, batch: torch.Tensor) -> Any:
         return network(batch)
     except FppBenchError:
         raise
-    except Exception as error:
+    except Exception as error:  # the user's code again
         raise DiagnosisError(f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {_said(error)}") from error
 
 

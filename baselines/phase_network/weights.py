@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from fpp_ml_bench.baselines.weights_file import SUFFIX, weights_path
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
 from fpp_ml_bench.evaluation.text import printable
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 SHIPPED = Path(__file__).resolve().parent / "weights"
 """Folder of the weights that come with the package."""
 DEFAULT = "phase-net"
-SUFFIX = ".safetensors"
 FORMAT, VERSION = "fpp-ml-bench phase-net", "1"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -60,20 +60,6 @@ class NetFile:
     config: NetConfig
     network: "PhaseNet"
     sha256: str
-
-
-def weights_path(name_or_path: str | Path) -> Path:
-    """A path where it looks like one, else a shipped name. Raises `WeightsError` for a name that does not ship."""
-    text = str(name_or_path)
-    if isinstance(name_or_path, Path) or text.endswith(SUFFIX) or "/" in text:
-        return Path(name_or_path)
-    names = sorted(path.name.removesuffix(SUFFIX) for path in SHIPPED.glob(f"*{SUFFIX}"))
-    if text not in names:
-        raise WeightsError(
-            f"no phase-net weights called {printable(text, 100)!r} come with this package; there are "
-            f"{', '.join(names) or 'none'}, or give the path of a {SUFFIX} file of fpp-bench train phase-net"
-        )
-    return SHIPPED / f"{text}{SUFFIX}"
 
 
 def save_net(path: Path, network: "PhaseNet", config: NetConfig) -> str:
@@ -112,7 +98,7 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile
 
     from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 
-    path = weights_path(name_or_path)
+    path = weights_path(name_or_path, SHIPPED)
     shown = printable(str(path), 500)
     if not path.is_file():
         came = "a folder" if path.is_dir() else "nothing"

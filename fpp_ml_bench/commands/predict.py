@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.linear_algebra import limit_threads
+
+    limit_threads(args.threads)
     with as_asked(args):
         return _run(args)
 

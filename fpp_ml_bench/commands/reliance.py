@@ -36,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write what was asked for, print. Raises FppBenchError before measuring for a file that can't take it."""
+    from fpp_ml_bench.linear_algebra import limit_threads
+
+    limit_threads(args.threads)
     from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneBook
     from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
     from fpp_ml_bench.commands.console import progress_bar

@@ -45,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
     written into."""
     import json
 
+    from fpp_ml_bench.linear_algebra import limit_threads
+
+    limit_threads(args.threads)
     from fpp_ml_bench.baselines.timing import time_method
     from fpp_ml_bench.baselines.timing_file import check_target, write_timing
     from fpp_ml_bench.commands.console import progress_bar

@@ -15,9 +15,6 @@ EXAMPLES = (
     "fpp-bench tradeoff data/full --list",
     "fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json",
 )
-_BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Where the linear algebra below NumPy looks how many threads it may start: left alone it takes all cores, also for
-small systems, and the phase route is then slower."""
 _GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 
 
@@ -54,10 +51,9 @@ def _count(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, write everything, print fronts, growths and what to know of them."""
-    import os
+    from fpp_ml_bench.linear_algebra import limit_threads
 
-    for name in _BLAS_THREADS:  # read when NumPy is loaded, which is now
-        os.environ[name] = str(args.threads)
+    limit_threads(args.threads)
     from fpp_ml_bench.commands.console import progress_bar
     from fpp_ml_bench.evaluation.console import show
     from fpp_ml_bench.leaderboard.tradeoff import Wish, planned, tradeoff
