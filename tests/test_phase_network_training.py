@@ -14,6 +14,7 @@ from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sample_of
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, train
+from fpp_ml_bench.baselines.phase_network.unions import companions, united
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route.settings import Settings
@@ -80,6 +81,43 @@ def test_wrong_first_orders_are_labelled_as_such() -> None:
     assert (captured.order[captured.fitted] == 1).mean() > 0.95
 
 
+def test_a_union_is_what_the_rig_captures_of_both() -> None:
+    """Two tilted surfaces through each other before a plane, all in the benchmark's own light."""
+    rows, columns = np.indices((RIG.camera.height, RIG.camera.width))
+    behind, tilts = 2.1, [(0.1, -0.1), (-0.3, 0.2)]
+    depths = [
+        np.where(rows < 160, plane_depth_m(RIG, 1.7, tilts[0]), 0),
+        np.where(columns > 90, plane_depth_m(RIG, 1.72, tilts[1]), 0),
+    ]
+    empty = plane_fringe(RIG, 0, np.full(rows.shape, behind), (0.0, 0.0), noise=0)
+    images = [
+        np.where(depth > 0, plane_fringe(RIG, 0, np.where(depth > 0, depth, behind), tilt, noise=0), empty)
+        for depth, tilt in zip(depths, tilts, strict=True)
+    ]
+    images[1][-1, 0] = 0  # a shadow on the plane stays
+    image, depth_mm = united(images, [1000 * one for one in depths])
+    first = (depths[0] > 0) & ((depths[1] == 0) | (depths[0] <= depths[1]))
+    second = (depths[1] > 0) & ~first
+    assert (first & (depths[1] > 0)).mean() > 0.05 and (second & (depths[0] > 0)).mean() > 0.05
+    expected = np.where(first, images[0], np.where(second, images[1], empty))
+    expected[-1, 0] = 0
+    assert np.array_equal(image, expected)
+    assert np.allclose(depth_mm, 1000 * np.where(first, depths[0], depths[1]), atol=1e-3)
+    assert image.dtype == np.uint8 and depth_mm.dtype == np.float32
+
+
+def test_companions_are_other_objects() -> None:
+    names = [f"{one}_A{view}" for one in ("mug", "large_clamp", "pen") for view in (0, 60)]
+    counts = set()
+    for seed in range(40):
+        found = companions(names, 1, np.random.default_rng(seed))
+        objects = [one.rsplit("_", 1)[0] for one in found]
+        assert "mug" not in objects and len(set(objects)) == len(objects)
+        counts.add(len(found))
+    assert counts == {1, 2}
+    assert companions(["mug_A0", "mug_A60"], 0, np.random.default_rng(0)) == []
+
+
 def test_turning_for_the_network_and_back() -> None:
     image = np.arange(24.0).reshape(2, 3, 4)
     for transposed in (False, True):
@@ -107,7 +145,7 @@ def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
 
 
 def test_recipes_that_train_nothing_are_refused() -> None:
-    for wrong in ({"steps": 0}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0}):
+    for wrong in ({"steps": 0}, {"unions": -1}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0}):
         with pytest.raises(RecipeError):
             replace(SMALL, **wrong)  # type: ignore[arg-type]
     assert SMALL.digest != replace(SMALL, rate=1e-3).digest

@@ -16,18 +16,19 @@ class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
 
     ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
-    ``weight_*``: of the losses; ``averaged``: decay of the weights' moving average, which is what is kept.
+    ``unions``: how many unions of several objects are learned from for every sample; ``weight_*``: of the losses;
+    ``averaged``: decay of the weights' moving average, which is what is kept.
     Raises `RecipeError` for values that train nothing.
     """
 
     name: str = "phase-net"
-    steps: int = 1500
+    steps: int = 5000
     batch: int = 6
     window: int = 160
     rate: float = 3e-3
     warm_up: int = 100
     decay: float = 1e-4
-    averaged: float = 0.99
+    averaged: float = 0.995
     seed: int = 42
     widths: tuple[int, ...] = (24, 32, 48, 64)
     fine: int = 14
@@ -35,16 +36,19 @@ class Recipe:
     order_widths: tuple[int, ...] = (32, 48, 64)
     bound_rad: float = math.pi / 2
     directions: tuple[Direction, ...] = DIRECTIONS
+    unions: int = 1
     weight_order: float = 2.0
     weight_mask: float = 0.5
     weight_phase: float = 10.0
-    validate_every: int = 200
+    validate_every: int = 500
     vary: Variation = field(default_factory=Variation)
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "window", "validate_every"):
             if not getattr(self, name) >= 1:
                 raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        if not 0 <= self.unions <= 100:
+            raise RecipeError(f"unions {self.unions!r}: expected 0 to 100 for every sample")
         if not self.rate > 0 or not 0 <= self.averaged < 1:
             raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
         if not self.directions or any(one not in DIRECTIONS for one in self.directions):

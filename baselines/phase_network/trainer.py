@@ -17,6 +17,7 @@ from fpp_ml_bench.baselines.phase_network.decide import Answers, ask, decided_ma
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, samples_of
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, score, train
+from fpp_ml_bench.baselines.phase_network.unions import unions_of
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.training.history import CURVE_FILE, LOG_FILE, write_log
@@ -81,11 +82,12 @@ def train_phase_net(
     samples: list[Sample] = []
     validation: list[Sample] = []
     added = [] if more is None else more.samples("train")
-    with bar("phase of the samples", (len(names) + len(held) + len(added)) * len(geometries), "samples") as advance:
+    images = (1 + recipe.unions) * (len(names) + len(added)) + len(held)
+    with bar("phase of the samples", images * len(geometries), "samples") as advance:
         for geometry in geometries.values():
-            samples += samples_of(opened, names, geometry, advance)
-            if more is not None:
-                samples += samples_of(more, added, geometry, advance)
+            for folder, own in [(opened, names), *([] if more is None else [(more, added)])]:
+                samples += samples_of(folder, own, geometry, advance)
+                samples += unions_of(folder, own, geometry, recipe.unions, recipe.seed, advance)
             validation += samples_of(opened, held, geometry, advance)
 
     def report(history: list[dict[str, Any]]) -> None:
