@@ -1,7 +1,7 @@
 """What each lever of phase-net is worth, and the paper's UNet as a guide to the order instead of it.
 
     python benchmarks/phase_network_levers.py DATASET [--split test] [--fringe vertical] [--per-object] [--hybrid]
-        [--weights FILE] [--pictures docs/pictures]
+        [--brief] [--weights FILE] [--pictures docs/pictures]
 
 Needs a generated dataset at 960 px with the fringe's first frame: ``fpp-bench build data/full --preset full``. Times
 are the processor's, on one thread: what else runs on the machine does not count.
@@ -28,9 +28,10 @@ from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.pixel_sets import object_mask
 
 NOTHING = Levers(order=False, mask=False, phase=False)
+NOTHING_LEARNED = "nothing learned"
 FULL = "order + mask + correction (phase-net)"
 VARIANTS: dict[str, Levers] = {
-    "nothing learned": NOTHING,
+    NOTHING_LEARNED: NOTHING,
     "order": Levers(mask=False, phase=False),
     "order + mask": Levers(phase=False),
     "order + correction": Levers(mask=False),
@@ -143,6 +144,7 @@ def main() -> None:
     parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
     parser.add_argument("--weights", type=Path, help="default: those that come with the package")
     parser.add_argument("--per-object", action="store_true")
+    parser.add_argument("--brief", action="store_true", help="only the network with all its levers, and with none")
     parser.add_argument("--hybrid", action="store_true", help="also the paper's UNet as a guide to the order")
     parser.add_argument("--blind", action="store_true", help="also without brightness")
     parser.add_argument("--every", type=int, default=1, help="only every n-th sample")
@@ -154,6 +156,7 @@ def main() -> None:
     method = PhaseNetMethod(opened.rig, args.fringe, args.weights or DEFAULT)
     blind = PhaseNetMethod(opened.rig, args.fringe, method.file, shading=False) if args.blind else None
     guide = unet(opened.size) if args.hybrid else None
+    variants = {title: VARIANTS[title] for title in ((NOTHING_LEARNED, FULL) if args.brief else VARIANTS)}
     rows: dict[str, list[dict[str, float]]] = {}
     names = opened.samples(args.split)[:: args.every]
     for number, name in enumerate(names):
@@ -166,7 +169,7 @@ def main() -> None:
         started = process_time()
         method.route.geometry.route.observe(image)
         network = shared - (process_time() - started)
-        for title, levers in VARIANTS.items():
+        for title, levers in variants.items():
             started = process_time()
             found = method.route.conclude(asked, levers)
             seconds = shared + process_time() - started
@@ -182,7 +185,7 @@ def main() -> None:
     )
     table(rows)
     if args.per_object:
-        for title in ("nothing learned", FULL):
+        for title in (NOTHING_LEARNED, FULL):
             print(f"\n{title}")
             by_object(rows[title], names)
     if args.pictures:

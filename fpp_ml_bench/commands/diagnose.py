@@ -60,17 +60,21 @@ def _count(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Ask the probes, write the report, print what they say. Raises FppBenchError for what can't be looked into."""
+    from fpp_ml_bench.hardware import usable_cores
+    from fpp_ml_bench.linear_algebra import limit_threads
+
+    threads = args.threads or usable_cores()
+    limit_threads(threads)
     from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
     from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings
     from fpp_ml_bench.baselines.diagnostics.registry import checked_names
     from fpp_ml_bench.baselines.diagnostics.subject import subject
     from fpp_ml_bench.evaluation.console import show
-    from fpp_ml_bench.hardware import usable_cores
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     asked = checked_names(args.probe)
     opened = DatasetFolder(args.dataset)
-    model = subject(args.model, opened, args.layers, args.units, args.frame, args.threads or usable_cores())
+    model = subject(args.model, opened, args.layers, args.units, args.frame, threads)
     settings = ProbeSettings(args.samples, args.seeds, args.quick)
     with _bars() as progress:
         found = diagnose(model, opened, asked, settings, args.out, progress, _command(args))

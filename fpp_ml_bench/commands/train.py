@@ -36,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="phase-net: a dataset whose training split is learned from besides",
     )
     parser.add_argument("--steps", type=int, metavar="N", help="phase-net: how long (default: as the shipped weights)")
+    parser.add_argument(
+        "--unions", type=int, metavar="N", help="phase-net: unions of several objects for every sample (default: 1)"
+    )
     parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
@@ -53,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     if args.recipe == PHASE_NET:
         return _phase_net(args)
-    for option in ("extra", "start", "steps"):
+    for option in ("extra", "start", "steps", "unions"):
         if getattr(args, option) is not None:
             raise RecipeError(f"--{option} is an option of phase-net; leave it out")
     recipe = load_recipe(args.recipe, args.preset)
@@ -79,7 +82,8 @@ def _phase_net(args: argparse.Namespace) -> int:
     from fpp_ml_bench.commands import CHECK_FAILED
     from fpp_ml_bench.commands.console import progress_bar
 
-    recipe = Recipe() if args.steps is None else Recipe(steps=args.steps)
+    chosen = {name: getattr(args, name) for name in ("steps", "unions") if getattr(args, name) is not None}
+    recipe = Recipe(**chosen)
     done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
     if done.weights is None:
         print(f"{args.out}: stopped after {done.steps} of {recipe.steps} steps, all saved; the same command goes on")
