@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unions", type=int, metavar="N", help="phase-net: unions of several objects for every sample (default: 1)"
     )
+    parser.add_argument("--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: 0.003)")
     parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     if args.recipe == PHASE_NET:
         return _phase_net(args)
-    for option in ("extra", "start", "steps", "unions"):
+    for option in ("extra", "start", "steps", "unions", "rate"):
         if getattr(args, option) is not None:
             raise RecipeError(f"--{option} is an option of phase-net; leave it out")
     recipe = load_recipe(args.recipe, args.preset)
@@ -82,7 +83,7 @@ def _phase_net(args: argparse.Namespace) -> int:
     from fpp_ml_bench.commands import CHECK_FAILED
     from fpp_ml_bench.commands.console import progress_bar
 
-    chosen = {name: getattr(args, name) for name in ("steps", "unions") if getattr(args, name) is not None}
+    chosen = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
     recipe = Recipe(**chosen)
     done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
     if done.weights is None:
