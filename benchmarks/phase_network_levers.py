@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--split", default="test")
     parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
-    parser.add_argument("--weights", type=Path, help="default: those that come with the package")
+    parser.add_argument("--weights", metavar="NAME|FILE", help="default: phase-net, as shipped")
     parser.add_argument("--per-object", action="store_true")
     parser.add_argument("--brief", action="store_true", help="only the network with all its levers, and with none")
     parser.add_argument("--hybrid", action="store_true", help="also the paper's UNet as a guide to the order")

@@ -48,7 +48,8 @@ REFUSED = 2
 def weights_by_hash(runs: list[Path]) -> dict[str, Path]:
     """Every weights file of the package and below ``runs`` by its SHA-256."""
     files = [weights_path(name) for name in shipped_names()]
-    files += [path for folder in runs for path in sorted(folder.glob("**/weights*.safetensors"))]
+    below = [path for folder in runs for path in sorted(folder.glob("**/*.safetensors"))]
+    files += [path for path in below if not path.name.startswith("checkpoint")]
     return {sha256(path.read_bytes()).hexdigest(): path for path in files}
 
 

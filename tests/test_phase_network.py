@@ -72,14 +72,6 @@ def test_without_its_levers_it_is_the_measured_route() -> None:
     assert np.array_equal(same.confidence, measured.confidence)
 
 
-def test_threads_change_nothing() -> None:
-    image, routes = photograph("cork", "A60").frames[0], []
-    for threads in (1, 2):
-        torch.set_num_threads(1)  # the network's own sums may depend on it
-        routes.append(NetworkRoute(RIG, Settings(), wild(0.5), threads=threads).measure(image))
-    assert np.array_equal(routes[0].depth_mm, routes[1].depth_mm) and (routes[0].depth_mm > 0).any()
-
-
 def test_an_empty_scene_has_no_depth() -> None:
     empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
     assert not NetworkRoute(RIG, Settings(), wild(0.5), threshold=-1e9).measure(empty).depth_mm.any()

@@ -30,14 +30,12 @@ class Answers:
     correction_rad: Image
 
 
-def ask(
-    network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0, threads: int = 1
-) -> Answers:
+def ask(network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0) -> Answers:
     """Run ``network`` on one scene; ``lead`` is added to the logit of the base, because in training, where wrong orders
     are made up, it is wrong much more often than it is."""
     settings, rotation = geometry.route.settings, geometry.rotation
     layer = geometry.layer.at(scene.crop)
-    x, exists = channels(scene, layer, geometry.rig, rotation, geometry.route.period_px, settings.slack_mm, threads)
+    x, exists = channels(scene, layer, geometry.rig, rotation, geometry.route.period_px, settings.slack_mm)
     if not shading:
         x[list(SHADING)] = 0
     _, height, width = x.shape

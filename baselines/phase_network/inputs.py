@@ -20,7 +20,6 @@ from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation
 from fpp_ml_bench.baselines.phase_route.orders import LEAST_BRIGHTNESS
 from fpp_ml_bench.baselines.phase_route.shading import irradiance, wrapped
 from fpp_ml_bench.rig import Rig
-from fpp_ml_bench.side_by_side import side_by_side
 
 Image = NDArray[np.float32]
 
@@ -170,28 +169,12 @@ def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: 
 
 
 def channels(
-    scene: Scene, layer: CalibrationLayer, rig: Rig, rotation: Rotation, period_px: float, slack_mm: float,
-    threads: int = 1,
-) -> tuple[Image, NDArray[np.bool_]]:  # fmt: skip
+    scene: Scene, layer: CalibrationLayer, rig: Rig, rotation: Rotation, period_px: float, slack_mm: float
+) -> tuple[Image, NDArray[np.bool_]]:
     """Input of the network (`CHANNELS`, h', w') float32, turned, and which candidates exist, bool (3, h', w').
 
     The base always exists: where even it lies outside the range, nothing better is known.
     """
-    found: list[tuple[NDArray, ...]] = side_by_side(
-        [
-            lambda: _of_the_pixel(scene, layer, rig, rotation, period_px, slack_mm),
-            lambda: (from_the_sides(scene, layer, rotation, period_px),),
-        ],
-        threads,
-    )
-    (own, exists), (sides,) = found
-    return np.concatenate([own, sides]), np.ascontiguousarray(exists)
-
-
-def _of_the_pixel(
-    scene: Scene, layer: CalibrationLayer, rig: Rig, rotation: Rotation, period_px: float, slack_mm: float
-) -> tuple[Image, NDArray[np.bool_]]:
-    """The channels before those from the sides, and which candidates exist, turned."""
     expected = candidate_brightness(scene, layer, rig, rotation.sign)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     near, far = rig.working_range_mm
@@ -220,7 +203,9 @@ def _of_the_pixel(
     ]).astype(np.float32)  # fmt: skip
     fitted *= scene.weight > LEAST_WEIGHT
     seen = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
-    return rotation.turn(np.nan_to_num(np.concatenate([seen, fitted]))), rotation.turn(exists)
+    whole = rotation.turn(np.nan_to_num(np.concatenate([seen, fitted])))
+    sides = from_the_sides(scene, layer, rotation, period_px)
+    return np.concatenate([whole, sides]), np.ascontiguousarray(rotation.turn(exists))
 
 
 def around(misfit: NDArray) -> Image:

@@ -55,7 +55,7 @@ class PhaseNetMethod:
             )
         chosen = levers or Levers(shading=shading)
         config = self.file.config
-        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, chosen, config.lead, threads)
+        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, chosen, config.lead)
 
     @property
     def frames_used(self) -> tuple[int, ...]:

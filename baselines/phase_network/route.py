@@ -71,11 +71,9 @@ class NetworkRoute:
         threshold: float = 0.0,
         levers: Levers | None = None,
         lead: float = 0.0,
-        threads: int = 1,
     ) -> None:
         self.levers = levers or Levers()
-        self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading), threads)
-        self.threads = threads
+        self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading))
         self.network, self.threshold, self.lead = network, threshold, lead
 
     def measure(self, image: NDArray[np.uint8]) -> Measurement:
@@ -91,7 +89,7 @@ class NetworkRoute:
         if seen.empty:
             return Asked(seen, base, margin, None, None)
         scene = Scene.of(seen, base, geometry.rig)
-        answers = ask(self.network, scene, geometry, self.levers.shading, self.lead, self.threads)
+        answers = ask(self.network, scene, geometry, self.levers.shading, self.lead)
         seen.watch.done("network")
         return Asked(seen, base, margin, scene, answers)
 

@@ -33,8 +33,8 @@ class Geometry:
     rotation: Rotation
 
     @classmethod
-    def of(cls, rig: Rig, settings: Settings, threads: int = 1) -> "Geometry":
-        route = PhaseRoute(rig, settings, threads=threads)
+    def of(cls, rig: Rig, settings: Settings) -> "Geometry":
+        route = PhaseRoute(rig, settings)
         return cls(rig, route, Rotation.of(route.layer, settings.direction))
 
     @property

@@ -12,13 +12,10 @@ what costs them twice the error (docs/phase_route.md).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from fpp_ml_bench.side_by_side import side_by_side
 
 Image = NDArray[np.float32]
 
@@ -30,24 +27,20 @@ LARGEST_STEP_RAD = 0.7
 
 
 class Window:
-    """A Gaussian of ``sigma_px`` and its first and second moments, for `cv2.sepFilter2D`; ``threads`` for many."""
+    """A Gaussian of ``sigma_px`` and its first and second moments, for `cv2.sepFilter2D`."""
 
-    def __init__(self, sigma_px: float, threads: int = 1) -> None:
+    def __init__(self, sigma_px: float) -> None:
         half = int(np.ceil(WINDOW_SIGMAS * sigma_px))
         t = np.arange(-half, half + 1) / sigma_px
         weight = np.exp(-0.5 * t * t)
         weight /= weight.sum()
-        self.sigma_px, self._threads = sigma_px, threads
+        self.sigma_px = sigma_px
         self._kernels = [(weight * t**power).astype(np.float64) for power in range(3)]
 
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
         """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image."""
         kernels = self._kernels
         return cv2.sepFilter2D(image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
-
-    def moments(self, *asked: tuple[Image, int, int]) -> list[Image]:
-        """`moment` of every image, along_x and along_y."""
-        return side_by_side([partial(self.moment, *one) for one in asked], self._threads)
 
 
 @dataclass(frozen=True)
@@ -92,20 +85,18 @@ def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, wi
     light = grey * weight
     cosine, sine = np.cos(carrier_rad).astype(np.float32), np.sin(carrier_rad).astype(np.float32)
     by_cosine, by_sine = weight * cosine, weight * sine
-    w00, w10, w01, w20, w11, w02, c00, c10, c01, s00, s10, s01, cc, cs, *right = window.moments(
-        (weight, 0, 0), (weight, 1, 0), (weight, 0, 1), (weight, 2, 0), (weight, 1, 1), (weight, 0, 2),
-        (by_cosine, 0, 0), (by_cosine, 1, 0), (by_cosine, 0, 1), (by_sine, 0, 0), (by_sine, 1, 0), (by_sine, 0, 1),
-        (by_cosine * cosine, 0, 0), (by_cosine * sine, 0, 0),
-        (light, 0, 0), (light, 1, 0), (light, 0, 1), (light * cosine, 0, 0), (light * sine, 0, 0),
-    )  # fmt: skip
+    m = window.moment
+    w00 = m(weight)
+    cc = m(by_cosine * cosine)
     none = w00
     matrix = [
-        [w00, w10, w01, c00, s00],
-        [none, w20, w11, c10, s10],
-        [none, none, w02, c01, s01],
-        [none, none, none, cc, cs],
+        [w00, m(weight, 1, 0), m(weight, 0, 1), m(by_cosine), m(by_sine)],
+        [none, m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
+        [none, none, m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
+        [none, none, none, cc, m(by_cosine * sine)],
         [none, none, none, none, w00 - cc],
     ]
+    right = [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
     answer = solve_symmetric(matrix, right)
     return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
 
@@ -125,13 +116,17 @@ def fringe_fit(
         raised, sine = 1 + np.cos(angle), np.sin(angle)
         rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
         lr, ls = lr + light * raised, ls + light * sine
-    r00, r10, r01, r20, r11, r02, s00, s10, s01, s_s, share, *right = window.moments(
-        (rr, 0, 0), (rr, 1, 0), (rr, 0, 1), (rr, 2, 0), (rr, 1, 1), (rr, 0, 2), (rs, 0, 0), (rs, 1, 0), (rs, 0, 1),
-        (ss, 0, 0), (weight, 0, 0), (lr, 0, 0), (lr, 1, 0), (lr, 0, 1), (ls, 0, 0),
-    )  # fmt: skip
-    matrix = [[r00, r10, r01, s00], [r00, r20, r11, s10], [r00, r00, r02, s01], [r00, r00, r00, s_s]]
+    m = window.moment
+    r00 = m(rr)
+    matrix = [
+        [r00, m(rr, 1, 0), m(rr, 0, 1), m(rs)],
+        [r00, m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
+        [r00, r00, m(rr, 0, 2), m(rs, 0, 1)],
+        [r00, r00, r00, m(ss)],
+    ]
+    right = [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)]
     g, gx, gy, s = solve_symmetric(matrix, right)
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
     scale = np.float32(1 / window.sigma_px)
     phase = (carrier_rad + step).astype(np.float32)
-    return FringeFit(phase, g, gx * scale, gy * scale, share)
+    return FringeFit(phase, g, gx * scale, gy * scale, m(weight))

@@ -15,7 +15,7 @@ from fpp_ml_bench.rig import Rig
 
 
 class PhaseMethod:
-    """Depth from one or more sinusoids of one direction by ``threads``; options are those of `Settings`.
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`.
 
     Raises `PredictionError` for an option that there is not or a value it can't have.
     """
@@ -24,13 +24,12 @@ class PhaseMethod:
     uses_ground_truth_range = False
     units = "mm"
 
-    def __init__(self, rig: Rig, threads: int = 1, **options: Any) -> None:
+    def __init__(self, rig: Rig, **options: Any) -> None:
         try:
             chosen = Settings(**options)
         except TypeError as error:
             raise PredictionError(f"phase: {error}; there are {', '.join(Settings.__dataclass_fields__)}") from None
-        self.rig, self.options, self.route = rig, chosen, PhaseRoute(rig, chosen, threads=threads)
-        self.threads = threads
+        self.rig, self.options, self.route = rig, chosen, PhaseRoute(rig, chosen)
 
     @property
     def frames_used(self) -> tuple[int, ...]:

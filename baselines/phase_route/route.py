@@ -45,13 +45,11 @@ PAIR_ROUNDS = 2
 
 
 class PhaseRoute:
-    """The route for one rig and one fringe direction; ``chooser`` decides the orders (default: without learning);
-    ``threads`` change how long it takes and nothing else."""
+    """The route for one rig and one fringe direction; ``chooser`` decides the orders (default: without learning)."""
 
     def __init__(
-        self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness,
-        threads: int = 1,
-    ) -> None:  # fmt: skip
+        self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness
+    ) -> None:
         self.rig, self.settings, self.chooser = rig, settings or Settings(), chooser
         direction = self.settings.direction
         self.layer = CalibrationLayer.of(rig, direction)
@@ -60,13 +58,12 @@ class PhaseRoute:
         self._scene = EmptyScene(rig, self.layer, self.period_px, self.settings.white_grey, self.settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
         self._windows = [
-            Window(share * self.period_px, threads)
-            for share in (self.settings.first_window, self.settings.second_window)
+            Window(share * self.period_px) for share in (self.settings.first_window, self.settings.second_window)
         ]
         self.steps = steps_of(rig.sequence.steps, self.settings.frames)
         self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
         if self.settings.frames == 2:
-            self._windows += [Window(self.settings.pair_window * self.period_px, threads)] * PAIR_ROUNDS
+            self._windows += [Window(self.settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
     def measure(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Measurement:
         """Depth and all that it came from, of one captured fringe, uint8 (H, W), or of the frames of ``steps``.

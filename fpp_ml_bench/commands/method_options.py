@@ -197,7 +197,7 @@ def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
     chosen: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
     chosen |= {"frames": args.frames, "error_mm": args.error_mm}
     chosen["shading"] = None if args.no_shading is None else False
-    return {"threads": args.threads} | {name: value for name, value in chosen.items() if value is not None}
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _phase_net(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
