@@ -107,15 +107,15 @@ def test_a_union_is_what_the_rig_captures_of_both() -> None:
 
 
 def test_companions_are_other_objects() -> None:
-    names = [f"{one}_A{view}" for one in ("mug", "large_clamp", "pen") for view in (0, 60)]
+    objects = {f"{view}_{one}": one for one in ("mug", "large_clamp", "pen") for view in (0, 60)}
     counts = set()
     for seed in range(40):
-        found = companions(names, 1, np.random.default_rng(seed))
-        objects = [one.rsplit("_", 1)[0] for one in found]
-        assert "mug" not in objects and len(set(objects)) == len(objects)
+        found = companions(objects, "60_mug", np.random.default_rng(seed))
+        shown = [objects[one] for one in found]
+        assert "mug" not in shown and len(set(shown)) == len(shown)
         counts.add(len(found))
     assert counts == {1, 2}
-    assert companions(["mug_A0", "mug_A60"], 0, np.random.default_rng(0)) == []
+    assert companions({"0_mug": "mug", "60_mug": "mug"}, "0_mug", np.random.default_rng(0)) == []
 
 
 def test_turning_for_the_network_and_back() -> None:

@@ -5,7 +5,7 @@ what the rig would capture of both standing there, through each other where they
 from the other. No new object, no renderer.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +37,17 @@ def united(
     return np.where(shadow, darkest, image), np.where(empty, 0.0, depth).astype(np.float32)
 
 
-def companions(names: Sequence[str], number: int, random: np.random.Generator) -> list[str]:
-    """One or two samples of other objects than ``names[number]``'s, each of another; fewer where there are none."""
-    here = [names[number]]
+def companions(objects: Mapping[str, str], sample: str, random: np.random.Generator) -> list[str]:
+    """One or two samples that show other objects than ``sample`` does, each another; fewer where there are none.
+
+    ``objects``: the object of every sample that may be taken."""
+    here = [sample]
     for _ in range(int(random.integers(1, MOST))):
-        seen = {_object(one) for one in here}
-        others = [one for one in names if _object(one) not in seen]
+        seen = {objects[one] for one in here}
+        others = [one for one, shown in objects.items() if shown not in seen]
         if others:
             here.append(others[int(random.integers(len(others)))])
     return here[1:]
-
-
-def _object(name: str) -> str:
-    return name.rsplit("_", 1)[0]
 
 
 def unions_of(
@@ -58,11 +56,12 @@ def unions_of(
 ) -> list[Sample]:  # fmt: skip
     """``count`` unions of every one of ``names`` with others of them, the same objects for both fringe directions."""
     frame = opened.sequence.sinusoids(geometry.route.settings.direction)[0]
+    objects = {name: str(opened.measured(name)["object"]) for name in names}
     found = []
     for number, name in enumerate(names):
         for copy in range(count):
             random = np.random.default_rng([seed, number, copy])
-            members = [name, *companions(names, number, random)]
+            members = [name, *companions(objects, name, random)]
             if len(members) > 1:
                 image, depth_mm = united(
                     [np.asarray(opened.frame(one, frame)) for one in members],

@@ -37,9 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", type=int, metavar="N", help="phase-net: how long (default: as the shipped weights)")
     parser.add_argument(
-        "--unions", type=int, metavar="N", help="phase-net: unions of several objects for every sample (default: 1)"
+        "--unions",
+        type=int,
+        metavar="N",
+        help="phase-net: unions of objects for every sample (default: as for --steps)",
     )
-    parser.add_argument("--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: 0.003)")
+    parser.add_argument(
+        "--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)"
+    )
     parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
