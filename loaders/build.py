@@ -7,14 +7,13 @@ from pathlib import Path
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.loaders.assemble import Assembly, Progress, Receipt, assemble
-from fpp_ml_bench.loaders.manifest import Manifest
+from fpp_ml_bench.loaders.manifest import GENERATED, Manifest
 from fpp_ml_bench.loaders.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.schema import stored_frames
 from fpp_ml_bench.loaders.settings import BuildSettings
 from fpp_ml_bench.loaders.shards import Row, ShardPlan, ShardWriter, plan_shards
 from fpp_ml_bench.loaders.view import Studio
 
-GENERATED = "generated"
 MESH_FOLDER = "meshes"
 
 

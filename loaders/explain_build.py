@@ -7,9 +7,8 @@ explained as well; `tests/test_skipping.py` counts what really happens and finds
 import numpy as np
 
 from fpp_ml_bench.explain import Explanation, LeftOut, explained, saved_by
-from fpp_ml_bench.loaders.build import GENERATED
 from fpp_ml_bench.loaders.illumination import lit_object
-from fpp_ml_bench.loaders.manifest import Manifest
+from fpp_ml_bench.loaders.manifest import GENERATED, Manifest
 from fpp_ml_bench.loaders.meshes import solid_mesh
 from fpp_ml_bench.loaders.raycast import TracedObject
 from fpp_ml_bench.loaders.scene import place

@@ -17,6 +17,8 @@ from fpp_ml_bench.errors import DatasetError
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
+GENERATED = "generated"
+"""`Manifest.origin` of a dataset that the builder made."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, OBJECTS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.frames import CONFIGS
 from fpp_ml_bench.loaders.scene import PLACEMENTS, PlacementRule
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.rig import Rig, paper_rig
 
 PRESETS: dict[str, tuple[tuple[str, ...], int]] = {"mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE)}
 
@@ -85,3 +85,9 @@ class BuildSettings:
                 for mesh in self.user_meshes
             ],
         }  # fmt: skip
+
+
+def preset_settings(preset: str, size: int | None = None) -> BuildSettings:
+    """The settings of ``fpp-bench build --preset PRESET [--size SIZE]`` with everything else left at its default."""
+    objects, preset_size = PRESETS[preset]
+    return BuildSettings(rig=paper_rig(size or preset_size), objects=objects)

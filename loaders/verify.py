@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.frames import Sequence
-from fpp_ml_bench.loaders.manifest import MANIFEST, Manifest, ShardFile, dataset_files, file_hash, read_manifest
+from fpp_ml_bench.loaders.manifest import (
+    GENERATED,
+    MANIFEST,
+    Manifest,
+    ShardFile,
+    dataset_files,
+    file_hash,
+    read_manifest,
+)
 from fpp_ml_bench.loaders.schema import (
     DATA_GROUP,
     DEPTH,
@@ -169,7 +177,7 @@ def split_findings(manifest: Manifest) -> list[str]:
                 findings.append(
                     f"object {name!r} in {split}: expected the views {', '.join(VIEWS)}, found {', '.join(seen)}"
                 )
-            if manifest.origin == "generated" and name in OBJECTS and split_of(name) != split:
+            if manifest.origin == GENERATED and name in OBJECTS and split_of(name) != split:
                 findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
     return findings
 
