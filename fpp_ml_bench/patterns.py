@@ -15,6 +15,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.frames import Frame
 from fpp_ml_bench.gray_code import binary_to_gray, cell_of
+from fpp_ml_bench.portable import cosine_of_turns
 from fpp_ml_bench.rig import Rig
 
 
@@ -36,9 +37,9 @@ def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
     position = np.arange(rig.pattern_length(frame.direction))
     pitch = rig.pitch(frame.direction)
     if frame.kind == "sinusoid":
-        shift = 2 * np.pi * frame.step / rig.sequence.steps
-        half = GREY_LEVELS / 2
-        return np.rint(half + half * np.cos(2 * np.pi * position / pitch + shift)).astype(np.uint8)
+        steps, half = rig.sequence.steps, GREY_LEVELS / 2
+        turns = (position * steps + frame.step * pitch) / (pitch * steps)
+        return np.rint(half + half * cosine_of_turns(turns)).astype(np.uint8)
     code = binary_to_gray(cell_of(position, pitch))
     bit = code >> (rig.sequence.bits(frame.direction) - 1 - frame.step) & 1
     return (bit * GREY_LEVELS).astype(np.uint8)

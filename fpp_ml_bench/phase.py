@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 
 class Phase(NamedTuple):
@@ -44,7 +45,8 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
     if shifts.ndim != 1 or len(shifts) < 3 or not np.all(np.isfinite(shifts)):
         raise DecodeError(f"shifts_rad: expected at least 3 finite phase shifts in rad, got {shifts_rad!r}")
     count = len(shifts)
-    model = np.stack([np.ones(count), np.cos(shifts), np.sin(shifts)], axis=1)
+    turns = shifts / (2 * np.pi)
+    model = np.stack([np.ones(count), cosine_of_turns(turns), sine_of_turns(turns)], axis=1)
     weights = model.T * np.array([[1.0], [2.0], [2.0]]) / count
     if np.abs(weights @ model - np.eye(3)).max() < 1e-12:
         return np.ascontiguousarray(weights)

@@ -128,7 +128,11 @@ class Rig:
 
     def project(self, points_m: ArrayLike) -> Maps:
         """Projector pixels (u_p, v_p) of points (..., 3) in the CAMERA's frame, metres; NaN behind the projector."""
-        return self.projector.project(np.asarray(points_m, dtype=np.float64) @ self.R.T + self.t)
+        points = np.asarray(points_m, dtype=np.float64)
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        # Added in this order on every processor, which a matrix product is not.
+        turned = [row[0] * x + row[1] * y + row[2] * z + shift for row, shift in zip(self.R, self.t, strict=True)]
+        return self.projector.project(np.stack(turned, axis=-1))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and mappings, as stored with a dataset; see `fpp_ml_bench.rig_io`."""

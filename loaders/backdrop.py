@@ -55,7 +55,7 @@ class Backdrop:
     def _plane(self) -> Hits:
         pixels = np.arange(self._empty.gain.size, dtype=np.int64)
         normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (pixels.size, 3))
-        return Hits(pixels, np.full(pixels.size, self._rig.background_m), normals, rays=0)
+        return Hits(pixels, np.full(pixels.size, self._rig.background_m), normals)
 
     @cached_property
     def _points_m(self) -> NDArray[np.float64]:

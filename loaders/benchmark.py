@@ -29,9 +29,13 @@ class Benchmark:
 
 
 BENCHMARKS = (
-    Benchmark("fpp-bench-full", 0, "full", FULL_SIZE, "0" * 64),
-    Benchmark("fpp-bench-full-224", 0, "full", 224, "2" * 64),
-    Benchmark("fpp-bench-mini", 0, "mini", MINI_SIZE, "1" * 64),
+    Benchmark(
+        "fpp-bench-full", 0, "full", FULL_SIZE, "d46eed4271d91e8887863420ca08dff148db61abc135a24233d7757135d5683f"
+    ),
+    Benchmark("fpp-bench-full-224", 0, "full", 224, "052761fe170e60c8893e47b480265dd5727a4045bfb076077bc7eb8a0a1657a9"),
+    Benchmark(
+        "fpp-bench-mini", 0, "mini", MINI_SIZE, "0ba15100b657c8b0edfde78d1833ecefc0ebc42d219a96727f83fe604ba55440"
+    ),
 )
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 

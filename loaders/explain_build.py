@@ -10,7 +10,7 @@ from fpp_ml_bench.explain import Explanation, LeftOut, explained, saved_by
 from fpp_ml_bench.loaders.illumination import lit_object
 from fpp_ml_bench.loaders.manifest import GENERATED, Manifest
 from fpp_ml_bench.loaders.meshes import solid_mesh
-from fpp_ml_bench.loaders.raycast import TracedObject
+from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import place
 from fpp_ml_bench.loaders.settings import BuildSettings
 from fpp_ml_bench.loaders.view import Studio
@@ -28,16 +28,12 @@ class OneView:
         self.studio, rig = Studio(settings), settings.rig
         mesh = solid_mesh(name, settings.user_meshes)
         self.traced = TracedObject(mesh, place(mesh, view, rig, settings.placement, settings.seed)[0])
-        self.rays = rig.camera.rays()
-        self.hits = self.traced.primary(*self.rays)
+        self.hits = self.traced.primary(PixelRays.of(rig.camera))
         self.lit = lit_object(self.hits, rig, self.studio.lighting, self.traced)
         self.stream = (settings.seed, name, view)
-        self.seen = np.zeros(self.rays[0].shape, dtype=bool)
+        self.seen = np.zeros((rig.camera.height, rig.camera.width), dtype=bool)
         self.seen.ravel()[self.hits.pixels] = True
         self.expose()
-
-    def trace(self) -> None:
-        self.traced.primary(*self.rays)
 
     def light_background(self) -> None:
         self.studio.backdrop.behind(self.traced, self.hits.pixels)
@@ -68,8 +64,10 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     def exposed(px: int, count: int) -> int:
         return (px * unstored) + count * pixels * stored
 
-    lines = [_rays(one, rows, pixels, settings.shadows, rule)]
-    if not settings.shadows:
+    lines = []
+    if settings.shadows:
+        lines.append(_shadow_rays(one, rows, pixels, rule))
+    else:
         again = pixels * (views - 1)
         saved, how = saved_by(one.light_background, pixels, again), rule + "; lit once a process, one process assumed"
         lines.append(LeftOut("empty background again", "pixels", pixels, again, None, saved, how))
@@ -94,23 +92,11 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     return explained("build", about, lines)
 
 
-def _rays(one: OneView, rows: list[dict], pixels: int, shadows: bool, rule: str) -> LeftOut:
-    traced = sum(row["rays"] for row in rows)
-    if not shadows:
-        left, here = len(rows) * pixels - traced, pixels - one.row["rays"]
-        return LeftOut(
-            "camera rays past the object's box", "rays", traced, left, None,
-            saved_by(one.trace, here, left), rule,
-        )  # fmt: skip
-    # A shadow ray for every pixel of the plane would be the whole: those of the object's own surface are all needed.
-    whole = 2 * pixels
-
-    def both() -> None:
-        one.trace()
-        one.light_background()
-
-    left, here = len(rows) * whole - traced, whole - one.row["rays"]
+def _shadow_rays(one: OneView, rows: list[dict], pixels: int, rule: str) -> LeftOut:
+    """Shadow rays that pass the object; a ray for every pixel of the image would be all of them."""
+    traced = sum(row["shadow_rays"] for row in rows)
+    left, here = len(rows) * pixels - traced, pixels - one.row["shadow_rays"]
     return LeftOut(
-        "camera and shadow rays past the object's box", "rays", traced, left, None,
-        saved_by(both, here, left), rule + "; at most one shadow ray a pixel counted as the whole",
+        "shadow rays past the object's box", "rays", traced, left, None, saved_by(one.light_background, here, left),
+        rule,
     )  # fmt: skip

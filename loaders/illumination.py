@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.raycast import Hits, TracedObject
+from fpp_ml_bench.portable import power
 from fpp_ml_bench.rig import Rig
 
 NEAREST_M = 1e-3
@@ -89,7 +90,8 @@ def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -
 
 def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
     """The projector's centre of projection in camera coordinates, metres (3,)."""
-    return -rig.R.T @ rig.t
+    rotation, (tx, ty, tz) = rig.R, rig.t
+    return -(rotation[0] * tx + rotation[1] * ty + rotation[2] * tz)
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # of points in a lens, which get no light
@@ -113,7 +115,7 @@ def light_surface(
     along /= np.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
     # Blinn-Phong with the exponent that a microfacet roughness of this size has (2 / roughness^4 - 2).
     exponent = max(2.0 / lighting.roughness**4 - 2.0, 0.0)
-    gloss = np.maximum(along, 0.0) ** exponent
+    gloss = power(np.clip(along, 0.0, 1.0), exponent)
     reference_m = rig.working_range_mm[0] / MM_PER_M
     gain = (1.0 - lighting.specular + lighting.specular * gloss) * cosine
     gain *= lighting.white_grey * reference_m**2 / squared_m

@@ -15,6 +15,7 @@ from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.manifest import file_hash
 from fpp_ml_bench.loaders.scene import SolidMesh
 from fpp_ml_bench.loaders.settings import UserMesh
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:
     import trimesh
@@ -43,14 +44,13 @@ def load_user_mesh(description: UserMesh) -> SolidMesh:
     Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or
     triangles between vertices that are not there.
     """
-    import trimesh
-
     mesh = _read_mesh(Path(description.path))
     vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
-        angle = math.radians(degrees)
-        turn = trimesh.transformations.rotation_matrix(angle, np.eye(3)[axis])[:3, :3]
-        vertices_m = vertices_m @ turn.T
+        cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        a, b = vertices_m[:, first].copy(), vertices_m[:, second].copy()
+        vertices_m[:, first], vertices_m[:, second] = cosine * a - sine * b, sine * a + cosine * b
     if description.centre:
         vertices_m = vertices_m - (vertices_m.min(axis=0) + vertices_m.max(axis=0)) / 2
     return SolidMesh(

@@ -97,7 +97,7 @@ def _save(save: Callable[..., None], path: Path) -> None:
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     """The mesh from above and to the side, lit from the eye; uint8 (size, size)."""
     from fpp_ml_bench.loaders.meshes import load_user_mesh
-    from fpp_ml_bench.loaders.raycast import TracedObject
+    from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
     from fpp_ml_bench.loaders.scene import turned
     from fpp_ml_bench.loaders.settings import UserMesh
 
@@ -110,7 +110,7 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     distance = 4.0 * radius
     line = np.linspace(-1, 1, size) * (1.05 * radius / distance)
     x, y = np.meshgrid(line, line)
-    hits = TracedObject(mesh, vertices_m + np.array([0, 0, distance])).primary(x, y)
+    hits = TracedObject(mesh, vertices_m + np.array([0, 0, distance])).primary(PixelRays(x, y))
     toward = -np.column_stack([x.ravel()[hits.pixels], y.ravel()[hits.pixels], np.ones(hits.pixels.size)])
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     picture = np.full(size * size, 255, dtype=np.uint8)

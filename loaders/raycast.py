@@ -1,92 +1,112 @@
-"""Primary rays through Embree: which pixel sees which triangle, and the exact depth and normal there.
+"""Which pixel sees which triangle of an object, the exact depth and normal there, and what lies in shadow.
 
-Embree answers in float32; it is only asked for the triangle. Depth comes from that triangle's plane in float64.
+The camera's rays go through a depth buffer over the pixels' own rays, lens distortion included; any other ray through a
+box tree. All of it is float64 (`fpp_ml_bench.loaders.raycast_kernels`).
 """
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.scene import SolidMesh
-from fpp_ml_bench.skipping import skipping_enabled
+from fpp_ml_bench.pinhole import Pinhole
 
 _SHADOW_OFFSET_M = 1e-4
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Pixels that see the object: flat ``pixels`` int64 (n,), ``depth_m`` float64 (n,), ``normals`` float64 (n, 3).
-
-    Normals are unit vectors turned toward the camera, so a mesh with flipped triangles shades like one without.
-    ``rays`` counts the primary rays that may hit the object: those that are traced, unless skipping is switched off.
-    """
+    """Pixels that see the object: flat ``pixels`` int64 (n,) ascending, ``depth_m`` float64 (n,), ``normals`` float64
+    (n, 3), unit vectors turned toward the camera, so that a mesh with flipped triangles shades like one without."""
 
     pixels: NDArray[np.int64]
     depth_m: NDArray[np.float64]
     normals: NDArray[np.float64]
-    rays: int
+
+
+class PixelRays:
+    """The rays of an image: ``x`` and ``y`` float64 (H, W), undistorted normalised coordinates; NaN where there is no
+    ray.
+
+    ``columns`` float64 (2, W) bounds them: the greatest x up to each column, and the least x from it on. ``rows``
+    (2, H) does the same for y.
+    """
+
+    def __init__(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        self.x, self.y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+        self.columns, self.rows = _bounds(self.x, 0), _bounds(self.y, 1)
+
+    @classmethod
+    def of(cls, camera: Pinhole) -> "PixelRays":
+        """The rays of a camera; those of the two latest cameras are kept."""
+        return _camera_rays(camera)
+
+
+@lru_cache(maxsize=2)
+def _camera_rays(camera: Pinhole) -> PixelRays:
+    return PixelRays(*camera.rays())
+
+
+def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    greatest = np.where(np.isnan(rays), -np.inf, rays).max(axis=axis)
+    least = np.where(np.isnan(rays), np.inf, rays).min(axis=axis)
+    return np.stack([np.maximum.accumulate(greatest), np.minimum.accumulate(least[::-1])[::-1]])
 
 
 class TracedObject:
     """One placed object, ready for rays: ``vertices_m`` (V, 3) in camera coordinates."""
 
     def __init__(self, mesh: SolidMesh, vertices_m: NDArray[np.float64]) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
         corners = vertices_m[mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1)
+        lengths = np.sqrt(normals[:, 0] ** 2 + normals[:, 1] ** 2 + normals[:, 2] ** 2)
         solid = lengths > 0
         if not solid.any():
             raise MeshError(f"object {mesh.name!r} has no triangle with an area")
-        self._faces = np.ascontiguousarray(mesh.faces[solid], dtype=np.int32)
+        self._corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
         self._normals = normals[solid] / lengths[solid, None]
-        self._offsets = np.einsum("ij,ij->i", self._normals, corners[solid, 0])
-        self._depth_bounds = corners[solid, :, 2].min(axis=1), corners[solid, :, 2].max(axis=1)
+        self._offsets = _dot(self._normals, self._corners[:, 0])
         self._vertices_m = vertices_m
-        self._scene = rtcore_scene.EmbreeScene()
-        # The scene keeps no reference of its own to the mesh.
-        self._triangles = TriangleMesh(self._scene, vertices_m.astype(np.float32), self._faces)
 
-    def _first(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
-        if len(origins) == 0:
-            return np.empty(0, dtype=np.int32)
-        return self._scene.run(origins, directions)
+    def primary(self, rays: PixelRays) -> Hits:
+        """What the camera's rays meet first."""
+        from fpp_ml_bench.loaders.raycast_kernels import rasterise
 
-    def primary(self, rays_x: NDArray[np.float64], rays_y: NDArray[np.float64]) -> Hits:
-        """Trace the camera's rays, undistorted normalised coordinates (H, W); NaN rays see nothing."""
-        x, y = rays_x.ravel(), rays_y.ravel()
-        wanted = self._may_hit(x, y)
-        rays = int(wanted.size)
-        if not skipping_enabled():
-            wanted = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-        directions = np.column_stack([x[wanted], y[wanted], np.ones(wanted.size)])
-        triangle = self._first(np.zeros((wanted.size, 3), dtype=np.float32), directions.astype(np.float32))
-        seen = triangle >= 0
-        pixels, triangle, directions = wanted[seen], triangle[seen], directions[seen]
-        normals = self._normals[triangle]
-        facing = np.einsum("ij,ij->i", normals, directions)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth_m = self._offsets[triangle] / facing
-        # Seen exactly edge-on the plane gives no depth; the triangle itself still bounds it.
-        lowest, highest = self._depth_bounds[0][triangle], self._depth_bounds[1][triangle]
-        depth_m = np.where(np.isfinite(depth_m), np.clip(depth_m, lowest, highest), lowest)
-        normals = np.where((facing > 0)[:, None], -normals, normals)
-        return Hits(pixels=pixels, depth_m=depth_m, normals=normals, rays=rays)
+        window = self._window(rays)
+        (top, bottom), (left, right) = window
+        shape = (max(bottom - top, 0), max(right - left, 0))
+        depth_m, triangle = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int32)
+        if triangle.size:
+            rasterise(
+                self._corners, self._normals, self._offsets, rays.x, rays.y, rays.columns, rays.rows, left, top,
+                depth_m, triangle,
+            )  # fmt: skip
+        row, column = np.nonzero(triangle >= 0)
+        seen = triangle[row, column]
+        row, column = row + top, column + left
+        normals = self._normals[seen]
+        facing = normals[:, 0] * rays.x[row, column] + normals[:, 1] * rays.y[row, column] + normals[:, 2]
+        return Hits(
+            pixels=row * rays.x.shape[1] + column,
+            depth_m=depth_m[row - top, column - left],
+            normals=np.where((facing > 0)[:, None], -normals, normals),
+        )
 
-    def _may_hit(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Flat indices of rays inside the object's bounding box in normalised coordinates: the others can't hit it."""
-        usable = np.isfinite(x) & np.isfinite(y)
-        z = self._vertices_m[:, 2]
-        if z.min() > 0:
-            # Every triangle projects into the hull of its vertices; the hair's breadth covers Embree's float32.
-            slack = 1e-6
-            for rays, across in ((x, self._vertices_m[:, 0] / z), (y, self._vertices_m[:, 1] / z)):
-                usable &= (rays >= across.min() - slack) & (rays <= across.max() + slack)
-        return np.flatnonzero(usable)
+    def _window(self, rays: PixelRays) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First row and column, and the ones behind the last, of the box that the object can cover in the image."""
+        z = self._corners[..., 2]
+        if z.min() <= 0:
+            return (0, rays.x.shape[0]), (0, rays.x.shape[1])
+        spans = []
+        for bounds, across in ((rays.rows, self._corners[..., 1] / z), (rays.columns, self._corners[..., 0] / z)):
+            slack = 1e-9
+            first = np.searchsorted(bounds[0], across.min() - slack, "left")
+            behind = np.searchsorted(bounds[1], across.max() + slack, "right")
+            spans.append((int(first), int(behind)))
+        return spans[0], spans[1]
 
     def may_shadow(self, from_light_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which points the object can hide from the light at ``light_m`` (3,); bool (n,).
@@ -98,7 +118,7 @@ class TracedObject:
         around = self._vertices_m - light_m
         if around[:, 2].min() <= 0:
             return np.ones(z.size, dtype=bool)
-        possible, slack = z > 0, 1e-5  # Embree's float32 moves a ray by about a micrometre
+        possible, slack = z > 0, 1e-9
         for along, across in ((x, around[:, 0] / around[:, 2]), (y, around[:, 1] / around[:, 2])):
             possible &= (along >= (across.min() - slack) * z) & (along <= (across.max() + slack) * z)
         return possible
@@ -106,6 +126,30 @@ class TracedObject:
     def shadowed(self, points_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which surface points (n, 3) the object itself hides from the light at ``light_m`` (3,); bool (n,)."""
         toward = light_m - points_m
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        origins = points_m + _SHADOW_OFFSET_M * toward
-        return self._first(origins.astype(np.float32), toward.astype(np.float32)) >= 0
+        lengths = np.sqrt(toward[:, 0] ** 2 + toward[:, 1] ** 2 + toward[:, 2] ** 2)
+        origins = points_m + toward * (_SHADOW_OFFSET_M / lengths)[:, None]
+        return self.blocked(origins, np.broadcast_to(light_m, points_m.shape))
+
+    def blocked(self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether the object lies between each origin and its target, both (n, 3) in camera coordinates; bool (n,)."""
+        from fpp_ml_bench.loaders.raycast_kernels import any_hit
+
+        blocked = np.zeros(len(origins_m), dtype=bool)
+        any_hit(*self._tree, origins_m, targets_m, blocked)
+        return blocked
+
+    @cached_property
+    def _tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Triangles in the order of a box tree, where its leaves start, and its boxes."""
+        from fpp_ml_bench.loaders.raycast_kernels import LEAF, build_tree
+
+        count = len(self._corners)
+        leaves = 1 << (-(-count // LEAF) - 1).bit_length()
+        order, starts, boxes = np.empty(count, np.int64), np.empty(leaves + 1, np.int64), np.empty((2 * leaves, 6))
+        build_tree(self._corners, order, starts, boxes)
+        return self._corners[order], starts, boxes
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Dot products of rows (n, 3), added in order: `einsum` may fuse multiplications and additions."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.sensor import uniform
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 from fpp_ml_bench.rig import Rig
 
 PlacementRule = Literal["fixed", "varied"]
@@ -32,8 +33,7 @@ class SolidMesh:
 
 def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     """Vertices after R_z(degrees), along the camera's axes but still about the turning axis; (V, 3) metres."""
-    angle = np.deg2rad(degrees)
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
     x = cosine * vertices_m[:, 0] - sine * vertices_m[:, 1]
     y = sine * vertices_m[:, 0] + cosine * vertices_m[:, 1]
     return np.column_stack([-y, -vertices_m[:, 2], x])

@@ -12,7 +12,7 @@ from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.backdrop import Backdrop
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import Lighting, LitPixels, lit_object
-from fpp_ml_bench.loaders.raycast import Hits, TracedObject
+from fpp_ml_bench.loaders.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place
 from fpp_ml_bench.loaders.schema import stored_frames
 from fpp_ml_bench.loaders.sensor import Noise
@@ -54,7 +54,7 @@ class Studio:
         settings, rig = self.settings, self.settings.rig
         vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
         traced = TracedObject(mesh, vertices_m)
-        hits = traced.primary(*rig.camera.rays())
+        hits = traced.primary(PixelRays.of(rig.camera))
         lit = lit_object(hits, rig, self.lighting, traced)
         stream = (settings.seed, mesh.name, view)
         whole = self.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
@@ -65,7 +65,7 @@ class Studio:
         depth_mm = self.ground_truth_mm(seen)
         measured = {
             "distance_mm": distance_m * MM_PER_M,
-            "rays": hits.rays + whole.shadow_rays,
+            "shadow_rays": whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
         frames = {index: self._frames[index] for index in self.stored}

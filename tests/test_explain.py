@@ -61,8 +61,8 @@ def test_build_and_its_account(tmp_path, capsys):
     content, lines = lines_of(account)
     rows = DatasetFolder(tmp_path / "on").manifest.samples["train"]
     assert content["skipping"] and len(rows) == 6
-    rays = lines["camera rays past the object's box"]
-    assert rays["done"] == sum(row["rays"] for row in rows) and rays["done"] + rays["left_out"] == 6 * PIXELS
+    background = lines["empty background again"]
+    assert (background["done"], background["left_out"]) == (PIXELS, 5 * PIXELS)
     truth = lines["ground truth off the object"]
     assert truth["left_out"] == 50 * sum(PIXELS - row["exact_px"] for row in rows) and truth["seconds_saved"] > 0
     frames = lines["frames not asked for"]

@@ -6,12 +6,12 @@ import sys
 
 import numpy as np
 import pytest
-from embreex import rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 
 from fpp_ml_bench.constants import OBJECTS, STANDOFF_M, VIEW_DEGREES, WORKING_RANGE_MM
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.objects import BUILDERS, object_mesh
+from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.scene import SolidMesh, turned
 
 FOCAL_PX, IMAGE_PX = 2285.77, 960  # the paper's camera
 SIZE = 120
@@ -29,29 +29,13 @@ def views(meshes):
     return {name: _visible_depths_mm(mesh) for name, mesh in meshes.items()}
 
 
-def _turn(degrees):
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-
-
 def _visible_depths_mm(mesh):
-    """For each view, depth (n,) of the pixels that hit; camera 1.8 m away on -x, looking along +x, y left, z up.
-
-    The camera goes round the object instead of the object turning, so that Embree builds its tree once.
-    """
-    row, column = np.mgrid[0:SIZE, 0:SIZE]
-    scale, centre = IMAGE_PX / SIZE / FOCAL_PX, (SIZE - 1) / 2
-    rays = np.stack([np.ones(SIZE * SIZE), (centre - column.ravel()) * scale, (centre - row.ravel()) * scale], axis=1)
-    eyes = np.tile([-STANDOFF_M, 0.0, 0.0], (len(rays), 1))
-    scene = rtcore_scene.EmbreeScene()
-    triangles = TriangleMesh(scene, mesh.triangles.astype(np.float32))  # must outlive the queries
-    depths = []
-    for degrees in VIEW_DEGREES:
-        turn = _turn(degrees)  # (R^T v)^T = v^T R: the scene seen from a camera turned the other way
-        distance = scene.run((eyes @ turn).astype(np.float32), (rays @ turn).astype(np.float32), query="DISTANCE")
-        depths.append(1000.0 * distance[distance < 1e3])  # the ray's component along the axis is 1
-    del triangles
-    return depths
+    """For each view, depth (n,) of the pixels that hit; the camera stands 1.8 m before the turning axis."""
+    line = (np.arange(SIZE) - (SIZE - 1) / 2) * IMAGE_PX / SIZE / FOCAL_PX
+    rays = PixelRays(*np.meshgrid(line, line))
+    solid = SolidMesh("object", np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int32))
+    placed = (np.add(turned(solid.vertices_m, degrees), [0, 0, STANDOFF_M]) for degrees in VIEW_DEGREES)
+    return [1000.0 * TracedObject(solid, vertices_m).primary(rays).depth_m for vertices_m in placed]
 
 
 def _digest(mesh):
@@ -82,9 +66,9 @@ def test_mesh_is_centred_and_within_the_working_range(meshes, name):
     near, far = (depth / 1000 for depth in WORKING_RANGE_MM)
     assert np.hypot(vertices[:, 0], vertices[:, 1]).max() <= min(STANDOFF_M - near, far - STANDOFF_M) - 0.004
     for degrees in VIEW_DEGREES:
-        turned = vertices @ _turn(degrees).T
-        depth = turned[:, 0] + STANDOFF_M
-        reach = FOCAL_PX * np.abs(turned[:, 1:]) / depth[:, None]
+        across, down, away = turned(vertices, degrees).T
+        depth = away + STANDOFF_M
+        reach = FOCAL_PX * np.abs(np.stack([across, down], axis=1)) / depth[:, None]
         assert reach.max() <= IMAGE_PX / 2 - MARGIN_PX
 
 

@@ -18,7 +18,7 @@ from fpp_ml_bench.loaders.backdrop import Backdrop
 from fpp_ml_bench.loaders.build import build
 from fpp_ml_bench.loaders.camera import Exposure
 from fpp_ml_bench.loaders.illumination import Lighting
-from fpp_ml_bench.loaders.raycast import TracedObject
+from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.rig import paper_rig
@@ -50,36 +50,37 @@ def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
 
 
 def counting(monkeypatch):
-    """What really happens: rays given to Embree, pixels exposed whole or in part."""
+    """What really happens: shadow rays traced, pixels exposed whole or in part."""
     counts = {"rays": 0, "exposed": 0}
-    first, expose = TracedObject._first, Exposure.expose
+    blocked, expose = TracedObject.blocked, Exposure.expose
 
-    def counted_first(self, origins, directions):
+    def counted_rays(self, origins, targets):
         counts["rays"] += len(origins)
-        return first(self, origins, directions)
+        return blocked(self, origins, targets)
 
     def counted_expose(self, frames, lit, pixels, *rest):
         counts["exposed"] += len(frames) * pixels.size
         return expose(self, frames, lit, pixels, *rest)
 
-    monkeypatch.setattr(TracedObject, "_first", counted_first)
+    monkeypatch.setattr(TracedObject, "blocked", counted_rays)
     monkeypatch.setattr(Exposure, "expose", counted_expose)
     return counts
 
 
 def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeypatch):
     counts = counting(monkeypatch)
-    settings = tiny_settings(objects=("cork",), stored="single_shot")
+    settings = tiny_settings(objects=("cork",), stored="single_shot", shadows=True)
     manifest = build(tmp_path / "on", settings, workers=1)
     rows = manifest.samples["train"]
-    pixels = TINY_SIZE**2
-    assert counts["rays"] == sum(row["rays"] for row in rows) < 0.1 * len(rows) * pixels
+    pixels, traced = TINY_SIZE**2, counts["rays"]
+    assert traced == sum(row["shadow_rays"] for row in rows) < 0.1 * len(rows) * pixels
     # Frame 0 whole; 49 that only the ground truth needs at the object alone; black and white nowhere.
     assert counts["exposed"] == sum(pixels + 49 * row["exact_px"] for row in rows)
     counts.update(rays=0, exposed=0)
     with skipping(False):
         build(tmp_path / "off", settings, workers=1)
-    assert counts == {"rays": len(rows) * pixels, "exposed": len(rows) * 52 * pixels}
+    assert counts["rays"] > 2 * traced
+    assert counts["exposed"] == len(rows) * 52 * pixels
 
 
 def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
@@ -87,7 +88,7 @@ def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
     ball = trimesh.creation.icosphere(3, 0.15)
     mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
     traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
-    covered = traced.primary(*rig.camera.rays()).pixels
+    covered = traced.primary(PixelRays.of(rig.camera)).pixels
     backdrop, counts = Backdrop(rig, lighting), counting(monkeypatch)
     fewer = backdrop.behind(traced, covered)
     asked = counts["rays"]

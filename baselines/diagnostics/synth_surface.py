@@ -11,7 +11,7 @@ from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.build import MESH_FOLDER
 from fpp_ml_bench.loaders.meshes import load_user_mesh
-from fpp_ml_bench.loaders.raycast import TracedObject
+from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import turned
 from fpp_ml_bench.loaders.schema import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.settings import UserMesh
@@ -71,7 +71,8 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
     if mesh.is_file() and about.get("distance_mm") is not None:
         found = load_user_mesh(UserMesh(mesh.stem, str(mesh), centre=False))
         vertices_m = turned(found.vertices_m, VIEW_DEGREES[VIEWS.index(about["view"])])
-        hits = TracedObject(found, vertices_m + np.array([0, 0, about["distance_mm"] / MM_PER_M])).primary(x, y)
+        placed_m = vertices_m + np.array([0, 0, about["distance_mm"] / MM_PER_M])
+        hits = TracedObject(found, placed_m).primary(PixelRays.of(dataset.rig.camera))
         place = np.full(x.size, -1)
         place[hits.pixels] = np.arange(hits.pixels.size)
         traced = place[pixels] >= 0

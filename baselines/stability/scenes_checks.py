@@ -9,7 +9,7 @@ from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.illumination import Lighting, light_surface, projector_centre_m
-from fpp_ml_bench.loaders.raycast import Hits, TracedObject
+from fpp_ml_bench.loaders.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import SolidMesh, place
 from fpp_ml_bench.rig import paper_rig
 
@@ -44,7 +44,7 @@ def edge_on(off_deg: float) -> Outcome:
     along = math.cos(turn) * sight + math.sin(turn) * np.array([sight[2], 0.0, -sight[0]])
     up = np.array([0.0, 0.1, 0.0])
     corners = [middle + s * 0.1 * along + r * up for s, r in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    hits = _quad(corners).primary(*RIG.camera.rays())
+    hits = _quad(corners).primary(PixelRays.of(RIG.camera))
     x, y = (axis.ravel()[hits.pixels] for axis in RIG.camera.rays())
     wide = np.asarray(corners, dtype=np.longdouble)
     normal = np.cross(wide[1] - wide[0], wide[2] - wide[0])
@@ -76,7 +76,7 @@ def needle(width_px: float, centre_px: float) -> Outcome:
     left, right = ((column + side * width_px / 2 - camera.cx) / camera.fx * 1.8 for side in (-1, 1))
     half = 0.1
     hits = _quad([[left, -half, 1.8], [right, -half, 1.8], [right, half, 1.8], [left, half, 1.8]]).primary(
-        *camera.rays()
+        PixelRays.of(camera)
     )
     seen = image(hits)
     columns = np.arange(camera.width)
@@ -99,7 +99,7 @@ def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[NDArray[np.flo
 def broken(kind: str) -> Outcome:
     """A ball with something wrong that must not change what the camera sees of it."""
     vertices, faces = _ball()
-    whole = traced(vertices, faces).primary(*RIG.camera.rays())
+    whole = traced(vertices, faces).primary(PixelRays.of(RIG.camera))
     rng = np.random.default_rng(2)
     if kind == "degenerate triangles":
         some = rng.integers(0, len(vertices), (500, 2))
@@ -126,7 +126,7 @@ def broken(kind: str) -> Outcome:
     elif kind == "open back":
         centre = vertices[faces].mean(axis=1)
         faces = faces[centre[:, 2] < 1.8 + 0.05]
-    found = traced(vertices, faces).primary(*RIG.camera.rays())
+    found = traced(vertices, faces).primary(PixelRays.of(RIG.camera))
     a, b = image(whole), image(found)
     lit = found.normals[:, 2] if len(found.pixels) else np.zeros(0)
     if ((a > 0) != (b > 0)).any() or not np.isfinite(found.normals).all() or (lit > 1e-9).any():
@@ -143,7 +143,7 @@ def triangles(count: float) -> Outcome:
     """So many triangles: one, or a paraboloid cut into a grid, whose facets are as close to it as chords are."""
     camera = RIG.camera
     if count == 1:
-        hits = traced([[-0.3, -0.3, 1.9], [0.3, -0.3, 1.7], [0.0, 0.4, 1.8]], [[0, 1, 2]]).primary(*camera.rays())
+        hits = traced([[-0.3, -0.3, 1.9], [0.3, -0.3, 1.7], [0.0, 0.4, 1.8]], [[0, 1, 2]]).primary(PixelRays.of(camera))
         x, y = (axis.ravel()[hits.pixels] for axis in camera.rays())
         exact = 1.8 / (1 + x / 3)  # the plane Z = 1.8 - X / 3
         return worst(hits.depth_m - exact, 64 * U64) if len(hits.pixels) else Outcome(math.inf, 0.0)
@@ -157,7 +157,7 @@ def triangles(count: float) -> Outcome:
     for half, corners in enumerate(((0, 1, side + 2), (0, side + 2, side + 1))):
         for place_, corner in enumerate(corners):
             faces[half::2, place_] = cell + corner
-    hits = traced(vertices, faces).primary(*camera.rays())
+    hits = traced(vertices, faces).primary(PixelRays.of(camera))
     x, y = (axis.ravel()[hits.pixels] for axis in camera.rays())
     # Z = 1.7 + Z^2 (x^2 + y^2), the nearer root, without cancellation.
     square = x * x + y * y
@@ -180,7 +180,7 @@ def camera_inside(turn_deg: float) -> Outcome:
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
              [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    hits = traced(corners @ turn.T, faces).primary(*RIG.camera.rays())
+    hits = traced(corners @ turn.T, faces).primary(PixelRays.of(RIG.camera))
     x, y = (axis.ravel() for axis in RIG.camera.rays())
     if len(hits.pixels) != x.size:
         return Outcome(math.inf, 0.0, note=f"{x.size - len(hits.pixels)} rays leave a closed box")
@@ -200,7 +200,7 @@ def placed_around(name: str) -> Outcome:
 
 
 def behind_camera() -> Outcome:
-    hits = _quad([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).primary(*RIG.camera.rays())
+    hits = _quad([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).primary(PixelRays.of(RIG.camera))
     return worst(np.zeros(4), 0.0, np.full(4, len(hits.pixels) == 0))
 
 

@@ -127,7 +127,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: float) -> None:
-    from fpp_ml_bench.commands.console import gigabytes
+    from fpp_ml_bench.commands.console import gigabytes, say_benchmark
     from fpp_ml_bench.loaders.statistics import ground_truth_summary
 
     size = sum(file.bytes for file in manifest.files)
@@ -136,4 +136,5 @@ def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: f
     print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)}; {rate}")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
+    say_benchmark(manifest)
     print(f"next: fpp-bench info {out}")

@@ -1,7 +1,12 @@
 """What a person sees of a long job: a progress bar on standard error, and tables on standard output."""
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.loaders.manifest import Manifest
 
 
 @contextmanager
@@ -40,3 +45,11 @@ def gigabytes(count: float) -> str:
 def millimetres(value: float | None) -> str:
     """A length for a table; a dash where there is none."""
     return "-" if value is None else f"{value:.3f}"
+
+
+def say_benchmark(manifest: "Manifest") -> None:
+    """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
+    from fpp_ml_bench.loaders.benchmark import benchmark_sentence
+
+    as_expected, sentence = benchmark_sentence(manifest)
+    print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)

@@ -22,15 +22,18 @@ def run(args: argparse.Namespace) -> int:
 
     from fpp_ml_bench.constants import MM_PER_M
     from fpp_ml_bench.frames import DIRECTIONS
+    from fpp_ml_bench.loaders.benchmark import benchmark_of, benchmark_sentence
     from fpp_ml_bench.loaders.statistics import split_statistics, whole_statistics
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     opened = DatasetFolder(args.dataset)
+    benchmark = benchmark_of(opened.fingerprint)
     statistics = split_statistics(opened.manifest)
     if args.json:
         content = {
             "path": str(opened.path),
             "fingerprint": opened.fingerprint,
+            "benchmark": None if benchmark is None else {"name": benchmark.name, "version": benchmark.version},
             "origin": opened.manifest.origin,
             "size": list(opened.size),
             "configs": list(opened.configs),
@@ -60,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"dataset         {opened.path}")
     print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
     print(f"fingerprint     {opened.fingerprint}")
+    print(f"benchmark       {benchmark_sentence(manifest)[1]}")
     print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-SUMMARY = "Prove a dataset intact: checksums, missing and foreign files, labels, split leaks, duplicated images."
+SUMMARY = "Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."
 EXAMPLES = ("fpp-bench verify data/mini", "fpp-bench verify data/mini && echo safe to train on")
 
 
@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.commands import CHECK_FAILED, OK
-    from fpp_ml_bench.commands.console import gigabytes, progress_bar
+    from fpp_ml_bench.commands.console import gigabytes, progress_bar, say_benchmark
     from fpp_ml_bench.loaders.manifest import read_manifest
     from fpp_ml_bench.loaders.verify import verify
 
@@ -30,4 +30,5 @@ def run(args: argparse.Namespace) -> int:
         return CHECK_FAILED
     print(f"{args.dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in two splits")
     print(f"fingerprint {manifest.fingerprint}")
+    say_benchmark(manifest)
     return OK

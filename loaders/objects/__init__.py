@@ -26,7 +26,7 @@ from fpp_ml_bench.loaders.objects import (
     small_things,
     vessels,
 )
-from fpp_ml_bench.loaders.objects.solids import Solid
+from fpp_ml_bench.loaders.objects.solids import Solid, on_grid
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["BUILDERS", "object_mesh"]
 
 SLIVER_MM = 1e-2  # edges shorter than this are collapsed: booleans leave slivers there, and no pixel sees one
+
+FINAL_GRID_MM = 2.0**-8  # of the finished mesh: two hundred to a pixel, and coarse enough to leave no sliver
 
 # name: (builder, times real size)
 BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
@@ -104,7 +106,7 @@ def object_mesh(name: str) -> "trimesh.Trimesh":
         hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(BUILDERS)}"
         raise MeshError(f"expected one of the benchmark's {len(BUILDERS)} objects, got {name!r}; {hint}")
     builder, scale = BUILDERS[name]
-    solid = builder().scale((scale, scale, scale)).as_original().simplify(SLIVER_MM)
+    solid = on_grid(builder().scale((scale, scale, scale)), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
     mesh = solid.to_mesh64()
     vertices_m = mesh.vert_properties[:, :3] / MM_PER_M
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)

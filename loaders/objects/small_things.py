@@ -140,7 +140,7 @@ def battery_case() -> Solid:
             (0, side * 90, 0),
         )
         spring = [place(ring(4.0 - 0.3 * k, 0.7), (-side * (30.4 - 1.6 * k), y, 1), (0, 90, 0)) for k in range(4)]
-        stem = rod((-side * 31, y, 1), (-side * 23, y, 1), 3.3)
+        stem = rod((-side * 31, y, 1), (-side * 23, y, 1), 3.2)
         plus = place(text_section("+", 5).extrude(1.4), (side * 17, y, 7.4))
         cells += [cell, stem, plus, *spring, block(1.4, 9, 11, 0, (side * 31, y, 2))]
     leads = [tube(curve([(30, y, -4), (37, y, -4), (41, y + 5, -3), (42, 20 + y, 0)]), 1.3, sides=20) for y in (6, 12)]

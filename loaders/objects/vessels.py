@@ -105,7 +105,7 @@ def _candle(radius: float, height: float) -> Solid:
     )
     runs = []
     for k in range(5):
-        angle = 1.1 + 1.31 * k + 0.03 * height
+        angle = 1.11 + 1.31 * k + 0.03 * height
         x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
         runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
     wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
