@@ -84,7 +84,7 @@ def _contradicting_mean(
 def _black_frame(levels: list[NDArray[np.uint8]]) -> tuple[int, str] | None:
     """Index of the frame that is black at every pixel while the frame half a period later varies, and the fault.
 
-    Where a correct frame is black everywhere, both are at an extreme of the fringe, and the later one can't vary.
+    Where a correct frame is black everywhere, both are at an extreme of the fringe, and the later frame can't vary.
     """
     for position, level in enumerate(levels):
         opposite = levels[(position + len(levels) // 2) % len(levels)]

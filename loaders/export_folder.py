@@ -22,7 +22,7 @@ def exporting(out: Path) -> Iterator[Path]:
     if target.exists() and not target.is_dir():
         raise BuildError(f"{out}: is a file; give a new folder")
     if target.is_dir() and any(target.iterdir()):
-        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to one or overwrites it")
+        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")
     with exclusive(staging / _LOCK, out, "exporting there"):
         try:

@@ -164,7 +164,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
 
 
 def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
-    """Frame order of the first readable raw scan that fits one; tries a few scans, as the first may be broken."""
+    """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
     for sample in tree.all_samples()[:_MOST_SCANS_TRIED]:
         try:

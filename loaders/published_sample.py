@@ -75,7 +75,7 @@ class SampleReader:
         images = [self._image(path, problems) for path in sample.fringes]
         if images[0] is not None:
             problems += [
-                f"{path}: expected the same image as {sample.fringes[0]}, got a different one"
+                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
                 for path, image in zip(sample.fringes[1:], images[1:], strict=True)
                 if image is not None and not np.array_equal(image, images[0])
             ]

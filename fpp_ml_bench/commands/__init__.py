@@ -23,7 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "verify": ("verify", "check a dataset: checksums, missing and foreign files, split leaks"),
     "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),
     "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
-    "train": ("train", "train one recipe, a shipped one or yours, into a weights file"),
+    "train": ("train", "train a recipe, shipped or yours, into a weights file"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
     "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
     "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
