@@ -1,8 +1,8 @@
 """FPP-ML-Bench: data, strict evaluation, baselines and leaderboard for single-shot fringe projection profilometry.
 
-The core (rig, patterns, phase, triangulation) lives here; the rooms that build on it are the subpackages
-``loaders <- evaluation <- baselines <- leaderboard``, each importing only what stands left of it.
-Nothing heavy is imported until it is used: ``import fpp_ml_bench`` costs a few milliseconds.
+This package is the core: rig, patterns, phase, triangulation. The subpackages build on it in the order
+``loaders <- evaluation <- baselines <- leaderboard``; each imports only the core and the packages to its left.
+Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes a few milliseconds.
 """
 
 from pathlib import Path as _Path
@@ -12,8 +12,8 @@ __version__ = "0.1.0"
 
 _ROOT = _Path(__file__).resolve().parent.parent
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "loaders" / "__init__.py").is_file():
-    # A source checkout: the rooms are folders beside this one. An editable install finds them by itself; when the
-    # checkout is merely the current folder it shadows an installed wheel, and core and rooms must come from one place.
+    # A source checkout: the subpackages are folders beside this one. An editable install finds them by itself. When the
+    # checkout is only the current folder it shadows an installed wheel; core and subpackages must not mix the two.
     __path__.append(str(_ROOT))
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The one switch between compiled (numba) and plain NumPy kernels.
+"""The switch between compiled (numba) and plain NumPy kernels.
 
 Kernels live in modules of their own that are imported only when `numba_enabled` says so, each beside a NumPy function
 that gives the same numbers. The environment variable ``FPP_BENCH_NUMBA=0`` selects NumPy; so does a machine on which
@@ -19,13 +19,13 @@ SWITCH = "FPP_BENCH_NUMBA"
 def _importable() -> bool:
     try:
         import numba  # noqa: F401
-    except ImportError:  # also what numba raises for a NumPy newer than it knows
+    except ImportError:  # numba also raises it for a NumPy version that it does not support
         return False
     return True
 
 
 def numba_enabled() -> bool:
-    """Whether compiled kernels are to be used; looks at ``FPP_BENCH_NUMBA`` on every call."""
+    """Whether compiled kernels are to be used; reads ``FPP_BENCH_NUMBA`` on every call."""
     return os.environ.get(SWITCH, "1") != "0" and _importable()
 
 

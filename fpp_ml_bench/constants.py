@@ -1,8 +1,8 @@
 """The benchmark's constants, in one place: objects and their split, views, working range, units.
 
 Sources: paper Section 3 (50 objects, 6 views by 60 degrees, 80/10/10 split by object, range 1.5-2.1 m) and the public
-list of its objects. Which object stands in which split is ours, fixed here, with the four objects that the paper's
-test figures show in test.
+list of its objects. The paper does not list the split; it is defined here, with the four objects of the paper's test
+figures in test.
 """
 
 SCHEMA_VERSION = "1.0.0"
@@ -37,14 +37,15 @@ OBJECTS = YCB_OBJECTS + WAREHOUSE_OBJECTS
 VALIDATION_OBJECTS = ("mustard_bottle", "mug", "paint_brush_large", "paint_container_jar", "spraygun")
 TEST_OBJECTS = ("power_drill", "magazine_stack", "container_bottle", "wooden_boards", "large_clamp")
 
-# The mini preset: every split, both test figures' extremes (a concave union and the deepest object), six objects.
+# The mini preset: six objects from all splits, among them the extremes of the test figures (a concave union of parts
+# and the deepest object).
 MINI_OBJECTS = ("bowl", "cracker_box", "banana", "mug", "power_drill", "wooden_boards")
 MINI_SIZE = 480
 FULL_SIZE = 960
 
 
 def split_of(name: str) -> str:
-    """Split of one of the 50 objects: ``train``, ``validation`` or ``test``."""
+    """Split of a benchmark object: ``train``, ``validation`` or ``test``."""
     if name in TEST_OBJECTS:
         return "test"
     return "validation" if name in VALIDATION_OBJECTS else "train"
@@ -56,7 +57,7 @@ def sample_name(name: str, view: str) -> str:
 
 
 def split_sample_name(sample: str) -> tuple[str, str]:
-    """Object and view of a sample name, cut at the LAST underscore: object names hold underscores themselves."""
+    """Object and view of a sample name, split at the LAST underscore, because object names contain underscores."""
     name, _, view = sample.rpartition("_")
     if not name or not view:
         raise ValueError(f"expected a sample name like 'power_drill_A60', got {sample!r}")

@@ -1,7 +1,7 @@
-"""One block of pixels through the decoder: the stages, each compiled or in NumPy, and the verdict on every pixel.
+"""Decoding a block of pixels: the stages, each compiled or in NumPy, then a depth or a reason for every pixel.
 
 `fpp_ml_bench.decoding` cuts the image into blocks that fit the processor's cache and calls `decode_direction` and
-`verdict` here.
+`depth_and_reason` here.
 """
 
 from collections.abc import Mapping
@@ -27,23 +27,23 @@ from fpp_ml_bench.rig import Rig
 from fpp_ml_bench.triangulation import depth_from_both, depth_from_coordinate
 
 MIN_MODULATION = 5.0
-"""Grey levels. At read noise of one level and only 3 steps this leaves a phase noise of 0.16 rad: a tenth of the pi/2
-that the fringe order tolerates, and some 7 mm of depth at 1.8 m. Darker than this is shadow, glare or no projector
-light."""
+"""Grey levels. At a read noise of 1 grey level and only 3 steps the phase noise is then 0.16 rad: a tenth of the pi/2
+that the fringe order tolerates, and about 7 mm of depth at 1.8 m. A smaller modulation means shadow, glare or no
+projector light."""
 CLIPPED_STEPS_DIVISOR = 9
 """A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). With so many steps a clipped crest
 distorts the phase by under 5 mrad, since N steps cancel harmonics up to N - 2; with few steps it would bias it by tens
 of mrad."""
 MAX_DISAGREEMENT_PX = 1.5
 """Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps
-gives a sigma of 0.5 px; a fringe order wrong by one puts an 18-px fringe more than 10 px off."""
+gives a sigma of 0.5 px; a fringe order that is wrong by 1 shifts an 18 px fringe by more than 10 px."""
 
 
 class Reason(IntEnum):
-    """Why a pixel has no depth; of several, the lowest is given.
+    """Why a pixel has no depth. Where several reasons apply, the lowest code is stored.
 
-    NO_RAY: the camera's lens model has no inverse there, or the ray meets what the projector showed nowhere in front of
-    both devices.
+    NO_RAY: the camera's lens model has no inverse at this pixel, or the ray does not meet the measured projector plane
+    in front of both devices. NOT_ASKED: the pixel is outside the mask.
     """
 
     DECODED = 0
@@ -59,7 +59,7 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Limits:
-    """What a pixel must fulfil to be decoded; the defaults are explained beside their constants."""
+    """Conditions that a decoded pixel meets; the defaults are explained beside their constants."""
 
     min_modulation: float = MIN_MODULATION
     max_clipped_steps: int | None = None
@@ -69,7 +69,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class DirectionPlan:
-    """Everything about decoding one direction that does not depend on the pixel."""
+    """What decoding a direction needs besides the grey levels; the same for every pixel."""
 
     direction: Direction
     sinusoids: tuple[int, ...]
@@ -79,22 +79,22 @@ class DirectionPlan:
     pitch_px: float
     length_px: int
     max_clipped_steps: int
-    known: Mapping[int, int] = field(default_factory=dict)
-    """Frames that need not be captured, because the grey level is the same wherever the camera can see, by index."""
+    constant_levels: Mapping[int, int] = field(default_factory=dict)
+    """Grey level by frame index of the frames that need not be captured: the same at every pixel the camera sees."""
 
     @property
     def rows(self) -> tuple[int, ...]:
-        """Indices of the frames in the order of its grey levels."""
+        """Frame indices in the order in which `decode_direction` takes the grey levels."""
         return self.sinusoids + self.gray
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Indices of the frames it reads."""
-        return tuple(index for index in self.rows if index not in self.known)
+        """Indices of the frames that must be captured and read."""
+        return tuple(index for index in self.rows if index not in self.constant_levels)
 
 
 def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -> DirectionPlan:
-    """Plan for one direction with ``steps`` of the rig's sinusoids; raises `DecodeError` for an impossible number."""
+    """Plan for a direction with ``steps`` of the rig's sinusoids; raises `DecodeError` for an impossible number."""
     chosen = choose_steps(rig.sequence.steps, steps)
     available = rig.sequence.sinusoids(direction)
     pitch, length = rig.pitch(direction), rig.pattern_length(direction)
@@ -113,16 +113,19 @@ def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -
 
 @dataclass(frozen=True)
 class Coordinates:
-    """One direction of a block: px, grey levels and rad, float64 (n,), with the reason codes uint8 (n,)."""
+    """A block's measurement in one direction: coordinate (px), modulation (grey levels) and phase (rad), float64 (n,)
+    each, and the reason codes, uint8 (n,)."""
 
     coordinate_px: NDArray[np.float64]
     modulation: NDArray[np.float64]
     phase: NDArray[np.float64]
     reason: NDArray[np.uint8]
 
-    def at(self, kept: NDArray[np.intp]) -> "Coordinates":
-        """Those of some of the pixels."""
-        return Coordinates(self.coordinate_px[kept], self.modulation[kept], self.phase[kept], self.reason[kept])
+    def at(self, indices: NDArray[np.intp]) -> "Coordinates":
+        """The coordinates of the pixels at ``indices`` only."""
+        return Coordinates(
+            self.coordinate_px[indices], self.modulation[indices], self.phase[indices], self.reason[indices]
+        )
 
 
 _STAGE_REASONS = (
@@ -139,7 +142,7 @@ def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limit
         from fpp_ml_bench.decode_kernels import decode_block
 
         count = grey.shape[1]
-        found = Coordinates(np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
+        coordinates = Coordinates(np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
         thresholds = (
             float(limits.min_modulation),
             float(plan.max_clipped_steps),
@@ -149,9 +152,9 @@ def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limit
         codes = tuple(float(code) for code in _STAGE_REASONS)
         decode_block(
             grey, plan.weights, len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px), thresholds,
-            codes, found.coordinate_px, found.modulation, found.phase, found.reason,
+            codes, coordinates.coordinate_px, coordinates.modulation, coordinates.phase, coordinates.reason,
         )  # fmt: skip
-        return found
+        return coordinates
     steps = len(plan.sinusoids)
     mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
     modulation = np.sqrt(cosine * cosine + sine * sine)
@@ -172,50 +175,50 @@ def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limit
     return Coordinates(coordinate, modulation, phase, reason)
 
 
-def _depth_one(rays: Maps, found: Coordinates, plan: DirectionPlan, rig: Rig) -> NDArray[np.float64]:
+def _depth_from_coordinate(rays: Maps, coordinates: Coordinates, plan: DirectionPlan, rig: Rig) -> NDArray[np.float64]:
     if rig.projector.is_distorted or not numba_enabled():
-        return depth_from_coordinate(rays, found.coordinate_px, rig, plan.direction)
-    from fpp_ml_bench.decode_kernels import depth_one
+        return depth_from_coordinate(rays, coordinates.coordinate_px, rig, plan.direction)
+    from fpp_ml_bench.decode_kernels import depth_from_coordinate_kernel
 
-    device, depth_mm = rig.projector, np.empty(len(found.reason))
+    device, depth_mm = rig.projector, np.empty(len(coordinates.reason))
     axis = 0 if plan.direction == "vertical" else 1
     focal, centre = (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
-    depth_one(*rays, found.coordinate_px, rig.R, rig.t, axis, focal, centre, depth_mm)
+    depth_from_coordinate_kernel(*rays, coordinates.coordinate_px, rig.R, rig.t, axis, focal, centre, depth_mm)
     return depth_mm
 
 
-def _depth_both(
-    rays: Maps, found: dict[Direction, Coordinates], rig: Rig
+def _depth_from_both(
+    rays: Maps, coordinates: dict[Direction, Coordinates], rig: Rig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    u, v = found["vertical"], found["horizontal"]
+    u, v = coordinates["vertical"], coordinates["horizontal"]
     # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
     weight_u, weight_v = u.modulation / rig.pitch("vertical"), v.modulation / rig.pitch("horizontal")
     if rig.projector.is_distorted or not numba_enabled():
         squared = weight_u * weight_u, weight_v * weight_v
         return depth_from_both(rays, u.coordinate_px, v.coordinate_px, rig, *squared)
-    from fpp_ml_bench.decode_kernels import depth_both
+    from fpp_ml_bench.decode_kernels import depth_from_both_kernel
 
     device, depth_mm, disagreement = rig.projector, np.empty(len(u.reason)), np.empty(len(u.reason))
     focal, centre = (device.fx, device.fy), (device.cx, device.cy)
-    depth_both(
+    depth_from_both_kernel(
         *rays, u.coordinate_px, v.coordinate_px, weight_u, weight_v, rig.R, rig.t, focal, centre, depth_mm, disagreement
     )
     return depth_mm, disagreement
 
 
-def verdict(
-    found: dict[Direction, Coordinates], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
+def depth_and_reason(
+    coordinates: dict[Direction, Coordinates], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm float32 (n,), 0 = none, and reason uint8 (n,) of a block from the coordinates of each direction."""
-    first = found[plans[0].direction]
+    """Depth in mm, float32 (n,), 0 = none, and reason, uint8 (n,), of a block, from the coordinates by direction."""
+    first = coordinates[plans[0].direction]
     if len(plans) == 1:
         reason = first.reason.copy()
-        depth_mm = _depth_one(rays, first, plans[0], rig)
+        depth_mm = _depth_from_coordinate(rays, first, plans[0], rig)
     else:
-        second = found[plans[1].direction]
+        second = coordinates[plans[1].direction]
         lower, upper = np.minimum(first.reason, second.reason), np.maximum(first.reason, second.reason)
         reason = np.where(lower == 0, upper, lower)
-        depth_mm, disagreement = _depth_both(rays, found, rig)
+        depth_mm, disagreement = _depth_from_both(rays, coordinates, rig)
         reason[(reason == 0) & (disagreement > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
     near, far = rig.working_range_mm
     missing = np.isnan(depth_mm)

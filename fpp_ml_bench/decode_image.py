@@ -1,6 +1,6 @@
-"""The work of decoding one image, block by block: which pixels of a block are looked at in which direction, and when.
+"""Decoding an image block by block: which pixels of a block are read in which direction, and in which order.
 
-`fpp_ml_bench.decoding` checks what came and makes the plans; `decode_blocks` knows what is done to a pixel.
+`fpp_ml_bench.decoding` checks the input and makes the plans; `decode_blocks` decodes the pixels.
 """
 
 from dataclasses import dataclass
@@ -8,26 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decode_blocks import Coordinates, DirectionPlan, Limits, Reason, decode_direction, verdict
-from fpp_ml_bench.decode_fewest import nearest_pair, with_order, wrapped
+from fpp_ml_bench.decode_blocks import Coordinates, DirectionPlan, Limits, Reason, decode_direction, depth_and_reason
+from fpp_ml_bench.decode_fewest import decode_wrapped, nearest_pair, with_order
 from fpp_ml_bench.decode_reach import within_reach
 from fpp_ml_bench.fewest import JointCode
 from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.rig import Rig
 
 BLOCK_PX = 1 << 15
-"""Pixels worked off at a time: the grey levels of a block, 0.8 MB a direction, and its results stay in the cache."""
-WORTH_PICKING = 0.6
-"""Up to this part of a block, its pixels are picked out one by one for the second direction; beyond, reading the whole
+"""Pixels in a block: its grey levels, 0.8 MB per direction, and its results stay in the processor's cache."""
+MOST_PICKED_SHARE = 0.6
+"""Up to this share of a block, the pixels that need the second direction are read by index. Above it, reading the whole
 block in order is faster."""
-SAMPLED = 32
-"""Of so many pixels one is looked at to see whether picking pixels out will be worth it."""
+SAMPLING = 32
+"""Every 32nd pixel of a block is tested to see whether reading by index can be faster."""
+Pixels = slice | NDArray[np.intp]
+"""Pixels of a block: a slice of the flat image, or flat indices."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One direction of the image: ``coordinate_px`` float64 (NaN = not decoded), ``modulation`` float32 grey levels and
-    ``phase`` float64 rad in [-pi, pi), each (H, W)."""
+    """The image's measurement in one direction, (H, W) each: ``coordinate_px`` float64 (NaN = not decoded),
+    ``modulation`` float32 grey levels and ``phase`` float64 rad in [-pi, pi)."""
 
     coordinate_px: NDArray[np.float64]
     modulation: NDArray[np.float32]
@@ -35,7 +37,7 @@ class Measured:
 
 
 class DecodedImage:
-    """The flat results, and the work on one block of them; blocks touch disjoint pixels."""
+    """Results of the whole image as flat arrays, filled block by block; no pixel belongs to two blocks."""
 
     def __init__(
         self,
@@ -43,15 +45,15 @@ class DecodedImage:
         rig: Rig,
         plans: list[DirectionPlan],
         limits: Limits,
-        chosen: NDArray[np.intp] | None,
+        mask_indices: NDArray[np.intp] | None,
         details: bool,
         depth_alone: bool,
         joint: JointCode | None,
     ) -> None:
         size = rig.camera.height * rig.camera.width
-        self.frames, self.rig, self.plans, self.limits, self.chosen = frames, rig, plans, limits, chosen
+        self.frames, self.rig, self.plans, self.limits, self.mask_indices = frames, rig, plans, limits, mask_indices
         self.depth_alone, self.joint = depth_alone, joint
-        self.pixels = size if chosen is None else len(chosen)
+        self.pixel_count = size if mask_indices is None else len(mask_indices)
         self.depth_mm = np.zeros(size, dtype=np.float32)
         self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
         self.rays = tuple(axis.reshape(-1) for axis in rig.camera.rays())
@@ -62,99 +64,113 @@ class DecodedImage:
                 self.details[plan.direction] = Coordinates(u, b, phi, reason=np.zeros(size, dtype=np.uint8))
 
     def decode_from(self, start: int) -> int:
-        """Decode one block; returns of how many of its pixels every direction was looked at."""
-        stop = min(start + BLOCK_PX, self.pixels)
-        where = slice(start, stop) if self.chosen is None else self.chosen[start:stop]
-        found = {self.plans[0].direction: self._coordinates(self.plans[0], where, stop - start)}
+        """Decode a block; returns the number of its pixels that were read in every direction."""
+        stop = min(start + BLOCK_PX, self.pixel_count)
+        pixels = slice(start, stop) if self.mask_indices is None else self.mask_indices[start:stop]
+        first_direction = self.plans[0].direction
+        coordinates = {first_direction: self._coordinates(self.plans[0], pixels, stop - start)}
         if self.depth_alone:
-            first = found[self.plans[0].direction]
-            kept = self._reached(first, where)
-            if kept is not None:
+            first = coordinates[first_direction]
+            selected = self._within_reach(first, pixels)
+            if selected is not None:
                 no_depth = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
-                where, found = self._narrowed(start, where, found, kept, no_depth)
-        looked_at = len(next(iter(found.values())).reason)
+                pixels, coordinates = self._reduced(start, pixels, coordinates, selected, no_depth)
+        count = len(coordinates[first_direction].reason)
         for plan in self.plans[1:]:
-            found[plan.direction] = self._coordinates(plan, where, looked_at)
+            coordinates[plan.direction] = self._coordinates(plan, pixels, count)
         if self.joint:
-            where, found = self._ordered(start, where, found, self.joint)
-        rays = self.rays[0][where], self.rays[1][where]
-        self.depth_mm[where], self.reason[where] = verdict(found, rays, self.plans, self.rig, self.limits)
-        for direction, kept_details in self.details.items():
-            one = found[direction]
-            kept_details.coordinate_px[where] = np.where(one.reason == 0, one.coordinate_px, np.nan)
-            kept_details.modulation[where], kept_details.phase[where] = one.modulation, one.phase
-        return looked_at
+            pixels, coordinates = self._with_orders(start, pixels, coordinates, self.joint)
+        rays = self.rays[0][pixels], self.rays[1][pixels]
+        self.depth_mm[pixels], self.reason[pixels] = depth_and_reason(
+            coordinates, rays, self.plans, self.rig, self.limits
+        )
+        for direction, details in self.details.items():
+            measured = coordinates[direction]
+            details.coordinate_px[pixels] = np.where(measured.reason == 0, measured.coordinate_px, np.nan)
+            details.modulation[pixels], details.phase[pixels] = measured.modulation, measured.phase
+        return count
 
-    def _ordered(
-        self, start: int, where: slice | NDArray[np.intp], found: dict[Direction, Coordinates], joint: JointCode
-    ) -> tuple[slice | NDArray[np.intp], dict[Direction, Coordinates]]:
-        """The block with the orders that both phases give together, reduced to pixels that have them."""
-        rays = self.rays[0][where], self.rays[1][where]
-        orders, off_px = nearest_pair(found, rays, self.rig, joint.tolerance_px)
-        measured = np.minimum(*(np.where(one.reason == 0, Reason.NOT_ASKED, one.reason) for one in found.values()))
-        unclear = (measured == Reason.NOT_ASKED) & ~(off_px <= joint.tolerance_px)
-        reason = np.where(unclear, Reason.DIRECTIONS_DISAGREE, measured)
-        kept = None if self.details else self._few(reason == Reason.NOT_ASKED)
-        if kept is not None:
-            where, found = self._narrowed(start, where, found, kept, reason)
-            orders = {name: order[kept] for name, order in orders.items()}
+    def _with_orders(
+        self, start: int, pixels: Pixels, coordinates: dict[Direction, Coordinates], joint: JointCode
+    ) -> tuple[Pixels, dict[Direction, Coordinates]]:
+        """The block with the fringe orders that both phases give together, reduced to the pixels that have orders."""
+        rays = self.rays[0][pixels], self.rays[1][pixels]
+        orders, distance_px = nearest_pair(coordinates, rays, self.rig, joint.tolerance_px)
+        # NOT_ASKED, the highest code, marks pixels without a reason here.
+        reasons = (np.where(c.reason == 0, Reason.NOT_ASKED, c.reason) for c in coordinates.values())
+        lowest = np.minimum(*reasons)
+        unclear = (lowest == Reason.NOT_ASKED) & ~(distance_px <= joint.tolerance_px)
+        reason = np.where(unclear, Reason.DIRECTIONS_DISAGREE, lowest)
+        selected = None if self.details else self._indices_if_few(reason == Reason.NOT_ASKED)
+        if selected is not None:
+            pixels, coordinates = self._reduced(start, pixels, coordinates, selected, reason)
+            orders = {direction: order[selected] for direction, order in orders.items()}
         else:
-            for one in found.values():
-                one.reason[unclear] = Reason.DIRECTIONS_DISAGREE
-        return where, {name: with_order(one, orders[name], self.rig, name) for name, one in found.items()}
+            for measured in coordinates.values():
+                measured.reason[unclear] = Reason.DIRECTIONS_DISAGREE
+        return pixels, {
+            direction: with_order(measured, orders[direction], self.rig, direction)
+            for direction, measured in coordinates.items()
+        }
 
-    def _reached(self, first: Coordinates, where: slice | NDArray[np.intp]) -> NDArray[np.intp] | None:
-        """Places of the pixels whose first direction leaves a depth possible, if they are few. A sample of the block
-        is looked at first: where the object fills it, that is all that skipping costs."""
-        rays = self.rays[0][where], self.rays[1][where]
+    def _within_reach(self, first: Coordinates, pixels: Pixels) -> NDArray[np.intp] | None:
+        """Indices into the block of the pixels that can still get a depth after the first direction, if they are few.
 
-        def open_yet(part: slice) -> NDArray[np.bool_]:
+        A sample of the block is tested first: where the object fills the block, skipping costs no more than that test.
+        """
+        rays = self.rays[0][pixels], self.rays[1][pixels]
+
+        def undecided(part: slice) -> NDArray[np.bool_]:
             coordinate, x, y = (np.ascontiguousarray(values[part]) for values in (first.coordinate_px, *rays))
             reached = within_reach(coordinate, (x, y), self.plans[0], self.rig, self.limits)
             return reached & (first.reason[part] == 0)
 
-        return None if self._few(open_yet(slice(None, None, SAMPLED))) is None else self._few(open_yet(slice(None)))
+        if self._indices_if_few(undecided(slice(None, None, SAMPLING))) is None:
+            return None
+        return self._indices_if_few(undecided(slice(None)))
 
     @staticmethod
-    def _few(open_yet: NDArray[np.bool_]) -> NDArray[np.intp] | None:
-        """Places of the pixels that are ``open_yet`` (n,), if they are few enough to be worth picking out."""
-        kept = np.flatnonzero(open_yet)
-        return kept if len(kept) <= WORTH_PICKING * len(open_yet) else None
+    def _indices_if_few(mask: NDArray[np.bool_]) -> NDArray[np.intp] | None:
+        """Indices of the True entries of ``mask`` (n,), if they are few enough to be picked out."""
+        indices = np.flatnonzero(mask)
+        return indices if len(indices) <= MOST_PICKED_SHARE * len(mask) else None
 
-    def _narrowed(
+    def _reduced(
         self,
         start: int,
-        where: slice | NDArray[np.intp],
-        found: dict[Direction, Coordinates],
-        kept: NDArray[np.intp],
+        pixels: Pixels,
+        coordinates: dict[Direction, Coordinates],
+        selected: NDArray[np.intp],
         reason: NDArray[np.uint8],
-    ) -> tuple[slice | NDArray[np.intp], dict[Direction, Coordinates]]:
-        """A block reduced to the pixels ``kept``; the others get their ``reason``."""
-        self.reason[where] = reason
-        there = kept + start if isinstance(where, slice) else where[kept]
-        return there, {direction: one.at(kept) for direction, one in found.items()}
+    ) -> tuple[Pixels, dict[Direction, Coordinates]]:
+        """The block with only the ``selected`` pixels; ``reason`` (n,) of the block is stored for all others."""
+        self.reason[pixels] = reason
+        remaining = selected + start if isinstance(pixels, slice) else pixels[selected]
+        return remaining, {direction: measured.at(selected) for direction, measured in coordinates.items()}
 
-    def _coordinates(self, plan: DirectionPlan, where: slice | NDArray[np.intp], count: int) -> Coordinates:
-        """One direction at ``count`` pixels, its frames' grey levels gathered first."""
+    def _coordinates(self, plan: DirectionPlan, pixels: Pixels, count: int) -> Coordinates:
+        """Coordinates of a direction at ``count`` pixels; gathers the grey levels of its frames first."""
         levels = np.empty((len(plan.rows), count), dtype=np.uint8)
         for row, index in zip(levels, plan.rows, strict=True):
-            if index in plan.known:
-                row[:] = plan.known[index]
-            elif isinstance(where, slice):
-                row[:] = self.frames[index][where]
+            if index in plan.constant_levels:
+                row[:] = plan.constant_levels[index]
+            elif isinstance(pixels, slice):
+                row[:] = self.frames[index][pixels]
             else:
-                # Every index is one of the image's: "clip" only saves the check, and a copy with it.
-                self.frames[index].take(where, out=row, mode="clip")
-        return wrapped(levels, plan, self.limits) if self.joint else decode_direction(levels, plan, self.limits)
+                # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
+                self.frames[index].take(pixels, out=row, mode="clip")
+        decode = decode_wrapped if self.joint else decode_direction
+        return decode(levels, plan, self.limits)
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Forget what lies outside ``mask`` (pixels,)."""
+    def clear_outside(self, mask: NDArray[np.bool_]) -> None:
+        """Remove the results outside ``mask`` bool (H * W,)."""
         self.depth_mm[~mask], self.reason[~mask] = 0.0, Reason.NOT_ASKED
 
     def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
-        kept = self.details[direction]
+        """Details of ``direction`` as images of ``shape`` (H, W)."""
+        details = self.details[direction]
         return Measured(
-            kept.coordinate_px.reshape(shape),
-            kept.modulation.astype(np.float32).reshape(shape),
-            kept.phase.reshape(shape),
+            details.coordinate_px.reshape(shape),
+            details.modulation.astype(np.float32).reshape(shape),
+            details.phase.reshape(shape),
         )

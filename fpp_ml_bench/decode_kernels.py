@@ -1,8 +1,8 @@
-"""Compiled twins of `phase`, `gray_code` and `triangulation` for the decoder: same sums in the same order, fused.
+"""Compiled kernels of the decoder: the sums of `phase`, `gray_code` and `triangulation` in the same order, fused.
 
-Import only where `fpp_ml_bench.acceleration.numba_enabled`. Pixels are worked off in tiles that stay in the first-level
+Import only where `fpp_ml_bench.acceleration.numba_enabled`. Pixels are processed in tiles that stay in the first-level
 cache, frame by frame within a tile, so that the compiler can use vector instructions and each grey level is read once.
-The loops carry no branches for the same reason. The NumPy functions are the reference; tests hold the two together.
+The loops have no branches for the same reason. The NumPy functions are the reference; tests compare the two.
 """
 
 import math
@@ -48,7 +48,7 @@ def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
 def decode_block(  # type: ignore[no-untyped-def]
     frames, weights, bits, centres, pitch, length, limits, codes, coordinate, modulation, phase, reason
 ):
-    """One direction of a block of n pixels: phase, cell, order and projector coordinate.
+    """A direction of a block of n pixels: phase, cell, order and projector coordinate.
 
     ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``limits`` = least modulation, most
     clipped steps, ambiguous fraction, inconsistent rad; ``codes`` = low modulation, saturated, inconsistent, outside.
@@ -57,7 +57,7 @@ def decode_block(  # type: ignore[no-untyped-def]
     steps, total = weights.shape[1], frames.shape[1]
     mean, cosine, sine = np.empty(TILE), np.empty(TILE), np.empty(TILE)
     clipped, centre, faulty = np.empty(TILE, np.int32), np.empty(TILE), np.empty(TILE)
-    dark, bright, least = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
+    dark, bright, threshold = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
     cell, doubt, previous = np.empty(TILE, np.int16), np.empty(TILE, np.int16), np.empty(TILE, np.int16)
     cells = len(centres)
     for start in range(0, total, TILE):
@@ -81,16 +81,16 @@ def decode_block(  # type: ignore[no-untyped-def]
             b = math.sqrt(cosine[i] * cosine[i] + sine[i] * sine[i])
             modulation[start + i] = b
             margin = limits[2] * b
-            # Grey levels are whole numbers, so the float comparisons become exact integer ones: grey > mean is
+            # Grey levels are whole numbers, so the float comparisons become exact integer comparisons: grey > mean is
             # grey > floor(mean), and mean - margin < grey < mean + margin is dark < grey < bright.
-            least[i] = np.int16(math.floor(mean[i]))
+            threshold[i] = np.int16(math.floor(mean[i]))
             dark[i] = np.int16(max(math.floor(mean[i] - margin), -1.0))
             bright[i] = np.int16(min(math.ceil(mean[i] + margin), 256.0))
         for bit in range(bits):
             row = frames[steps + bit, start : start + n]
             for i in range(n):
                 level = np.int16(row[i])
-                previous[i] ^= level > least[i]
+                previous[i] ^= level > threshold[i]
                 cell[i] = np.int16(cell[i] * 2 + previous[i])
                 doubt[i] = np.int16(doubt[i] * 2 + ((level > dark[i]) & (level < bright[i])))
         for i in range(n):
@@ -114,7 +114,7 @@ def decode_block(  # type: ignore[no-untyped-def]
 
 
 @njit
-def depth_one(x, y, coordinate, rotation, translation, axis, focal, centre, depth_mm):  # type: ignore[no-untyped-def]
+def depth_from_coordinate_kernel(x, y, coordinate, rotation, translation, axis, focal, centre, depth_mm):  # type: ignore[no-untyped-def]
     """`triangulation.depth_from_coordinate` for an undistorted projector; all arrays (n,), ``depth_mm`` is filled."""
     r0, r1, r2 = rotation[axis, 0], rotation[axis, 1], rotation[axis, 2]
     s0, s1, s2 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
@@ -131,7 +131,7 @@ def depth_one(x, y, coordinate, rotation, translation, axis, focal, centre, dept
 
 
 @njit
-def depth_both(  # type: ignore[no-untyped-def]
+def depth_from_both_kernel(  # type: ignore[no-untyped-def]
     x, y, u, v, weight_u, weight_v, rotation, translation, focal, centre, depth_mm, disagreement
 ):
     """`triangulation.depth_from_both` for an undistorted projector; ``focal`` and ``centre`` are pairs.
@@ -177,14 +177,14 @@ def reach(  # type: ignore[no-untyped-def]
     x, y, coordinate, rotation, translation, axis, focal, centre, depths, disagreement, slack, reached
 ):
     """`decode_reach.within_reach`: fills ``reached`` bool (n,). ``focal``, ``centre`` and ``depths`` (m) are pairs."""
-    other = 1 - axis
+    other_axis = 1 - axis
     f, c = focal[axis], centre[axis]
-    g = focal[other]
-    tx, ty, tz = translation[axis], translation[other], translation[2]
+    g = focal[other_axis]
+    tx, ty, tz = translation[axis], translation[other_axis], translation[2]
     near, far = depths
     for i in range(len(x)):
         a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
-        b = rotation[other, 0] * x[i] + rotation[other, 1] * y[i] + rotation[other, 2]
+        b = rotation[other_axis, 0] * x[i] + rotation[other_axis, 1] * y[i] + rotation[other_axis, 2]
         forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
         first, last = near * forward + tz, far * forward + tz
         begin, end = f * (near * a + tx) / first + c, f * (far * a + tx) / last + c
@@ -200,16 +200,16 @@ def joint_orders(  # type: ignore[no-untyped-def]
     order_first, order_second, nearest,
 ):  # fmt: skip
     """`decode_fewest.nearest_pair`: fills the orders and ``nearest`` (px), float64 (n,). ``first`` and ``second``:
-    wrapped phases, of axis ``axis`` and of the other; ``depths`` in m, ``pitches`` in px: pairs in that order."""
-    other = 1 - axis
-    ta, tb, tz = translation[axis], translation[other], translation[2]
-    fa, fb, ca, cb = focal[axis], focal[other], centre[axis], centre[other]
+    wrapped phases of axis ``axis`` and of the other axis; ``pitches`` (px) in that order; ``depths``: near, far (m)."""
+    other_axis = 1 - axis
+    ta, tb, tz = translation[axis], translation[other_axis], translation[2]
+    fa, fb, ca, cb = focal[axis], focal[other_axis], centre[axis], centre[other_axis]
     near, far = depths
     pa, pb = pitches
     inverse_a, inverse_b, per_rad_a, per_rad_b = 1.0 / pa, 1.0 / pb, pa / _TAU, pb / _TAU
     for i in range(len(x)):
         a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
-        b = rotation[other, 0] * x[i] + rotation[other, 1] * y[i] + rotation[other, 2]
+        b = rotation[other_axis, 0] * x[i] + rotation[other_axis, 1] * y[i] + rotation[other_axis, 2]
         forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
         q, r = near * forward + tz, far * forward + tz
         nearest[i], order_first[i], order_second[i] = np.inf, 0.0, 0.0
@@ -221,12 +221,12 @@ def joint_orders(  # type: ignore[no-untyped-def]
         slope, share = across / along, abs(along) / math.sqrt(along * along + across * across)
         low, high = min(a_near, a_far) - tolerance, max(a_near, a_far) + tolerance
         start = math.ceil((low - first[i] * per_rad_a) * inverse_a)
-        one = first[i] * per_rad_a + start * pa
+        position = first[i] * per_rad_a + start * pa
         offset = b_near - second[i] * per_rad_b
         for step in range(tries):
-            beyond = offset + (one - a_near) * slope  # of the other direction's zeroth order, in its px
-            found = math.floor(beyond * inverse_b + 0.5)
-            off = abs(found * pb - beyond) * share
-            if (off < nearest[i]) & (one <= high):
-                nearest[i], order_first[i], order_second[i] = off, start + step, found
-            one += pa
+            predicted = offset + (position - a_near) * slope  # position from the second direction's order 0, px
+            second_order = math.floor(predicted * inverse_b + 0.5)
+            distance = abs(second_order * pb - predicted) * share
+            if (distance < nearest[i]) & (position <= high):
+                nearest[i], order_first[i], order_second[i] = distance, start + step, second_order
+            position += pa

@@ -1,8 +1,8 @@
-"""The classical decoder: a stack of frames to depth, with a reason for every pixel that has none.
+"""The classical decoder: a stack of frames to depth, with a reason for every pixel without depth.
 
 Wrapped phase by N steps, fringe order from the half-period Gray code, triangulation from one or both projector
 coordinates (paper Section 2.1). Frames are read once, in blocks; nothing is filtered, interpolated or guessed: a pixel
-that can't be decoded has depth 0 and says why.
+that can't be decoded has depth 0 and a reason.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.decode_blocks import Limits, Reason, plan_direction
 from fpp_ml_bench.decode_fewest import fewest_plans
-from fpp_ml_bench.decode_image import BLOCK_PX, WORTH_PICKING, DecodedImage, Measured
+from fpp_ml_bench.decode_image import BLOCK_PX, MOST_PICKED_SHARE, DecodedImage, Measured
 from fpp_ml_bench.decode_reach import reach_is_bounded
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.fewest import JointCode
@@ -30,8 +30,8 @@ Directions = Literal["horizontal", "vertical", "both"]
 @dataclass(frozen=True)
 class Decoded:
     """``depth_mm`` float32 (H, W), 0 = none; ``reason`` uint8 (H, W), a `Reason` code each; ``counts`` pixels per
-    reason (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, if
-    asked for."""
+    reason (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, empty
+    unless `decode_stack` was called with ``details``."""
 
     depth_mm: NDArray[np.float32]
     reason: NDArray[np.uint8]
@@ -39,12 +39,11 @@ class Decoded:
     frames_used: tuple[int, ...]
     details: dict[Direction, Measured] = field(default_factory=dict)
     second_px: int = 0
-    """Pixels of which the second direction's frames were read; fewer than were asked for where `decode_stack` was told
-    that nobody asks for reasons."""
+    """Pixels at which the second direction's frames were read; `decode_stack` with ``reasons=False`` may skip some."""
 
 
 def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
-    """The frames that are needed, checked and flat."""
+    """The frames at the indices ``used``, checked and flattened to (H * W,)."""
     expected = (rig.camera.height, rig.camera.width)
     if len(frames) != len(rig.sequence):
         raise DecodeError(
@@ -55,7 +54,7 @@ def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ..
     for index in used:
         frame, title = frames[index], f"frame {described[index].title}"
         if frame is None:
-            raise DecodeError(f"{title}: is needed and missing")
+            raise DecodeError(f"{title}: expected an image, got None; this decoding needs the frame, capture it")
         image = np.asarray(frame)
         if image.dtype != np.uint8:
             raise DecodeError(f"{title}: expected uint8 grey levels, got dtype {image.dtype}")
@@ -104,27 +103,27 @@ def decode_stack(
     threshold of the Gray code is the sinusoids' own mean.
 
     ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
-    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels whose two answers disagree by
-    more than ``limits.max_disagreement_px`` across the epipolar line.
+    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels at which the two coordinates
+    disagree by more than ``limits.max_disagreement_px`` across the epipolar line.
 
-    ``steps``: how many of the N sinusoids a direction to use, 3 to N (default: all), spread as evenly as they go; where
-    they are not quite even (N not a multiple), the phase is the least-squares one.
+    ``steps``: how many of each direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible.
+    Where they can't be even (N is not a multiple), the phase is the least-squares solution.
 
-    ``mask`` bool (H, W): pixels to decode; the others are `Reason.NOT_ASKED` and have no influence. ``threads``: the
-    result is the same, bit by bit, for any number, and inside a mask or without one. ``details``: also return
-    coordinates, modulation and wrapped phase.
+    ``mask`` bool (H, W): pixels to decode; all others get `Reason.NOT_ASKED` and have no influence. The result is the
+    same bit by bit for any number of ``threads``, and inside the mask the same as without a mask. ``details``: also
+    return coordinates, modulation and wrapped phase.
 
-    ``reasons`` False: depth is all that is asked for. Then a pixel that one direction already shows to lie outside the
-    working range (`fpp_ml_bench.decode_reach`), or to have no coordinate, is not looked at in the other direction:
-    depth is the same bit by bit, and its reason is the first direction's, or OUTSIDE_RANGE.
+    ``reasons`` False: only the depth has to be right. A pixel that the first direction shows to lie outside the working
+    range (`fpp_ml_bench.decode_reach`), or to have no coordinate, is then not read in the second direction. The depth
+    is the same bit by bit; the reason is the first direction's, or OUTSIDE_RANGE.
 
-    ``fewest``: read only the Gray frames that the rig's working range needs (`fpp_ml_bench.fewest`): with "both"
-    usually none, the orders then come from the two phases together. Where the depth is in range it is the same bit by
-    bit, but for pixels whose directions disagree by nearly as much as is allowed (`JointCode.tolerance_px`).
+    ``fewest``: read only the Gray frames that the rig's working range needs (`fpp_ml_bench.fewest`). With "both"
+    usually none is needed, and the fringe orders come from the two phases together. A depth in range is the same bit
+    by bit, except at pixels whose directions disagree by nearly the allowed distance (`JointCode.tolerance_px`).
 
-    Depths outside ``rig.working_range_mm`` become 0 with a reason of their own: that is how the background plane
-    leaves the depth map. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid
-    whose capture failed (`fpp_ml_bench.frame_check`).
+    Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this also removes the background
+    plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose capture
+    failed (`fpp_ml_bench.frame_check`).
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
@@ -132,27 +131,30 @@ def decode_stack(
         raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
     limits = limits or Limits()
     _checked_limits(limits)
-    wanted = rig.sequence.steps if steps is None else steps
-    asked: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
-    plans = [plan_direction(rig, one, wanted, limits) for one in asked]
+    step_count = rig.sequence.steps if steps is None else steps
+    directions: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
+    plans = [plan_direction(rig, name, step_count, limits) for name in directions]
     joint: JointCode | None = None
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
     flat = _used_frames(frames, used, rig)
     shape = (rig.camera.height, rig.camera.width)
-    chosen = _checked_mask(mask, shape)
+    mask_indices = _checked_mask(mask, shape)
     for plan in plans:
-        check_frames(flat, plan, chosen, rig.sequence)
+        check_frames(flat, plan, mask_indices, rig.sequence)
     depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
-    # A mask that leaves little out: whole blocks, and the rest thrown away, is faster than picking pixels out.
+    # With a mask of most of the image, decoding whole blocks and clearing the rest is faster than reading by index.
     dense = (
-        chosen is not None and not details and len(chosen) > WORTH_PICKING * shape[0] * shape[1] and skipping_enabled()
+        mask_indices is not None
+        and not details
+        and len(mask_indices) > MOST_PICKED_SHARE * shape[0] * shape[1]
+        and skipping_enabled()
     )
     image = DecodedImage(
-        flat, rig, plans, limits, None if dense else chosen, details, depth_alone and joint is None, joint
+        flat, rig, plans, limits, None if dense else mask_indices, details, depth_alone and joint is None, joint
     )
-    starts, second_px = range(0, image.pixels, BLOCK_PX), 0
+    starts, second_px = range(0, image.pixel_count, BLOCK_PX), 0
     if threads == 1 or len(starts) < 2:
         for start in starts:
             second_px += image.decode_from(start)
@@ -160,13 +162,13 @@ def decode_stack(
         with ThreadPoolExecutor(threads) as pool:
             second_px = sum(pool.map(image.decode_from, starts))
     if dense and mask is not None:
-        image.keep(np.asarray(mask).reshape(-1))
+        image.clear_outside(np.asarray(mask).reshape(-1))
     counts = np.bincount(image.reason, minlength=len(Reason))
     return Decoded(
         depth_mm=image.depth_mm.reshape(shape),
         reason=image.reason.reshape(shape),
         counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
         frames_used=used,
-        details={one: image.measured(one, shape) for one in asked} if details else {},
+        details={name: image.measured(name, shape) for name in directions} if details else {},
         second_px=second_px if len(plans) == 2 else 0,
     )

@@ -1,7 +1,7 @@
 """What a command left out and what that saved: the account that ``--explain`` prints.
 
-Each line says how much of some unit was done and left out, the bytes that were therefore neither read nor written, and
-the seconds, which can't be measured for work that was not done: they come from a rule that the line states.
+Each line counts the units done and left out, the bytes that were therefore neither read nor written, and the seconds
+saved. Seconds can't be measured for work that was not done; the line states the rule they were estimated by.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ REPEATS = 3
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One kind of work: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither read nor written, or None
-    where bytes are not what it is about; ``seconds_saved`` of processor time by ``rule``, or None with the reason in
+    """A kind of work, ``what``: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither read nor written, or
+    None where no bytes are involved; ``seconds_saved`` of processor time by ``rule``, or None with the reason in
     ``rule``."""
 
     what: str
@@ -30,14 +30,14 @@ class LeftOut:
 
     @property
     def share(self) -> float:
-        """Part of the whole that was left out, 0 to 1."""
-        whole = self.done + self.left_out
-        return self.left_out / whole if whole else 0.0
+        """Share of the work that was left out, 0 to 1."""
+        total = self.done + self.left_out
+        return self.left_out / total if total else 0.0
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """The account of one run. ``skipping`` False: nothing was left out, and the lines say what would have been."""
+    """The account of a run. ``skipping`` False: nothing was left out, and the lines count what would have been."""
 
     command: str
     subject: str
@@ -47,48 +47,48 @@ class Explanation:
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         lines = [{**asdict(line), "share": round(line.share, 6)} for line in self.lines]
-        known = [line.seconds_saved for line in self.lines if line.seconds_saved is not None]
+        seconds_saved = [line.seconds_saved for line in self.lines if line.seconds_saved is not None]
         return {
             "command": self.command,
             "subject": self.subject,
             "skipping": self.skipping,
             "left_out": lines,
-            "seconds_saved": sum(known),
+            "seconds_saved": sum(seconds_saved),
             "bytes_saved": sum(line.bytes_saved or 0 for line in self.lines),
         }
 
 
 def explained(command: str, subject: str, lines: list[LeftOut]) -> Explanation:
-    """The account of a run in this process's state of the switch; lines of which nothing could be left out go."""
+    """The account of a run, with skipping as switched in this process; lines with nothing left out are dropped."""
     return Explanation(command, subject, tuple(line for line in lines if line.left_out), skipping_enabled())
 
 
 def seconds_on_and_off(work: Callable[[], object]) -> tuple[float, float]:
-    """Processor seconds of ``work`` with skipping on and off: the least of `REPEATS` calls each, taken in turns."""
-    found: dict[bool, list[float]] = {True: [], False: []}
+    """Processor seconds of ``work`` with skipping on and off: the shortest of `REPEATS` calls each, alternating."""
+    seconds: dict[bool, list[float]] = {True: [], False: []}
     for number in range(REPEATS + 1):
-        for enabled, taken in found.items():
+        for enabled, measured in seconds.items():
             with skipping(enabled):
                 started = process_time()
                 work()
                 if number:
-                    taken.append(process_time() - started)
-    return min(found[True]), min(found[False])
+                    measured.append(process_time() - started)
+    return min(seconds[True]), min(seconds[False])
 
 
 def seconds_of(work: Callable[[], object]) -> float:
-    """Processor seconds of ``work``: the least of `REPEATS` calls."""
-    taken = []
+    """Processor seconds of ``work``: the shortest of `REPEATS` calls."""
+    seconds = []
     for _ in range(REPEATS):
         started = process_time()
         work()
-        taken.append(process_time() - started)
-    return min(taken)
+        seconds.append(process_time() - started)
+    return min(seconds)
 
 
 def saved_by(work: Callable[[], object], left_out_here: int, left_out: int) -> float | None:
-    """Processor seconds that leaving out ``left_out`` units saved, from what ``left_out_here`` of them save in
-    ``work``; may be below 0 where skipping costs more than it saves. None where nothing is left out here."""
+    """Processor seconds saved by leaving out ``left_out`` units, scaled up from ``work``, which leaves out
+    ``left_out_here`` of them. Below 0 where skipping costs more than it saves; None where ``left_out_here`` is 0."""
     if not left_out_here:
         return None
     on, off = seconds_on_and_off(work)

@@ -1,15 +1,15 @@
 """The fewest frames that a rig's working range needs: phase steps for a noise, Gray bits for the orders that can occur.
 
 A pixel's ray crosses only a few fringe periods within the working range (2.4 and 1.9 with the paper's rig), while the
-Gray code tells all periods of the pattern apart. Two ways to need less of it:
+Gray code tells all periods of the pattern apart. There are two ways to capture fewer Gray frames:
 
 - A bit that is the same on every cell the camera can see, at any depth between the near end of the range and the
-  background, says nothing (`gray_bits_in_view`). Bits that turn over somewhere in view are all needed by one direction
-  alone: without one of them, the cells on either side of its edge are mirror images, and a phase at a cell's edge fits
-  both.
-- With both directions no bit may be needed at all (`orders_from_phases`): the two fringes' periods along the ray
-  differ, and together they are unambiguous over their beat, as in two-frequency unwrapping. For every pair of orders
-  that the range allows, the measured (u, v) must lie on the pixel's epipolar line, and a wrong pair misses it by px.
+  background, carries no information (`gray_bits_in_view`). A single direction needs every bit that changes somewhere in
+  view: without it, the codes on either side of the change are mirror images, and a phase at a cell's edge fits two
+  cells.
+- With both directions, no bit may be needed (`orders_from_phases`): the two fringes' periods along the ray differ, and
+  together they are unambiguous over their beat, as in two-frequency unwrapping. The (u, v) of the right pair of orders
+  lies on the pixel's epipolar line; that of a wrong pair is several px away.
 
 Own derivation.
 """
@@ -28,18 +28,18 @@ from fpp_ml_bench.rig import Rig
 from fpp_ml_bench.triangulation import depth_noise_mm
 
 _GRID = 33
-"""Rays a side that stand for the image: projections are smooth, and the outermost rays are among them."""
+"""Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""
 CODE_MARGIN_CELLS = 1
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
-"""The direction that measures the projector's u, and the one that measures its v."""
+"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
 LEAST_TOLERANCE_PX = 1.0
-"""Projector px that noise may put a pixel off its epipolar line; the decoder's worst case (3 steps, least modulation)
-has a sigma of 0.5 px, usual pixels have 0.02."""
+"""Distance in projector px that noise may move a pixel off its epipolar line. The decoder's worst case (3 steps, least
+modulation) has a sigma of 0.5 px, usual pixels have 0.02 px."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What the range spans on the projector, over a grid of the image's rays: px at its near and its far end."""
+    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane."""
 
     near_px: dict[Direction, np.ndarray]
     far_px: dict[Direction, np.ndarray]
@@ -48,30 +48,30 @@ class Reach:
 
 def reach_of(rig: Rig) -> Reach:
     """Projector coordinates of the camera's rays at the ends of the working range and on the background plane; NaN
-    where the projector shows nothing."""
+    outside the projector's view."""
     rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
     columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
     x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
 
-    def seen(depth_m: float) -> dict[Direction, np.ndarray]:
+    def projected(depth_m: float) -> dict[Direction, np.ndarray]:
         u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
         return {"vertical": u, "horizontal": v}
 
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    return Reach(seen(near_m), seen(far_m), seen(rig.background_m))
+    return Reach(projected(near_m), projected(far_m), projected(rig.background_m))
 
 
 @lru_cache(maxsize=16)
 def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
-    """Gray bits of one direction (0 = most significant frame) that turn over where the camera can see; the others are
-    the same on every cell in view, of the working range and of the background."""
+    """Gray bits of a direction (0 = most significant frame) that change within the camera's view. All other bits are
+    the same on every cell in view, in the working range and on the background."""
     reach, bits = reach_of(rig), rig.sequence.bits(direction)
-    seen = np.concatenate([ends[direction] for ends in (reach.near_px, reach.far_px, reach.background_px)])
-    seen = seen[np.isfinite(seen)]
+    in_view = np.concatenate([ends[direction] for ends in (reach.near_px, reach.far_px, reach.background_px)])
+    in_view = in_view[np.isfinite(in_view)]
     last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
-    if not seen.size:
+    if not in_view.size:
         return tuple(range(bits))
-    low, high = (int(cell_of(edge, rig.pitch(direction))) for edge in (seen.min(), seen.max()))
+    low, high = (int(cell_of(edge, rig.pitch(direction))) for edge in (in_view.min(), in_view.max()))
     cells = np.arange(max(low - CODE_MARGIN_CELLS, 0), min(high + CODE_MARGIN_CELLS, last) + 1)
     code = binary_to_gray(cells if cells.size else np.arange(last + 1))
     return tuple(bit for bit in range(bits) if np.ptp(code >> (bits - 1 - bit) & 1))
@@ -79,11 +79,11 @@ def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class JointCode:
-    """What both directions' phases say together, in projector px across the epipolar line.
+    """How well both directions' phases together fix the orders, in projector px across the epipolar line.
 
-    ``least_gap_px``: nearest that a wrong pair of orders comes to a right one within the range; ``background_gap_px``:
-    nearest that the background plane comes to looking like something within the range. ``driver``: the direction of
-    which a ray crosses more periods within the range, ``most_periods`` at most.
+    ``least_gap_px``: smallest distance of a wrong pair of orders from the right pair within the range;
+    ``background_gap_px``: smallest distance at which the background plane could pass for a point within the range.
+    ``driver``: the direction of which a ray crosses more periods within the range; ``most_periods``: at most so many.
     """
 
     least_gap_px: float
@@ -93,12 +93,12 @@ class JointCode:
 
     @property
     def tolerance_px(self) -> float:
-        """How far from the epipolar line a pixel may lie: half the gap, and never more than the decoder allows."""
+        """Largest accepted distance from the epipolar line: half the gap, and never more than the decoder allows."""
         return min(MAX_DISAGREEMENT_PX, self.least_gap_px / 2)
 
     @property
     def unambiguous(self) -> bool:
-        """Whether the phases alone will do: `LEAST_TOLERANCE_PX` for noise, and the background stays out of it."""
+        """Whether the phases alone suffice: `LEAST_TOLERANCE_PX` left for noise, and clear of the background."""
         return self.tolerance_px >= LEAST_TOLERANCE_PX and self.background_gap_px > self.tolerance_px
 
 
@@ -106,40 +106,40 @@ class JointCode:
 def orders_from_phases(rig: Rig) -> JointCode:
     """How well two wrapped phases alone give the orders of both directions within the working range.
 
-    A wrong pair is i periods off in u and j in v, with (i, j) not (0, 0); both stay within the range's stretch along
-    the epipolar line, lengthened by the decoder's tolerance at either end. Its distance from the line is
-    ``|i P_u e_v - j P_v e_u|``, e the line's unit direction. Only for projectors without distortion: with it nothing is
-    known of curved lines, and both gaps are 0.
+    A wrong pair is i periods off in u and j in v, with (i, j) not (0, 0); both stay within the segment that the range
+    covers on the epipolar line, extended by the decoder's tolerance at either end. Its distance from the line is
+    ``|i P_u e_v - j P_v e_u|``, e the line's unit direction. This holds only for projectors without distortion, whose
+    epipolar lines are straight; for all others both gaps are 0.
     """
     if rig.projector.is_distorted:
         return JointCode(0.0, 0.0)
     reach = reach_of(rig)
-    near, far, behind = (
+    near, far, background = (
         np.stack([ends["vertical"], ends["horizontal"]]) for ends in (reach.near_px, reach.far_px, reach.background_px)
     )
     line = far - near
-    usable = np.isfinite(line).all(axis=0) & np.isfinite(behind).all(axis=0) & (np.hypot(*line) > 0)
+    usable = np.isfinite(line).all(axis=0) & np.isfinite(background).all(axis=0) & (np.hypot(*line) > 0)
     if not usable.any():
         return JointCode(0.0, 0.0)
-    near, far, behind, line = near[:, usable], far[:, usable], behind[:, usable], line[:, usable]
+    near, far, background, line = near[:, usable], far[:, usable], background[:, usable], line[:, usable]
     e = line / np.hypot(*line)
     pitch = np.array([[rig.pitch("vertical")], [rig.pitch("horizontal")]])
     span = (np.abs(line) + 2 * MAX_DISAGREEMENT_PX) / pitch
-    low = (np.minimum(near, far) - MAX_DISAGREEMENT_PX - behind) / pitch
-    high = (np.maximum(near, far) + MAX_DISAGREEMENT_PX - behind) / pitch
-    most = int(np.ceil(max(span.max(), np.abs(low).max(), np.abs(high).max())))
-    least = {"range": math.inf, "background": math.inf}
-    for i in range(-most, most + 1):
-        for j in range(-most, most + 1):
-            off = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
+    low = (np.minimum(near, far) - MAX_DISAGREEMENT_PX - background) / pitch
+    high = (np.maximum(near, far) + MAX_DISAGREEMENT_PX - background) / pitch
+    most_orders = int(np.ceil(max(span.max(), np.abs(low).max(), np.abs(high).max())))
+    gaps = {"range": math.inf, "background": math.inf}
+    for i in range(-most_orders, most_orders + 1):
+        for j in range(-most_orders, most_orders + 1):
+            distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
             inside = (abs(i) <= span[0]) & (abs(j) <= span[1]) & ((i, j) != (0, 0))
-            from_behind = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
-            for name, possible in (("range", inside), ("background", from_behind)):
+            on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
+            for name, possible in (("range", inside), ("background", on_background)):
                 if possible.any():
-                    least[name] = min(least[name], float(off[possible].min()))
+                    gaps[name] = min(gaps[name], float(distance_px[possible].min()))
     periods = (np.abs(line) / pitch).max(axis=1)
     driver = AXES[int(periods[1] > periods[0])]
-    return JointCode(least["range"], least["background"], driver, float(periods.max()))
+    return JointCode(gaps["range"], gaps["background"], driver, float(periods.max()))
 
 
 def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
@@ -147,18 +147,18 @@ def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tu
     if direction == "both":
         if orders_from_phases(rig).unambiguous:
             return {"horizontal": (), "vertical": ()}
-        return {one: gray_bits_in_view(rig, one) for one in DIRECTIONS}
-    one: Direction = "vertical" if direction == "vertical" else "horizontal"
-    return {one: gray_bits_in_view(rig, one)}
+        return {name: gray_bits_in_view(rig, name) for name in DIRECTIONS}
+    name: Direction = "vertical" if direction == "vertical" else "horizontal"
+    return {name: gray_bits_in_view(rig, name)}
 
 
 def fewest_steps(
     rig: Rig, direction: Direction | str, depth_mm_sigma: float, modulation: float, noise_grey: float
 ) -> int | None:
-    """Fewest phase steps at which noise moves depth by no more than ``depth_mm_sigma`` (standard deviation, mm) at the
-    far end of the range on the optical axis; None where not even all of the sequence's do.
+    """Fewest phase steps with which noise moves depth by at most ``depth_mm_sigma`` (standard deviation, mm) at the far
+    end of the range on the optical axis; None where all steps of the sequence are too few.
 
-    ``modulation`` there and ``noise_grey`` in grey levels; see `triangulation.depth_noise_mm`.
+    ``modulation`` at that depth and ``noise_grey`` in grey levels; see `triangulation.depth_noise_mm`.
     """
     far_mm = rig.working_range_mm[1]
     for steps in range(3, rig.sequence.steps + 1):

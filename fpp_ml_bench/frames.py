@@ -1,4 +1,4 @@
-"""The projected sequence: which frame is which, and which frames a configuration needs.
+"""The projected sequence: what each frame shows, and which frames a configuration needs.
 
 The order is the paper's (Section 3.2): N horizontal sinusoids, N vertical sinusoids, horizontal Gray code, vertical
 Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52 frames. *Horizontal* fringes have horizontal stripes: they vary
@@ -19,7 +19,7 @@ CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 @dataclass(frozen=True)
 class Frame:
-    """One projected frame: ``step`` is n of a sinusoid (phase shift 2 pi n / N) or the Gray bit, most significant 0."""
+    """A projected frame: ``step`` is n of a sinusoid (phase shift 2 pi n / N) or the Gray bit, 0 = most significant."""
 
     index: int
     kind: Kind
@@ -33,7 +33,7 @@ class Frame:
 
     @property
     def title(self) -> str:
-        """What a person reads under the picture."""
+        """Description for captions and messages."""
         if self.kind == "sinusoid":
             return f"{self.index}: {self.direction} sinusoid, step {self.step}"
         return (
@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sequence:
-    """The frames of one capture: ``steps`` sinusoids a direction and ``bits`` Gray-code frames a direction."""
+    """The frames of a capture: ``steps`` sinusoids and ``bits`` Gray-code frames per direction, black and white."""
 
     steps: int = 18
     bits_horizontal: int = 7
@@ -56,7 +56,7 @@ class Sequence:
             raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
         if min(self.bits_horizontal, self.bits_vertical) < 1 or max(self.bits_horizontal, self.bits_vertical) > 15:
             raise ValueError(
-                f"Gray bits must be 1 to 15 a direction, got {self.bits_horizontal} horizontal and "
+                f"Gray bits must be 1 to 15 per direction, got {self.bits_horizontal} horizontal and "
                 f"{self.bits_vertical} vertical"
             )
 
@@ -80,12 +80,12 @@ class Sequence:
         return tuple(Frame(i, *d) for i, d in enumerate(described))
 
     def sinusoids(self, direction: Direction) -> range:
-        """Frame indices of one direction's sinusoids, in the order of their phase shift."""
+        """Frame indices of a direction's sinusoids, in the order of their phase shift."""
         first = 0 if direction == "horizontal" else self.steps
         return range(first, first + self.steps)
 
     def gray(self, direction: Direction) -> range:
-        """Frame indices of one direction's Gray code, most significant bit first."""
+        """Frame indices of a direction's Gray code, most significant bit first."""
         first = 2 * self.steps + (0 if direction == "horizontal" else self.bits_horizontal)
         return range(first, first + self.bits(direction))
 

@@ -1,11 +1,11 @@
 """Gray code in half periods, and the fringe order from it.
 
 A cell is half a fringe period, so code and wrapped phase overlap: the phase alone fixes the position up to whole
-periods, and the cell only has to say which one. The order is the whole number k that brings ``phi + 2 pi k`` nearest
-to the cell's centre. A bit misread at a cell edge names the neighbouring cell, whose centre is half a period off; but
-at an edge the true phase is a quarter of a period from BOTH centres, so k stays right, with a quarter of a period to
-spare on either side. The classical code of one cell a period has its edges where the phase wraps, and slips there by a
-whole period; a median filter hides such slips and moves depth edges with them.
+periods, and the cell only has to select the period. The fringe order is the whole number k that brings
+``phi + 2 pi k`` nearest to the cell's centre. A bit misread at a cell edge gives the neighbouring cell, whose centre is
+half a period away. But at an edge the true phase is a quarter of a period from BOTH centres, so k stays right, with a
+quarter of a period to spare on either side. The classical code with one cell per period has its edges where the phase
+wraps, and there the order can be wrong by 1; a median filter hides such errors but moves depth edges.
 """
 
 import math
@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 AMBIGUOUS_FRACTION = 0.25
 """A bit nearer to the threshold than this part of the modulation is ambiguous. A code bit swings by the full
-modulation, so noise must add up to one and a quarter of it before a clear bit can turn over unnoticed."""
+modulation, so noise must reach 1.25 times the modulation before a clear bit is misread unnoticed."""
 INCONSISTENT_RAD = 0.75 * math.pi
-"""Largest accepted distance from absolute phase to cell centre: pi/2 is the cell itself, pi/4 more a misread edge."""
+"""Largest accepted distance from absolute phase to cell centre: pi/2 reaches the cell's edge, pi/4 more allows for a
+bit misread at the edge."""
 
 
 def binary_to_gray(value: ArrayLike) -> NDArray[np.int64]:
@@ -35,7 +36,7 @@ def gray_to_binary(code: ArrayLike) -> NDArray[np.int64]:
 
 
 def cell_of(position_px: ArrayLike, pitch_px: float) -> NDArray[np.int64]:
-    """Cell of half a period that the projector pixel ``position_px`` (whole numbers) lies in, int64."""
+    """Number of the half-period cell that contains the projector pixel ``position_px`` (whole numbers), int64."""
     return np.floor(np.asarray(position_px, dtype=np.float64) / (pitch_px / 2)).astype(np.int64)
 
 
@@ -52,8 +53,8 @@ def bits_needed(length_px: int, pitch_px: float) -> int:
 def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
     """Absolute phase at the centre of each cell, float64 (cells,).
 
-    The centre of the pixels a cell really holds: for 9 px a cell, pixels 9j to 9j + 8 and thus 9j + 4, half a pixel
-    before (j + 1/2) P/2. Left out, that half pixel would eat into the quarter period of tolerance.
+    This is the centre of the pixels that a cell contains: with 9 px per cell, pixels 9j to 9j + 8, thus 9j + 4, half a
+    pixel before (j + 1/2) P/2. Ignoring that half pixel would reduce the tolerance of a quarter period.
     """
     edges = np.ceil(np.arange(cell_count(length_px, pitch_px) + 1) * (pitch_px / 2))
     return (edges[:-1] + edges[1:] - 1) / 2 * (2 * np.pi / pitch_px)
@@ -62,14 +63,13 @@ def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
 def decode_cells(
     bits: ArrayLike, threshold: ArrayLike, modulation: ArrayLike, ambiguous_fraction: float = AMBIGUOUS_FRACTION
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Cell numbers and whether they can be trusted, from the Gray frames of one direction.
+    """Cell numbers and whether they can be trusted, from the Gray frames of a direction.
 
     ``bits`` (n, H, W) grey levels, most significant bit first; ``threshold`` and ``modulation`` (H, W) grey levels: the
     mean A and amplitude B of the same direction's sinusoids. Returns int32 (H, W) cells and bool (H, W).
 
-    A bit within ``ambiguous_fraction`` B of the threshold is ambiguous. Between neighbouring cells exactly one bit
-    turns over, so a cell is trusted when no bit is ambiguous, or when just one is and turning it over names a
-    neighbour.
+    A bit within ``ambiguous_fraction`` B of the threshold is ambiguous. Adjacent cells differ in exactly one bit, so
+    a cell is trusted when no bit is ambiguous, or when a single bit is and flipping it gives a neighbour.
     """
     mean, amplitude = np.asarray(threshold, dtype=np.float64), np.asarray(modulation, dtype=np.float64)
     margin = ambiguous_fraction * amplitude

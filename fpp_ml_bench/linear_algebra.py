@@ -1,7 +1,7 @@
-"""How many threads the linear algebra below NumPy may start.
+"""How many threads NumPy's linear algebra library may start.
 
-It reads that from the environment when NumPy is loaded. Left alone it takes every core, also for the small systems of
-this package, and its idle threads spin: the work then takes longer, and on a busy machine several times as long.
+The library reads the number from the environment when NumPy is loaded. Without it, the library uses every core even for
+the small systems of this package, and its idle threads spin: the work takes longer, on a busy machine several times.
 """
 
 import os
@@ -10,5 +10,5 @@ THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def limit_threads(threads: int) -> None:
-    """Let linear algebra have ``threads``; call it before NumPy is loaded, for later it does nothing."""
+    """Limit linear algebra to ``threads``; works only before NumPy is loaded."""
     os.environ.update(dict.fromkeys(THREAD_COUNTS, str(max(threads, 1))))

@@ -8,9 +8,9 @@ global     D / 1000 (m)                    1000 D
 individual (D - D_min) / (D_max - D_min)   D (D_max - D_min) + D_min
 ========== =============================== ==================================
 
-Background stays 0 in all three. Under ``individual`` the pixels at D_min also become exactly 0 and can't be told from
-background any more: that is the paper's rule, kept as it is. A flat depth map (D_max == D_min) would divide by zero;
-its object becomes 0 like every pixel at D_min, and comes back as D_min.
+Background stays 0 in all three. Under ``individual`` the pixels at D_min also become exactly 0 and can no longer be
+told from background; this is the paper's rule. A flat depth map (D_max == D_min) would divide by zero; its object
+becomes 0 like every pixel at D_min, and comes back as D_min.
 """
 
 from typing import Literal
@@ -38,9 +38,9 @@ def normalise(
 ) -> NDArray:  # fmt: skip
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
 
-    Single precision loses nothing where depth and range are float32 themselves: the difference of two such depths
-    within a factor of two of each other is exact (Sterbenz), and the division rounds once. A range from elsewhere, or
-    deeper depths, would lose digits by being rounded first: that is worked out in float64 and rounded at the end.
+    Single precision loses nothing where depth and range are float32: the difference of two such depths within a factor
+    of two of each other is exact (Sterbenz), and the division rounds once. Any other range, or depths of higher
+    precision, would lose digits by being rounded first: these are computed in float64 and rounded at the end.
     Raises ``ValueError`` for an unknown name or a range that is not finite and ordered.
     """
     _check(name)

@@ -1,4 +1,4 @@
-"""A pinhole with lens distortion: the camera, or a projector read as an inverse camera.
+"""Pinhole model with lens distortion: the camera, or a projector as an inverse camera.
 
 Pixel centres lie at integer coordinates, so that an image W px wide spans -0.5 to W - 0.5 (OpenCV's convention).
 """
@@ -17,8 +17,8 @@ from fpp_ml_bench.lens import NO_DISTORTION, Coefficients, distort, is_distorted
 Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 MAX_CONDITION = 2.0**26
-"""Largest accepted condition number of the intrinsic matrix, lengths in image sizes: inverting it then costs half of
-double precision's digits. The paper's camera has 3; a focal length of 0.01 px or 10^10 px reaches it."""
+"""Largest accepted condition number of the intrinsic matrix, with lengths in image sizes: inverting it then costs half
+of double precision's digits. The paper's camera has 3; a focal length of 0.01 px or 10^10 px reaches the limit."""
 
 
 def number(value: object, name: str, *, positive: bool = False) -> float:
@@ -44,7 +44,7 @@ def numbers(value: object, count: int, name: str) -> tuple[float, ...]:
 class Pinhole:
     """A camera, or a projector as an inverse camera: size and intrinsics in px, distortion (k1, k2, p1, p2, k3).
 
-    Raises `RigError` for sizes that are no positive integers, focal lengths that are not positive, non-finite values.
+    Raises `RigError` for sizes that are not positive integers, focal lengths that are not positive, non-finite values.
     """
 
     width: int

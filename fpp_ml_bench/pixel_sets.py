@@ -1,7 +1,7 @@
-"""The three pixel sets every score is reported on, and the depth edges that split the object set.
+"""The three pixel sets on which every score is reported, and the depth edges that split the object set.
 
-One rule, used by ground-truth statistics, training masks and the evaluator alike (paper Section 5.3.2): a pixel belongs
-to the object where the target depth is above 0 mm, else to the background.
+Ground-truth statistics, training masks and the evaluator share the rule (paper Section 5.3.2): a pixel belongs to the
+object where the target depth is above 0 mm, else to the background.
 """
 
 import math
@@ -15,7 +15,7 @@ from fpp_ml_bench.skipping import skipping_enabled
 
 DEPTH_EDGE_JUMP_MM = 10.0
 """A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
-At 1.8 m a pixel covers 0.79 mm, so 10 mm a pixel is a surface 85 degrees off the image plane."""
+At 1.8 m a pixel covers 0.79 mm, so 10 mm per pixel is a surface tilted by 85 degrees from the image plane."""
 
 
 def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -24,7 +24,7 @@ def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def background_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels of the background: every pixel that is not object, so that the two sets always make up the image."""
+    """Pixels of the background: all pixels outside the object, so that the two sets always make up the image."""
     return ~object_mask(depth_mm)
 
 
@@ -36,19 +36,19 @@ def edge_jump_mm(size_px: int) -> float:
 def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.bool_]:
     """Pixels beside a depth edge, bool (H, W).
 
-    An edge runs between two 4-neighbours of which one is object and one background, or whose depths differ by more
-    than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels beside it are marked.
+    An edge runs between an object pixel and a background pixel beside it (4-neighbours), or between two object pixels
+    whose depths differ by more than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels are marked.
     """
     jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
     inside = object_mask(depth_mm)
     edge = np.zeros(depth_mm.shape, dtype=bool)
     for axis in (0, 1):
-        here = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
-        there = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
-        step = np.abs(depth_mm[there] - depth_mm[here]) > jump
-        step = (step & inside[here] & inside[there]) | (inside[here] != inside[there])
-        edge[here] |= step
-        edge[there] |= step
+        before = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        after = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        step = np.abs(depth_mm[after] - depth_mm[before]) > jump
+        step = (step & inside[before] & inside[after]) | (inside[before] != inside[after])
+        edge[before] |= step
+        edge[after] |= step
     return edge
 
 
@@ -68,7 +68,7 @@ def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = Non
 
 
 def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:
-    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W): the same set, found by dilating edges.
+    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W), computed by dilating the edges.
 
     For the few pixels of a score's edge band this is several times faster than a distance transform, and needs no
     OpenCV (whose import alone takes longer than scoring ten samples).
@@ -79,26 +79,26 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
 def object_near_edges(
     depth_mm: NDArray[np.floating], bands_px: Sequence[int], jump_mm: float | None = None
 ) -> list[NDArray[np.bool_]]:
-    """`object_near_edge` for several bands, whose edges are then looked for once."""
-    found = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
+    """`object_near_edge` for several bands; the edges are computed once."""
+    near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not rows.size:
-        return found
+        return near_edge
     # Every edge touches the object, so the object's box and one pixel around it hold all of them.
     box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
     if not skipping_enabled():
         box = (slice(None), slice(None))
     edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
-    for near, band_px in zip(found, bands_px, strict=True):
+    for band, band_px in zip(near_edge, bands_px, strict=True):
         if band_px > 0:
-            _dilate(edge, band_px, near[box])
-            near[box] &= inside[box]
-    return found
+            _dilate(edge, band_px, band[box])
+            band[box] &= inside[box]
+    return near_edge
 
 
 def _dilate(edge: NDArray[np.bool_], band_px: int, band: NDArray[np.bool_]) -> None:
-    """Mark in ``band`` what lies nearer than ``band_px`` to a pixel of ``edge``; both (h, w)."""
+    """Mark in ``band`` the pixels nearer than ``band_px`` to a pixel of ``edge``; both (h, w)."""
     height, width = edge.shape
     run, half = edge.copy(), 0  # edge, dilated sideways by half
     reach = min(band_px - 1, height - 1)

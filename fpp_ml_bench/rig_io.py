@@ -1,4 +1,4 @@
-"""Rig files: YAML or JSON, strict on the way in, exact on the way round.
+"""Rig files in YAML or JSON: reading is strict, and writing and reading again gives an equal rig.
 
 ::
 
@@ -36,14 +36,14 @@ _RIG_KEYS = (
 
 
 def _mapping(value: object, keys: tuple[str, ...], name: str) -> Mapping[str, Any]:
-    where = f"{name}: " if name else ""
+    prefix = f"{name}: " if name else ""
     if not isinstance(value, Mapping):
-        raise RigError(f"{where}expected a mapping with the keys {', '.join(keys)}, got {value!r}")
+        raise RigError(f"{prefix}expected a mapping with the keys {', '.join(keys)}, got {value!r}")
     unknown = [str(key) for key in value if key not in keys]
     missing = [key for key in keys if key not in value]
     if unknown or missing:
-        found = [f"unknown key {key}" for key in unknown] + [f"missing key {key}" for key in missing]
-        raise RigError(f"{where}{', '.join(found)}; expected exactly {', '.join(keys)}")
+        problems = [f"unknown key {key}" for key in unknown] + [f"missing key {key}" for key in missing]
+        raise RigError(f"{prefix}{', '.join(problems)}; expected exactly {', '.join(keys)}")
     return value
 
 
@@ -124,19 +124,19 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
 
 
 def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    seen: dict[Any, Any] = {}
+    mapping: dict[Any, Any] = {}
     for key, value in pairs:
-        if key in seen:
-            raise RigError(f"key {key} stands twice in one mapping")
-        seen[key] = value
-    return seen
+        if key in mapping:
+            raise RigError(f"key {key} is given twice in the same mapping; keep one entry")
+        mapping[key] = value
+    return mapping
 
 
 def _parse_yaml(text: str) -> object:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """SafeLoader that refuses a key given twice, where PyYAML silently keeps the last."""
+        """SafeLoader that refuses a key given twice; PyYAML silently keeps the last value."""
 
     def construct(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
         pairs = [(loader.construct_object(k, deep=True), loader.construct_object(v, deep=True)) for k, v in node.value]

@@ -1,7 +1,7 @@
-"""From planned shards to a finished folder: skip what is done, write the rest, then card, rig and manifest.
+"""From planned shards to a finished folder: skip finished shards, write the rest, then card, rig and manifest.
 
-Generated and imported datasets go the same way; they differ only in where their rows come from. Each finished shard
-leaves a receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it says.
+Generated and imported datasets are written alike; only the source of their rows differs. Each finished shard leaves a
+receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states.
 """
 
 import json
@@ -36,7 +36,8 @@ from fpp_ml_bench.loaders.store import DatasetFolder
 SETTINGS = "settings.json"
 Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
 Work = Callable[[Path, Path, ShardPlan, Callable[[], None]], Receipt]
-"""Writes one shard: (dataset folder, scratch folder, plan, to call after each row) -> its files and rows. Picklable."""
+"""Writes a shard: (dataset folder, scratch folder, plan, function to call after each row) -> its files and rows.
+Picklable."""
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
 _POLL_S = 0.2
@@ -44,14 +45,14 @@ _POLL_S = 0.2
 
 @dataclass(frozen=True)
 class Assembly:
-    """A dataset to be written: its plans, the work that writes one, and what the manifest says of the whole."""
+    """A dataset to be written: its shard plans, the function that writes a shard, and the manifest without rows."""
 
     plans: list[ShardPlan]
     work: Work
     manifest: Manifest
     bytes_per_row: int
     mesh_folder: str | None = None
-    """Where the work leaves a PLY of each object, below the dataset folder."""
+    """Folder below the dataset folder into which ``work`` writes a PLY of each object."""
 
     def mesh_paths(self, rows: list[dict[str, Any]]) -> list[str]:
         """Mesh files of the objects that ``rows`` show, relative to the dataset folder."""
@@ -60,7 +61,7 @@ class Assembly:
         return [f"{self.mesh_folder}/{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
 
     def key(self) -> dict[str, Any]:
-        """What must be equal for a resumed run to go on with this folder's work."""
+        """Settings that must be equal for a run to resume in this folder."""
         content = asdict(self.manifest)
         return {
             name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
@@ -70,16 +71,16 @@ class Assembly:
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
     """Write or finish the dataset. Returns the manifest at the end.
 
-    ``progress`` is told of finished rows: first of those that an interrupted run left, then of each that is made. It is
-    not called at all when the dataset stands already.
+    ``progress`` is called with numbers of finished rows: first the rows of an interrupted run, then each new row. It is
+    not called when the dataset is already finished.
 
-    Raises `BuildError` when the folder is in use, holds something else, or can't be written.
+    Raises `BuildError` when the folder is in use, holds other files, or can't be written.
     """
     try:
         return _assemble(folder, assembly, workers, progress)
     except OSError as error:
         raise BuildError(
-            f"{folder}: the work can't go on ({error}); put that right (a full disk: free some space), then run the "
+            f"{folder}: writing failed ({error}); remove the cause (on a full disk: free some space), then run the "
             "same command again: it resumes"
         ) from error
 
@@ -87,8 +88,8 @@ def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress 
 def _assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
     with writing(folder) as scratch:
         if (folder / MANIFEST).exists():
-            return _already_there(folder, assembly)
-        _same_settings(folder, scratch, assembly)
+            return _finished_manifest(folder, assembly)
+        _check_settings(folder, scratch, assembly)
         for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
             leftover.unlink(missing_ok=True)  # the two patterns overlap
         receipts = {}
@@ -98,48 +99,48 @@ def _assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress
                 receipts[plan.name] = receipt
         missing = [plan for plan in assembly.plans if plan.name not in receipts]
         progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
-        _enough_space(folder, assembly, missing)
+        _check_space(folder, assembly, missing)
         for plan, receipt in _run(folder, scratch, assembly.work, missing, workers, progress):
-            _keep_receipt(scratch, plan, receipt)
+            _write_receipt(scratch, plan, receipt)
             receipts[plan.name] = receipt
         return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
 
 
-def _already_there(folder: Path, assembly: Assembly) -> Manifest:
-    standing = DatasetFolder(folder).manifest  # every file is there, in full length
-    _compare(folder, {key: asdict(standing)[key] for key in assembly.key()}, assembly.key())
-    return standing
+def _finished_manifest(folder: Path, assembly: Assembly) -> Manifest:
+    manifest = DatasetFolder(folder).manifest  # every file is there, in full length
+    _compare(folder, {key: asdict(manifest)[key] for key in assembly.key()}, assembly.key())
+    return manifest
 
 
-def _same_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
+def _check_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
     path = scratch / SETTINGS
-    # Another version may make other bytes: a finished dataset of its own is none the worse, half of one is.
-    asked = {**assembly.key(), "generator": assembly.manifest.generator}
+    # Another version may make other bytes: its finished dataset is valid, but a dataset must not mix two versions.
+    settings = {**assembly.key(), "generator": assembly.manifest.generator}
     if path.exists():
         try:
-            begun = json.loads(path.read_text(encoding="utf-8"))
+            begun_settings = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise BuildError(f"{path}: damaged; delete {folder} and start again") from error
-        _compare(folder, begun, asked)
-    write_atomically(path, json.dumps(asked, indent=1).encode())
+        _compare(folder, begun_settings, settings)
+    write_atomically(path, json.dumps(settings, indent=1).encode())
 
 
-def _compare(folder: Path, theirs: dict[str, Any], ours: dict[str, Any]) -> None:
-    """Raise `BuildError` naming what differs between the folder's settings and those asked for."""
-    ours = json.loads(json.dumps(ours))
-    theirs = json.loads(json.dumps(theirs))
+def _compare(folder: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:
+    """Raise `BuildError` naming the differences between the folder's settings and the requested settings."""
+    requested = json.loads(json.dumps(requested))
+    stored = json.loads(json.dumps(stored))
     differing = []
-    for key in ours:
-        if ours[key] == theirs.get(key):
+    for key in requested:
+        if requested[key] == stored.get(key):
             continue
-        if isinstance(ours[key], dict) and isinstance(theirs.get(key), dict):
-            names = sorted(set(ours[key]) | set(theirs[key]))
+        if isinstance(requested[key], dict) and isinstance(stored.get(key), dict):
+            names = sorted(set(requested[key]) | set(stored[key]))
             differing += [
-                f"{name} (there {_short(theirs[key].get(name))}, now {_short(ours[key].get(name))})"
-                for name in names if ours[key].get(name) != theirs[key].get(name)
+                f"{name} (there {_short(stored[key].get(name))}, now {_short(requested[key].get(name))})"
+                for name in names if requested[key].get(name) != stored[key].get(name)
             ]  # fmt: skip
         else:
-            differing.append(f"{key} (there {_short(theirs.get(key))}, now {_short(ours[key])})")
+            differing.append(f"{key} (there {_short(stored.get(key))}, now {_short(requested[key])})")
     if differing:
         raise BuildError(
             f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete it"
@@ -152,25 +153,27 @@ def _short(value: object) -> str:
 
 
 def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
-    """Receipt of a shard that is finished and whole, else None."""
+    """Receipt of a shard that is finished and whose files are intact, else None."""
     path = scratch / f"{plan.name}.json"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         files = [ShardFile(**entry) for entry in content["files"]]
         rows = content["rows"]
-        whole = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
+        complete = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return (files, rows) if whole and [row["sample"] for row in rows] == [name for name, _, _ in plan.samples] else None
+    return (
+        (files, rows) if complete and [row["sample"] for row in rows] == [name for name, _, _ in plan.samples] else None
+    )
 
 
-def _keep_receipt(scratch: Path, plan: ShardPlan, receipt: Receipt) -> None:
+def _write_receipt(scratch: Path, plan: ShardPlan, receipt: Receipt) -> None:
     files, rows = receipt
     content = {"files": [asdict(file) for file in files], "rows": rows}
     write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
 
 
-def _enough_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
+def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
     needed = sum(len(plan.samples) for plan in missing) * assembly.bytes_per_row
     free = shutil.disk_usage(folder).free
     if needed + _RESERVE_BYTES > free:
@@ -183,7 +186,7 @@ def _enough_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) ->
 def _run(
     folder: Path, scratch: Path, work: Work, plans: list[ShardPlan], workers: int, progress: Progress
 ) -> Iterator[tuple[ShardPlan, Receipt]]:
-    """Finished shards as they come."""
+    """Write the shards; yields each when it is finished, in any order."""
     if workers <= 1 or len(plans) <= 1:
         for plan in plans:
             yield plan, work(folder, scratch, plan, lambda: progress(1))
@@ -192,12 +195,12 @@ def _run(
     rows_done = context.Value("q", 0)
     reported = 0
     with (
-        _one_thread_a_process(),
+        _single_threaded_algebra(),
         ProcessPoolExecutor(
             max_workers=min(workers, len(plans)), mp_context=context, initializer=_start_worker, initargs=(rows_done,)
         ) as pool,
     ):
-        # The longest shards first, so that none of them is what everybody waits for at the end.
+        # The longest shards first, so that no worker is left with a long shard at the end.
         ordered = sorted(plans, key=lambda plan: -len(plan.samples))
         futures = {pool.submit(_work_in_worker, work, folder, scratch, plan): plan for plan in ordered}
         waiting = set(futures)
@@ -219,14 +222,14 @@ def _run(
 
 
 @contextmanager
-def _one_thread_a_process() -> Iterator[None]:
-    """Workers started inside get a single-threaded BLAS: its idle threads spin, and cost more than they help here."""
-    before = {name: os.environ.get(name) for name in THREAD_COUNTS}
+def _single_threaded_algebra() -> Iterator[None]:
+    """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
+    previous = {name: os.environ.get(name) for name in THREAD_COUNTS}
     os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in previous.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -237,7 +240,7 @@ _rows_done: Any = None
 
 
 def _start_worker(rows_done: Any) -> None:
-    """Count rows where the parent sees them, and do not outlive it: an orphan would write an unlocked folder."""
+    """Count rows in memory shared with the parent, and end with it: an orphan would write into an unlocked folder."""
     global _rows_done
     _rows_done = rows_done
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -267,7 +270,7 @@ def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manife
     shards = [file for files, _ in receipts for file in files]
     manifest = replace(assembly.manifest, samples=samples, shards=shards)
     rows = [row for part in samples.values() for row in part]
-    # Named one by one: a file that somebody else left here is foreign, and stays so to `fpp-bench verify`.
+    # Only files written here are listed: `fpp-bench verify` reports any other file in the folder as foreign.
     names = [*write_card(folder, manifest), *assembly.mesh_paths(rows)]
     manifest = replace(manifest, others=[describe_file(folder, folder / name) for name in sorted(names)])
     manifest.write(folder)

@@ -1,4 +1,4 @@
-"""The files that make a dataset folder one that Hugging Face tools open: card, split list, per-split state, rig.
+"""The files by which Hugging Face tools open a dataset folder (card, split list, per-split state), and the rig file.
 
 ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
 ``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place.
@@ -27,7 +27,7 @@ tags:
 - metrology
 configs:
 """
-"""Front matter of every card up to its configurations."""
+"""Front matter of every card, up to its configurations."""
 _CARD = """\
 - config_name: single_shot
   default: true
@@ -53,12 +53,12 @@ train = datasets.load_from_disk("THIS FOLDER")["train"]                      # i
 
 
 def data_version(fingerprint: str) -> str:
-    """Version for a card: ``datasets`` finds an old copy in its cache unless the version changes with the data."""
+    """Version for a card; it changes with the data, because ``datasets`` looks up its cached copies by version."""
     return f"1.0.{int(fingerprint[:7], 16)}"
 
 
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
-    """Write card, rig and Hugging Face state files of a dataset whose shards stand; their paths below ``folder``."""
+    """Write card, rig and Hugging Face state files of a dataset with finished shards; returns their relative paths."""
     from fpp_ml_bench.rig_io import rig_from_dict, save_rig
 
     rig = rig_from_dict(manifest.rig)

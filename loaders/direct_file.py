@@ -1,7 +1,7 @@
-"""Writing large files past the page cache, hashed on the way.
+"""Writing large files without the page cache, and hashing them meanwhile.
 
-Gigabytes of shards would push everything else out of memory, and copying them into the cache costs more time than
-rendering them. So blocks go to the disk directly (``O_DIRECT``) from a thread of their own, while the next block is
+Gigabytes of shards would push everything else out of memory, and copying them into the cache takes longer than
+rendering them. Blocks therefore go to the disk directly (``O_DIRECT``) from a separate thread while the next block is
 being filled. Where the file system can't do that (tmpfs, some network mounts), the same code writes through the cache.
 """
 
@@ -43,10 +43,10 @@ class DirectFile:
         self._hash.update(view)
         self.size += length
         while len(view):
-            taken = min(len(view), BLOCK_BYTES - self._filled)
-            self._blocks[self._current][self._filled : self._filled + taken] = view[:taken]
-            self._filled += taken
-            view = view[taken:]
+            count = min(len(view), BLOCK_BYTES - self._filled)
+            self._blocks[self._current][self._filled : self._filled + count] = view[:count]
+            self._filled += count
+            view = view[count:]
             if self._filled == BLOCK_BYTES:
                 self._pending[self._current] = self._thread.submit(
                     _write_block, self._descriptor, memoryview(self._blocks[self._current])
@@ -61,10 +61,10 @@ class DirectFile:
             pending.result()
 
     def flush(self) -> None:
-        """Nothing to do: a block leaves when it is full, and `close` sends the rest."""
+        """Does nothing: full blocks are written at once, and `close` writes the rest."""
 
     def close(self) -> None:
-        """Write what is left and wait until the disk has everything."""
+        """Write the rest and wait until everything is on the disk."""
         if self.closed:
             return
         self.closed = True
@@ -72,13 +72,13 @@ class DirectFile:
             for block in range(_BLOCKS):
                 self._wait(block)
             if self._filled:
-                _set_direct(self._descriptor, False)  # the tail is no whole number of disk blocks
+                _set_direct(self._descriptor, False)  # the rest is not a whole number of disk blocks
                 _write_block(self._descriptor, memoryview(self._blocks[self._current])[: self._filled])
             os.fdatasync(self._descriptor)
         finally:
             for pending in self._pending:
                 if pending is not None:
-                    pending.exception()  # the block is the thread's until it is done with it
+                    pending.exception()  # wait: the thread may still read the block
             os.close(self._descriptor)
 
     @property
@@ -111,6 +111,6 @@ def _write_block(descriptor: int, view: memoryview) -> None:
             direct = fcntl.fcntl(descriptor, fcntl.F_GETFL) & getattr(os, "O_DIRECT", 0)
             if error.errno != errno.EINVAL or not direct:
                 raise
-            _set_direct(descriptor, False)  # a file system that promised direct writes and refuses them
+            _set_direct(descriptor, False)  # a file system that opens for direct writes and then refuses them
             continue
         view = view[done:]

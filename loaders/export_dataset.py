@@ -1,4 +1,4 @@
-"""Exporting a dataset: which forms there are, and what each needs."""
+"""Exporting a dataset in one or several forms."""
 
 import shutil
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from fpp_ml_bench.loaders.store import ALL_SPLITS, DatasetFolder
 MESH_FOLDER = "meshes"
 FORMS = ("parquet", "mat", "meshes", "patterns")
 SAMPLE_FORMS = ("parquet", "mat")
-"""Forms whose work is counted in samples."""
+"""Forms whose progress is counted in samples."""
 
 
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
@@ -24,10 +24,10 @@ def export(
     dataset: DatasetFolder, out: Path, forms: list[str], splits: list[str], threads: int = 1,
     progress: Callable[[int], None] = lambda rows: None,
 ) -> None:  # fmt: skip
-    """Write ``forms`` (of `FORMS`) of a dataset: one form into ``out`` itself, several each into a folder of its name.
+    """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
 
-    ``out`` must be new or empty and appears complete or not at all; ``progress`` is told of samples written. Raises
-    `BuildError` for ``out`` or the disk, `DatasetError` for what the dataset does not have.
+    ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
+    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks.
     """
     if not forms or not set(forms) <= set(FORMS):
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
@@ -60,8 +60,8 @@ def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
     paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
     for path in paths:
         if not path.is_file():
-            why = (
+            hint = (
                 "imported datasets have no meshes" if dataset.manifest.origin == "imported" else "run: fpp-bench verify"
             )
-            raise DatasetError(f"{path}: the mesh is missing; {why}")
+            raise DatasetError(f"{path}: the mesh is missing; {hint}")
     return paths

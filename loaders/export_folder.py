@@ -1,4 +1,4 @@
-"""An export's folder appears complete or not at all: it is written beside its place and renamed when it is done."""
+"""Writes an export's folder completely or not at all: under a temporary name beside it, renamed at the end."""
 
 import shutil
 from collections.abc import Iterator
@@ -13,16 +13,16 @@ _LOCK = ".lock"
 
 @contextmanager
 def exporting(out: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it becomes ``out`` when the block ends well, and is removed when it does not.
+    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails.
 
-    What an export that was killed left behind is cleared away. Raises `BuildError` when ``out`` holds anything, is a
-    file, is being written by another process, or the disk refuses.
+    Remains of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being
+    written by another process, or the disk can't be written.
     """
     target = out.resolve()
     if target.exists() and not target.is_dir():
         raise BuildError(f"{out}: is a file; give a new folder")
     if target.is_dir() and any(target.iterdir()):
-        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to one or overwrites it")
+        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")
     with exclusive(staging / _LOCK, out, "exporting there"):
         try:

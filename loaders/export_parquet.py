@@ -1,8 +1,8 @@
 """Exporting a dataset as Parquet, from which plain ``datasets.load_dataset(OUT, CONFIG)`` opens every configuration.
 
-One file a shard holds all columns, so no pixel is stored twice; the card's ``columns:`` say which of them a
-configuration reads, and a column store reads no other. zstd; frames as dictionary-coded bytes, depth with its bytes
-split by significance, which suits smooth floats.
+There is one file per shard with all columns, so no pixel is stored twice. The card's ``columns:`` list the columns of
+each configuration, and a reader of Parquet reads no others. Compression is zstd; frames are dictionary-coded bytes, and
+depth has its bytes split by significance, which suits smooth floats.
 """
 
 from collections.abc import Callable
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 ROW_GROUP_BYTES = 1 << 28
 """Rows are written, and read by ``datasets``, in groups of about this size before compression."""
-_MOST_ROWS = 24
+_MOST_ROWS_PER_GROUP = 24
 _CARD = """\
 {configs}
 ---
 # FPP-ML-Bench dataset ({origin}), Parquet
 
-{rows} samples of {height} x {width} px; depth in mm, 0 = background. Fingerprint of the dataset this was exported from:
+{rows} samples of {height} x {width} px; depth in mm, 0 = background. Exported from the dataset with fingerprint
 `{fingerprint}`.
 
 ```python
@@ -54,7 +54,8 @@ def write_parquet(
 ) -> None:  # fmt: skip
     """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it.
 
-    Raises ``OSError`` when the disk refuses. Each thread writes a shard and holds one group of its rows in memory.
+    Raises ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in
+    memory.
     """
     manifest = dataset.manifest
     shards = [shard for shard in manifest.shards if shard.group == DATA_GROUP and shard.split in splits]
@@ -86,7 +87,7 @@ def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, rows_done
 
     columns = all_columns(dataset)
     schema = arrow_schema(columns, dataset.size)
-    table = _joined(dataset, shard, schema)
+    table = _joined_table(dataset, shard, schema)
     depths = [name for name in columns if name in (DEPTH, DEPTH_EXACT)]
     leaf = ".list.element.list.element"
     rows = _rows_per_group(dataset)
@@ -95,12 +96,12 @@ def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, rows_done
             path,
             schema,
             compression="zstd",
-            compression_level=3,  # a fifth smaller than 1, hardly slower; 6 gains 7% more for half again the time
+            compression_level=3,  # a fifth smaller than level 1, hardly slower; level 6: 7% smaller, 1.5 times the time
             use_dictionary=[
                 name if name in LABELS else name + leaf for name in columns if name not in (*depths, *RANGE)
             ],
             column_encoding={name + leaf: "BYTE_STREAM_SPLIT" for name in depths},
-            # Least and greatest grey level of an image help no reader.
+            # The range of grey levels of an image is of no use to a reader.
             write_statistics=[*LABELS, *RANGE],
         ) as writer:
             for first in range(0, table.num_rows, rows):
@@ -111,33 +112,33 @@ def _write_shard(dataset: DatasetFolder, shard: ShardFile, path: Path, rows_done
         raise OSError(f"{path.name}: {error}") from error
 
 
-def _joined(dataset: DatasetFolder, shard: ShardFile, schema: "pa.Schema") -> "pa.Table":
-    """The columns of all groups for the rows of one data shard, on the memory-mapped files."""
+def _joined_table(dataset: DatasetFolder, shard: ShardFile, schema: "pa.Schema") -> "pa.Table":
+    """The columns of all groups for the rows of a data shard, on the memory-mapped files."""
     import pyarrow as pa
 
-    found: dict[str, pa.ChunkedArray] = {}
+    columns: dict[str, pa.ChunkedArray] = {}
     for part in dataset.manifest.shards:
         if (part.split, part.first_row, part.rows) == (shard.split, shard.first_row, shard.rows):
             batches = dataset.record_batches(part)
             for name in batches[0].schema.names:
                 # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
-                pieces = (batch.column(name) for batch in batches)
-                found[name] = pa.chunked_array([getattr(piece, "storage", piece) for piece in pieces])
-    return pa.Table.from_arrays([found[name] for name in schema.names], schema=schema)
+                arrays = (batch.column(name) for batch in batches)
+                columns[name] = pa.chunked_array([getattr(array, "storage", array) for array in arrays])
+    return pa.Table.from_arrays([columns[name] for name in schema.names], schema=schema)
 
 
 def _rows_per_group(dataset: DatasetFolder) -> int:
     height, width = dataset.size
     frames = len(stored_frames(dataset.sequence, dataset.manifest.stored))
     row_bytes = height * width * (frames + (8 if dataset.has_exact else 4))
-    return max(1, min(_MOST_ROWS, ROW_GROUP_BYTES // row_bytes))
+    return max(1, min(_MOST_ROWS_PER_GROUP, ROW_GROUP_BYTES // row_bytes))
 
 
 def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     import yaml
 
     manifest: Manifest = dataset.manifest
-    # Two exports of the same dataset with other splits must not share a cache either.
+    # Exports of the same dataset with different splits must not share a cache entry.
     identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
     configs = [
         {

@@ -1,7 +1,7 @@
 """Exporting a dataset as the published tree: PNG fringes, .mat depth in three representations, raw scans, phases.
 
-Depth in mm is written as float32, bit by bit what the dataset holds. The normalised representations are written as
-float64, which brings the same float32 mm back; in float32 they would come back a few 0.0001 mm off.
+Depth in mm is written as float32, the same bits as in the dataset. The normalised representations are written as
+float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ from fpp_ml_bench.normalisation import Normalisation, normalise
 from fpp_ml_bench.pixel_sets import object_mask
 
 _PHASE_DIRECTION: Direction = "horizontal"
-"""The published phases have no direction in their name; they are those of the single-shot frame's own sequence."""
+"""The published phases do not name their direction; they belong to the fringes of the single-shot frame."""
 
 
 def write_tree(
@@ -47,8 +47,8 @@ def write_tree(
 ) -> None:
     """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all frames are stored.
 
-    ``fpp-bench import`` reads the tree back to the same frames, depth and splits. ``depth_exact`` has no place in the
-    layout and stays behind. Raises ``OSError`` when the disk refuses.
+    ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
+    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
     """
     with ThreadPoolExecutor(threads) as pool:
         jobs = [
@@ -69,12 +69,12 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
     depth_mm = dataset.depth_mm(sample)
     frame = dataset.frame(sample, SINGLE_SHOT_FRAME)
     fringe = png_bytes(frame)
-    fringe_alone = png_bytes(np.where(object_mask(depth_mm), frame, np.uint8(0)))
+    background_removed = png_bytes(np.where(object_mask(depth_mm), frame, np.uint8(0)))
     low_mm, high_mm = depth_range_mm(depth_mm, sample)
     training = folder / TRAINING
     for name, variable in VARIABLES.items():
         depth = matrix_bytes({variable: _represented(depth_mm, name, low_mm, high_mm)})
-        for variant, image in ((VARIANT_FOLDERS[name], fringe), (BACKGROUND_REMOVED_FOLDERS[name], fringe_alone)):
+        for variant, image in ((VARIANT_FOLDERS[name], fringe), (BACKGROUND_REMOVED_FOLDERS[name], background_removed)):
             _write(training / variant / published / FRINGE / f"{sample}.png", image)
             _write(training / variant / published / DEPTH / f"{sample}.mat", depth)
     limits = matrix_bytes(dict(zip(INFO_VARIABLES, (low_mm, high_mm), strict=True)))

@@ -1,4 +1,4 @@
-"""One writer a folder: a lock that the operating system drops when the process dies, however it dies."""
+"""A lock for the single writer of a folder; the operating system releases it when the process ends in any way."""
 
 import fcntl
 import os
@@ -13,9 +13,9 @@ from fpp_ml_bench.loaders.manifest import MANIFEST, WORK_FOLDER
 
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
-    """Hold a dataset folder for writing; yields its work folder, which is gone once the manifest stands.
+    """Lock a dataset folder for writing; yields its work folder, which is removed once the manifest is written.
 
-    Raises `BuildError` for a folder that another process is writing, or that holds something else than a dataset.
+    Raises `BuildError` for a folder that another process is writing, or that holds other files than a dataset.
     """
     work = folder / WORK_FOLDER
     if folder.exists() and not folder.is_dir():
@@ -31,8 +31,8 @@ def writing(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def exclusive(lock_file: Path, folder: Path, doing: str) -> Iterator[None]:
-    """Hold ``lock_file``, made with its folder where absent; `BuildError` about ``folder`` if another process does."""
+def exclusive(lock_file: Path, folder: Path, activity: str) -> Iterator[None]:
+    """Hold ``lock_file``, created with its folder if absent; `BuildError` for ``folder`` if another process has it."""
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         lock = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
@@ -42,7 +42,9 @@ def exclusive(lock_file: Path, folder: Path, doing: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise BuildError(f"{folder}: another process is {doing}; wait for it or choose another") from error
+            raise BuildError(
+                f"{folder}: another process is {activity}; wait for it or choose another folder"
+            ) from error
         yield
     finally:
         os.close(lock)

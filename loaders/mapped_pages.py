@@ -1,9 +1,9 @@
-"""Letting go of the pages of a memory-mapped file, so that a long run does not gather the whole file in its memory.
+"""Releasing the pages of a memory-mapped file, so that a long run does not keep the whole file in memory.
 
-What a process has read of a map counts as its memory until the map is closed or the machine is short of memory:
-scoring 300 samples would end with all their depth maps resident. `let_go` tells the kernel (madvise(2), MADV_DONTNEED)
-that this process is done with some pages. They stay in the page cache, and views of them stay valid: reading one again
-maps it again.
+The pages of a map that a process has read count as its memory until the map is closed or memory gets short: after
+scoring 300 samples, all their depth maps would be resident. `release_pages` tells the kernel (madvise(2),
+MADV_DONTNEED) that this process no longer needs some pages. They stay in the page cache, and views of them stay valid:
+reading a page again maps it again.
 """
 
 import ctypes
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 _MADV_DONTNEED = 4
 FAULT_AROUND_BYTES = 1 << 16
-"""A page fault on a file maps its neighbours too, in aligned windows of this size (Linux's default)."""
+"""A page fault on a file also maps the neighbouring pages, in aligned windows of this size (Linux's default)."""
 
 
 @cache
@@ -29,19 +29,19 @@ def _madvise() -> Any:
     return function
 
 
-def let_go(view: NDArray[Any], address: int, length: int) -> None:
-    """Let go of the pages that ``view``, a contiguous array, lies on, and of those that came with them.
+def release_pages(view: NDArray[Any], address: int, size: int) -> None:
+    """Release the pages that contain ``view``, a contiguous array, and the pages mapped together with them.
 
-    ``address`` and ``length`` (bytes) are those of the whole READ-ONLY FILE map that ``view`` lies in: nothing outside
-    is touched, which matters, because the same call empties memory that is not backed by a file. Elsewhere than on
-    Linux, or for a view that does not lie in the map, nothing happens.
+    ``address`` and ``size`` (bytes) are those of the whole READ-ONLY FILE map that contains ``view``. No page outside
+    is touched: on memory that is not backed by a file, the same call would erase the data. On systems other than Linux,
+    or for a view outside the map, this does nothing.
     """
     madvise = _madvise()
     start = view.ctypes.data
     stop = start + view.nbytes
-    if madvise is None or not view.nbytes or start < address or stop > address + length:
+    if madvise is None or not view.nbytes or start < address or stop > address + size:
         return
     page = mmap.PAGESIZE
-    first = max(start // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES, address // page * page)
-    last = min(-(-stop // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES, -(-(address + length) // page) * page)
-    madvise(first, last - first, _MADV_DONTNEED)
+    begin = max(start // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES, address // page * page)
+    end = min(-(-stop // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES, -(-(address + size) // page) * page)
+    madvise(begin, end - begin, _MADV_DONTNEED)

@@ -1,8 +1,8 @@
 """MATLAB files with one real matrix: v5 (zlib-compressed or not) and v7.3 (HDF5, stored transposed).
 
-v5 is parsed here and not by ``scipy.io.loadmat``, which reads the same values but trusts a file's lengths: of damaged
-uncompressed files it ends the whole process on some (segmentation fault, SciPy 1.17). Every length is checked here
-before it is used. Writing goes through SciPy, whose ``loadmat`` therefore reads what is written.
+v5 is parsed here instead of by ``scipy.io.loadmat``, which reads the same values but trusts the lengths in a file: some
+damaged uncompressed files end the whole process (segmentation fault, SciPy 1.17). Here every length is checked before
+it is used. Files are written by SciPy, so its ``loadmat`` reads them.
 """
 
 import io
@@ -30,14 +30,14 @@ _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
 
 
 class _Damaged(Exception):
-    """The file's content contradicts itself; the message says how."""
+    """The file is damaged or not supported; the message says how."""
 
 
 def read_matrix(path: Path, variable: str) -> NDArray:
-    """Variable ``variable`` of a v5 or v7.3 file as MATLAB shows it: a real numeric matrix (rows, columns), any dtype.
+    """Variable ``variable`` of a v5 or v7.3 file as in MATLAB: a real numeric matrix (rows, columns) of any dtype.
 
-    Raises `LayoutError` naming the file when it can't be read, holds no such variable (it names those it holds), or the
-    variable is not a real numeric matrix.
+    Raises `LayoutError` naming the file when it can't be read, lacks the variable (the message lists its variables), or
+    the variable is not a real numeric matrix.
     """
     try:
         content = path.read_bytes()
@@ -50,9 +50,9 @@ def read_matrix(path: Path, variable: str) -> NDArray:
 
 
 def parse_matrix(content: bytes, variable: str, largest_bytes: int = _LARGEST_BYTES) -> NDArray:
-    """`read_matrix` of the bytes of a file; its `LayoutError` names no file.
+    """`read_matrix` on the content of a file; its `LayoutError` names no file.
 
-    No variable is unpacked to more than ``largest_bytes``, and nothing outside of ``content`` is read.
+    No variable is unpacked to more than ``largest_bytes``, and other files that ``content`` refers to are not read.
     """
     try:
         if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
@@ -66,7 +66,7 @@ def read_scalar(path: Path, variable: str) -> float:
     """A scalar that MATLAB stores as a 1 x 1 matrix. Raises `LayoutError` as `read_matrix`, or for another shape."""
     matrix = read_matrix(path, variable)
     if matrix.shape != (1, 1) or not np.isfinite(matrix).all():
-        raise LayoutError(f"{path}: {variable} must be one finite number, stored 1 x 1, got {_shape(matrix)}")
+        raise LayoutError(f"{path}: {variable}: expected a finite number stored as 1 x 1, got {_shape(matrix)}")
     return float(matrix[0, 0])
 
 
@@ -104,7 +104,7 @@ class _Matrix:
         stored = np.dtype(self.order + _STORED[kind])
         if len(data) != math.prod(self.dimensions) * stored.itemsize:
             raise _Damaged(f"{self.name}: {len(data)} bytes do not make {self.dimensions}; the file is damaged")
-        # MATLAB keeps whole numbers in the smallest type that holds them; the class says what they are.
+        # MATLAB stores whole numbers in the smallest type that fits; the matrix class gives their true type.
         values = np.frombuffer(data, stored).reshape(self.dimensions, order="F")
         return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[self.kind]))
 
@@ -115,7 +115,7 @@ def _read_v5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
     mark = content[126:128]
     order = {b"IM": "<", b"MI": ">"}.get(mark)
     if order is None or struct.unpack(order + "H", content[124:126])[0] != 0x0100:
-        raise _Damaged("expected a MATLAB v5 or v7.3 file; this is neither")
+        raise _Damaged("expected a MATLAB v5 or v7.3 file; the header is neither")
     names = []
     for matrix in _matrices(memoryview(content)[_HEADER_BYTES:], order, largest_bytes):
         if matrix.name == variable:
@@ -145,24 +145,24 @@ def _decompressed(data: memoryview, largest_bytes: int) -> bytes:
 
 
 def _matrix(data: memoryview, order: str) -> _Matrix:
-    found = []
+    parts = []
     for expected in (_FLAGS, _DIMENSIONS, _NAME):
         kind, part, data = _element(data, order)
         if kind not in expected:
             raise _Damaged(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
-        found.append(part)
-    flags, dimensions, name = found
+        parts.append(part)
+    flags, dimensions, name = parts
     if len(flags) != 8 or len(dimensions) % 4:
         raise _Damaged("a matrix header has a wrong length; the file is damaged")
-    word = struct.unpack(order + "II", flags)[0]
+    flag_bits = struct.unpack(order + "II", flags)[0]
     shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
     if any(length < 0 for length in shape):
         raise _Damaged(f"a matrix has the shape {shape}; the file is damaged")
-    return _Matrix(bytes(name).decode("latin-1"), word & 0xFF, bool(word & _COMPLEX), shape, order, data)
+    return _Matrix(bytes(name).decode("latin-1"), flag_bits & 0xFF, bool(flag_bits & _COMPLEX), shape, order, data)
 
 
 def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int, memoryview, memoryview]:
-    """First data element: its type, its bytes, and what follows it. Elements inside a matrix are padded to 8 bytes."""
+    """First data element: its type, its bytes, and the content after it. Elements in a matrix are padded to 8 bytes."""
     if len(content) < 8:
         raise _Damaged("a data element is cut off; the file is damaged")
     kind, length = struct.unpack(order + "II", content[:8])
@@ -187,16 +187,16 @@ def _read_hdf5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
                 raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
             if not isinstance(file.get(variable, getlink=True), h5py.HardLink):
                 raise _Damaged(f"{variable} is a link; expected the matrix itself in this file")
-            found = file[variable]
-            if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "iuf" or found.ndim != 2:
+            matrix = file[variable]
+            if not isinstance(matrix, h5py.Dataset) or matrix.dtype.kind not in "iuf" or matrix.ndim != 2:
                 raise _Damaged(f"{variable}: expected a real numeric matrix (rows, columns)")
-            if found.is_virtual or found.external:
+            if matrix.is_virtual or matrix.external:
                 raise _Damaged(f"{variable} is stored in other files; expected the matrix itself in this file")
-            # A damaged file may unpack by the chunk, and a chunk may be far larger than the matrix it holds.
-            unpacked = max(found.size, math.prod(found.chunks or (1,))) * found.dtype.itemsize
+            # HDF5 unpacks whole chunks, and in a damaged file a chunk may be far larger than the matrix.
+            unpacked = max(matrix.size, math.prod(matrix.chunks or (1,))) * matrix.dtype.itemsize
             if unpacked > largest_bytes:
-                raise _Damaged(f"{variable}: {found.shape} is too large for a depth map")
+                raise _Damaged(f"{variable}: {matrix.shape} is too large for a depth map")
             # MATLAB is column-major, HDF5 row-major: the file holds the transpose.
-            return np.ascontiguousarray(np.asarray(found).T)
+            return np.ascontiguousarray(np.asarray(matrix).T)
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError) as error:
         raise _Damaged(f"can't be read as MATLAB v7.3 (HDF5): {error}") from error

@@ -1,4 +1,4 @@
-"""Pictures of a dataset: one sample with everything known about it, and the contact sheet of all objects and views."""
+"""Pictures of a dataset: a sample with frames, depth, mask and mesh, and a contact sheet of all objects and views."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,24 +22,24 @@ _TILE_PX = 120
 _DPI = 110
 
 
-def sample_picture(opened: DatasetFolder, sample: str, path: Path) -> None:
-    """Write one sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh."""
+def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
+    """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh."""
     from matplotlib.figure import Figure
 
-    sequence = opened.sequence
-    stored = set(stored_frames(sequence, opened.manifest.stored))
-    # The third finest Gray bit: its stripes are still told apart in a small picture.
+    sequence = dataset.sequence
+    stored = set(stored_frames(sequence, dataset.manifest.stored))
+    # The third finest Gray bit: its stripes are still visible in a small picture.
     codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
-    wished = [0, sequence.sinusoids("vertical")[0], *codes, sequence.white]
+    shown_frames = [0, sequence.sinusoids("vertical")[0], *codes, sequence.white]
     panels: list[tuple[str, Callable[[Axes], None]]] = []
-    for index in (i for i in wished if i in stored):
-        panels.append((sequence.frames[index].title, _grey(opened.frame(sample, index))))
-    depth_mm = opened.depth_mm(sample)
+    for index in (i for i in shown_frames if i in stored):
+        panels.append((sequence.frames[index].title, _grey(dataset.frame(sample, index))))
+    depth_mm = dataset.depth_mm(sample)
     inside = object_mask(depth_mm)
     low, high = float(depth_mm[inside].min()), float(depth_mm.max())
     panels.append((f"depth, {low:.0f}-{high:.0f} mm", _colours(_hidden(depth_mm, inside), "viridis", low, high, "mm")))
-    if opened.has_exact:
-        exact_mm = opened.depth_mm(sample, "depth_exact")
+    if dataset.has_exact:
+        exact_mm = dataset.depth_mm(sample, "depth_exact")
         error_mm = depth_mm - exact_mm
         limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
         panels.append(("exact depth", _colours(_hidden(exact_mm, object_mask(exact_mm)), "viridis", low, high, "mm")))
@@ -49,15 +49,15 @@ def sample_picture(opened: DatasetFolder, sample: str, path: Path) -> None:
         )  # fmt: skip
     cover = 100 * inside.mean()
     panels.append((f"object mask, {cover:.1f}% of the image", _grey(inside.astype(np.uint8) * 255)))
-    mesh = opened.path / "meshes" / f"{opened.measured(sample)['object']}.ply"
+    mesh = dataset.path / "meshes" / f"{dataset.measured(sample)['object']}.ply"
     if mesh.is_file():
         panels.append(("ground-truth mesh", _grey(_mesh_picture(mesh, 480))))
     columns = 5
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.4 * columns, 3.7 * rows), dpi=_DPI, layout="constrained")
-    figure.suptitle(f"{sample} ({opened.split_of_sample(sample)})")
-    for place, (title, draw) in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, place + 1)
+    figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
+    for number, (title, draw) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, number + 1)
         draw(axes)
         axes.set_title(title, fontsize=9)
         axes.set_xticks([])
@@ -74,8 +74,8 @@ def _grey(image: NDArray) -> "Callable[[Axes], None]":
 
 def _colours(image: NDArray, colours: str, low: float, high: float, unit: str) -> "Callable[[Axes], None]":
     def draw(axes: "Axes") -> None:
-        shown = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
-        bar = axes.figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.03)
+        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+        bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
         bar.set_label(unit, fontsize=8)
         bar.ax.tick_params(labelsize=7)
 
@@ -95,7 +95,7 @@ def _save(save: Callable[..., None], path: Path) -> None:
 
 
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
-    """The mesh from above and to the side, lit from the eye; uint8 (size, size)."""
+    """The mesh seen from above and the side, lit from the viewer; uint8 (size, size)."""
     from fpp_ml_bench.loaders.meshes import load_user_mesh
     from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
     from fpp_ml_bench.loaders.scene import turned
@@ -118,30 +118,30 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     return picture.reshape(size, size)
 
 
-def contact_sheet(opened: DatasetFolder, split: str, path: Path) -> None:
-    """Write every object (two a line) in its six views as one PNG, under white light where that frame is stored."""
+def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
+    """Write all objects (two per line) in their six views as a PNG, in white light if that frame is stored."""
     import cv2
 
-    samples = opened.samples(split)
-    objects = list(dict.fromkeys(opened.measured(sample)["object"] for sample in samples))
-    available = stored_frames(opened.sequence, opened.manifest.stored)
-    index = opened.sequence.white if opened.sequence.white in available else 0
+    samples = dataset.samples(split)
+    objects = list(dict.fromkeys(dataset.measured(sample)["object"] for sample in samples))
+    available = stored_frames(dataset.sequence, dataset.manifest.stored)
+    index = dataset.sequence.white if dataset.sequence.white in available else 0
     label_px, columns = 18, 2
     line_px = _TILE_PX + label_px
     lines = -(-len(objects) // columns)
     width = len(VIEWS) * _TILE_PX
     sheet = np.full((lines * line_px, columns * width + 8), 255, dtype=np.uint8)
-    known = set(samples)
-    for place, name in enumerate(objects):
-        top, left = (place // columns) * line_px, (place % columns) * (width + 8)
-        for number, view in enumerate(VIEWS):
+    samples_in_split = set(samples)
+    for number, name in enumerate(objects):
+        top, left = (number // columns) * line_px, (number % columns) * (width + 8)
+        for view_number, view in enumerate(VIEWS):
             sample = sample_name(name, view)
-            if sample not in known:
+            if sample not in samples_in_split:
                 continue
-            tile = cv2.resize(opened.frame(sample, index), (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
-            column = left + number * _TILE_PX
+            tile = cv2.resize(dataset.frame(sample, index), (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
+            column = left + view_number * _TILE_PX
             sheet[top + label_px : top + line_px, column : column + _TILE_PX] = cv2.convertScaleAbs(tile, alpha=1.4)
-        title = f"{name} ({opened.split_of_sample(sample_name(name, VIEWS[0]))})"
+        title = f"{name} ({dataset.split_of_sample(sample_name(name, VIEWS[0]))})"
         cv2.putText(sheet, title, (left + 4, top + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
     encoded, png = cv2.imencode(".png", sheet)
     if not encoded:

@@ -10,7 +10,7 @@ from fpp_ml_bench.errors import BuildError, LayoutError, RigError
 from fpp_ml_bench.frames import Sequence
 from fpp_ml_bench.loaders.assemble import Assembly, Progress, Receipt, assemble
 from fpp_ml_bench.loaders.manifest import MANIFEST, WORK_FOLDER, Manifest
-from fpp_ml_bench.loaders.published_layout import VARIANT_FOLDERS, refuse
+from fpp_ml_bench.loaders.published_layout import VARIANT_FOLDERS, layout_error
 from fpp_ml_bench.loaders.published_order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published_png import read_grey_png
 from fpp_ml_bench.loaders.published_sample import SampleReader
@@ -20,13 +20,13 @@ from fpp_ml_bench.loaders.shards import Row, ShardPlan, ShardWriter, plan_shards
 from fpp_ml_bench.rig import Rig, paper_rig
 
 IMPORTED = "imported"
-_SURVEY_THREADS = 4
-_TRIED_SCANS = 6
+_CHECK_THREADS = 4
+_MOST_SCANS_TRIED = 6
 
 
 @dataclass(frozen=True)
 class ImportShard:
-    """Picklable work of one shard: read its samples' files, check them, write the rows; one sample is held."""
+    """Picklable work of a shard: read and check its samples' files and write the rows, holding one sample in memory."""
 
     samples: dict[str, PublishedSample]
     reader: SampleReader
@@ -43,31 +43,31 @@ class ImportShard:
 
 
 @dataclass(frozen=True)
-class Import:
-    """An import that may start: the tree as scanned and what is to be assembled from it."""
+class ImportPlan:
+    """An import that is ready to start: the scanned tree, its reader and the dataset to assemble."""
 
     tree: PublishedTree
     reader: SampleReader
     assembly: Assembly
 
 
-def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> Import:
-    """Scan the tree at ``root`` and settle how it is read.
+def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
+    """Scan the tree at ``root`` and determine how it is read.
 
-    ``rig``: the rig that took the images; without one the paper's is assumed, scaled to the image size.
-    ``frame_order``: see `fpp_ml_bench.loaders.published_order`; ``auto`` finds it on the first sample's images,
-    and every other sample is held to it.
+    ``rig``: the rig that took the images; None assumes the paper's rig, scaled to the image size.
+    ``frame_order``: see `fpp_ml_bench.loaders.published_order`; ``auto`` determines it from the first sample's images,
+    and all other samples are checked against it.
 
-    Raises `LayoutError` listing every file that breaks the layout, `RigError` for a rig of another image size.
+    Raises `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size.
     """
     order = parse_order(frame_order)
     tree = scan_tree(root, len((rig or paper_rig()).sequence))
-    used = _rig_for(tree, rig)
+    rig_used = _rig_for(tree, rig)
     if not tree.has_frames:
         order = None
     elif order is None:
-        order = _found_order(tree, used)
-    reader = SampleReader(tree.size, tree.variants, used, order)
+        order = _order_of(tree, rig_used)
+    reader = SampleReader(tree.size, tree.variants, rig_used, order)
     stored = "all" if tree.has_frames else "single_shot"
     plans = []
     for split, samples in tree.samples.items():
@@ -85,9 +85,11 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
             "frame_order": order.name if order else None,
             "rig_assumed": rig is None,
             "ignored": list(tree.ignored),
-            "objects": {split: list(dict.fromkeys(s.object for s in found)) for split, found in tree.samples.items()},
+            "objects": {
+                split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()
+            },
         },
-        rig=used.to_dict(),
+        rig=rig_used.to_dict(),
         size=tree.size,
         stored=stored,
         exact=False,
@@ -96,50 +98,52 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
     )
     work = ImportShard({sample.sample: sample for sample in tree.all_samples()}, reader, stored)
     # One byte a frame and one float32 depth map.
-    bytes_per_row = tree.size[0] * tree.size[1] * (len(stored_frames(used.sequence, stored)) + 4)
-    return Import(tree, reader, Assembly(plans, work, manifest, bytes_per_row))
+    bytes_per_row = tree.size[0] * tree.size[1] * (len(stored_frames(rig_used.sequence, stored)) + 4)
+    return ImportPlan(tree, reader, Assembly(plans, work, manifest, bytes_per_row))
 
 
-def import_tree(folder: Path, planned: Import, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned import into ``folder``, or go on with one that was interrupted.
+def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
+    """Write the planned import into ``folder``, or resume an interrupted import.
 
-    Contents are checked as they are read; when a file is wrong, all the others are checked too, so that the one
-    `LayoutError` lists every offender. Raises `BuildError` as a build does, and when the tree changed after ``folder``
-    was finished.
+    Contents are checked as they are read. When a file is wrong, all others are checked too, so that the `LayoutError`
+    lists every wrong file. Raises `BuildError` as a build does, and when the tree changed after ``folder`` was
+    finished.
     """
-    _refuse_changed(folder, planned.tree)
-    _drop_stale_receipts(folder, planned)
+    _refuse_changed(folder, plan.tree)
+    _drop_stale_receipts(folder, plan)
     try:
-        return assemble(folder, planned.assembly, workers, progress)
+        return assemble(folder, plan.assembly, workers, progress)
     except LayoutError as error:
-        with ThreadPoolExecutor(_SURVEY_THREADS) as pool:
-            found = list(pool.map(planned.reader.problems, planned.tree.all_samples()))
-        problems = [line for lines in found for line in lines]
-        raise refuse(planned.tree.root, problems or str(error).splitlines()) from error
+        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
+            problems_by_sample = list(pool.map(plan.reader.problems, plan.tree.all_samples()))
+        problems = [line for lines in problems_by_sample for line in lines]
+        raise layout_error(plan.tree.root, problems or str(error).splitlines()) from error
 
 
 def import_notes(manifest: Manifest) -> list[str]:
-    """What a person should know of a finished import, a sentence each."""
+    """Notes about a finished import for the user, one sentence each."""
     settings = manifest.settings
     notes = [f"depth taken from {settings['depth_from']}"]
     if settings["depth_checked_against"]:
         notes[0] += f", checked against {', '.join(settings['depth_checked_against'])}"
     if settings["depth_from"] == VARIANT_FOLDERS["individual"]:
-        notes.append("pixels at a sample's least depth can't be told from background there: they became background")
+        notes.append(
+            "in this variant, pixels at a sample's least depth can't be told from background; they became background"
+        )
     if settings["rig_assumed"]:
-        notes.append("the rig is assumed to be the paper's, scaled to the image size; give --rig where it is another")
+        notes.append("the rig is assumed to be the paper's, scaled to the image size; give --rig if it is another")
     if settings["frame_order"]:
         notes.append(f"frame order of the raw scans: {settings['frame_order']}")
         order = parse_order(settings["frame_order"])
         sequence = Sequence(**manifest.rig["sequence"])
-        first = (order or FrameOrder()).frames(sequence)[0]
-        if first.index != SINGLE_SHOT_FRAME:
+        first_file = (order or FrameOrder()).frames(sequence)[0]
+        if first_file.index != SINGLE_SHOT_FRAME:
             notes.append(
-                f"the published single-shot input, A_0.png, is a {first.direction} fringe and stands in column "
-                f"{first.column}; configuration single_shot holds the first horizontal frame"
+                f"the published single-shot input, A_0.png, is a {first_file.direction} fringe, stored in column "
+                f"{first_file.column}; configuration single_shot holds the first horizontal frame"
             )
     if settings["ignored"]:
-        notes.append(f"left aside, they follow from what is stored: {', '.join(settings['ignored'])}")
+        notes.append(f"not imported, because computed from the stored data: {', '.join(settings['ignored'])}")
     return notes
 
 
@@ -148,7 +152,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
     if rig is None:
         if height != width:
             raise RigError(
-                f"{tree.root}: images of {width} x {height} px are not the paper's square ones; give the rig with --rig"
+                f"{tree.root}: images of {width} x {height} px are not square like the paper's; give the rig with --rig"
             )
         return paper_rig(width)
     if (rig.camera.height, rig.camera.width) != tree.size:
@@ -159,10 +163,10 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
     return rig
 
 
-def _found_order(tree: PublishedTree, rig: Rig) -> FrameOrder:
-    """Order of the first raw scan that can be read and has one; a few are tried, the first may be a broken one."""
+def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
+    """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
-    for sample in tree.all_samples()[:_TRIED_SCANS]:
+    for sample in tree.all_samples()[:_MOST_SCANS_TRIED]:
         try:
             files = [read_grey_png(path) for path in sample.frames]
         except LayoutError as error:
@@ -172,21 +176,23 @@ def _found_order(tree: PublishedTree, rig: Rig) -> FrameOrder:
         if order is not None:
             return order
         misfits = check_order(files, FrameOrder(), rig)
-        refusals.append(f"{sample.frames[0].parent}: fits no frame order known here. Of the paper's: {misfits[0]}")
-    raise refuse(tree.root, refusals)
+        refusals.append(
+            f"{sample.frames[0].parent}: fits no named frame order. Mismatch with the paper's order: {misfits[0]}"
+        )
+    raise layout_error(tree.root, refusals)
 
 
 def _changed_ns(path: Path) -> int:
-    """When a file last changed in any way. Unlike its modification time this is not copied along or set back."""
+    """When a file last changed, in ns. Unlike the modification time alone, copying or setting times can't reset it."""
     status = path.stat()
     return max(status.st_ctime_ns, status.st_mtime_ns)
 
 
 def _refuse_changed(folder: Path, tree: PublishedTree) -> None:
-    standing = folder / MANIFEST
-    if not standing.is_file():
+    manifest_path = folder / MANIFEST
+    if not manifest_path.is_file():
         return
-    finished = standing.stat().st_mtime_ns
+    finished = manifest_path.stat().st_mtime_ns
     for sample in tree.all_samples():
         for path in sample.files:
             if _changed_ns(path) > finished:
@@ -195,13 +201,13 @@ def _refuse_changed(folder: Path, tree: PublishedTree) -> None:
                 )
 
 
-def _drop_stale_receipts(folder: Path, planned: Import) -> None:
-    """A shard of an interrupted import is read again when one of its files changed after it was written."""
-    samples = {sample.sample: sample for sample in planned.tree.all_samples()}
-    for plan in planned.assembly.plans:
-        receipt = folder / WORK_FOLDER / f"{plan.name}.json"
+def _drop_stale_receipts(folder: Path, plan: ImportPlan) -> None:
+    """Delete receipts of shards of which a source file changed after the shard was written; they are read again."""
+    samples = {sample.sample: sample for sample in plan.tree.all_samples()}
+    for shard_plan in plan.assembly.plans:
+        receipt = folder / WORK_FOLDER / f"{shard_plan.name}.json"
         if receipt.is_file():
             written = receipt.stat().st_mtime_ns
-            files = (path for stem, _, _ in plan.samples for path in samples[stem].files)
+            files = (path for stem, _, _ in shard_plan.samples for path in samples[stem].files)
             if any(_changed_ns(path) > written for path in files):
                 receipt.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Names of the published tree: folders, variables, units; used by the import and by the export alike."""
+"""Names in the published tree (folders, variables, units), shared by import and export."""
 
 from fpp_ml_bench.constants import VIEWS, split_sample_name
 from fpp_ml_bench.errors import LayoutError
@@ -15,7 +15,7 @@ VARIANT_FOLDERS: dict[Normalisation, str] = {
     "global": "training_data_depth_global_normalized",
     "individual": "training_data_depth_individual_normalized",
 }
-"""Folder of each representation of depth, in the order in which mm are taken from them."""
+"""Folder of each depth representation; depth in mm is taken from the first that is present."""
 BACKGROUND_REMOVED_FOLDERS: dict[Normalisation, str] = {
     name: folder.replace("training_data_depth", "training_data_bgremoved_depth")
     for name, folder in VARIANT_FOLDERS.items()
@@ -26,18 +26,18 @@ VARIABLES: dict[Normalisation, str] = {
 WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS = "wrapped_phase.mat", "unwrapped_phase.mat", "z.csv"
 WRAPPED_PHASE_VARIABLE, UNWRAPPED_PHASE_VARIABLE = "wph", "uph"
 NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
-"""Files of a raw scan that follow from its frames; the import leaves them aside."""
+"""Files of a raw scan that are computed from its frames; the import ignores them."""
 
 LISTED_PROBLEMS = 50
 
 
 def frame_file(index: int) -> str:
-    """File of a raw scan's frame."""
+    """File name of frame ``index`` in a raw scan."""
     return f"A_{index}.png"
 
 
 def label_of(stem: str) -> tuple[str, str] | None:
-    """Object and view that a file name without its ending says, None when it says none."""
+    """Object and view in a file name without its suffix, None for any other name."""
     try:
         name, view = split_sample_name(stem)
     except ValueError:
@@ -45,8 +45,8 @@ def label_of(stem: str) -> tuple[str, str] | None:
     return (name, view) if view in VIEWS else None
 
 
-def refuse(root: object, problems: list[str]) -> LayoutError:
-    """The error that lists what is wrong with a tree: all of it, up to `LISTED_PROBLEMS` lines."""
+def layout_error(root: object, problems: list[str]) -> LayoutError:
+    """The error that lists the problems of a tree, at most `LISTED_PROBLEMS` of them."""
     shown = problems[:LISTED_PROBLEMS]
     if len(problems) > len(shown):
         shown.append(f"... and {len(problems) - len(shown)} more")

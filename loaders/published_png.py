@@ -1,6 +1,6 @@
-"""8-bit grey PNG files, strictly: OpenCV decodes a cut-off file to a half-empty image without a word.
+"""Strict reading of 8-bit grey PNG files. OpenCV decodes a truncated file to a partly empty image without an error.
 
-So the chunks and their checksums are walked first; what passes is whole, and decoding it can't go wrong quietly.
+So all chunks and their checksums are checked first; a file that passes is complete.
 """
 
 import struct
@@ -41,12 +41,10 @@ def read_png_header(path: Path) -> PngHeader:
 
 def _header(start: bytes, path: Path) -> PngHeader:
     if len(start) < _HEADER_BYTES or not start.startswith(_SIGNATURE) or start[12:16] != b"IHDR":
-        raise LayoutError(f"{path}: expected a PNG file, this is none")
+        raise LayoutError(f"{path}: expected a PNG file, got other content")
     width, height, bits, colour = struct.unpack(">IIBB", start[16:26])
     if bits != 8:
-        raise LayoutError(
-            f"{path}: expected an 8-bit PNG, got {bits} bits a channel, which are not clipped silently; convert it"
-        )
+        raise LayoutError(f"{path}: expected an 8-bit PNG, got {bits} bits per channel; convert it to 8 bits")
     if colour not in (_GREY, _RGB):
         raise LayoutError(
             f"{path}: expected a grey PNG, or RGB with equal channels, got {_COLOURS.get(colour, colour)}"
@@ -57,8 +55,8 @@ def _header(start: bytes, path: Path) -> PngHeader:
 def read_grey_png(path: Path) -> NDArray[np.uint8]:
     """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal.
 
-    Raises `LayoutError` naming the file when it is no PNG, is cut off or damaged, has another depth or colour type, or
-    its channels differ.
+    Raises `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour
+    type, or its channels differ.
     """
     import cv2
 
@@ -89,19 +87,19 @@ def _check_chunks(content: bytes, path: Path) -> None:
 
 
 def _chunks(content: bytes, path: Path) -> Iterator[bytes]:
-    view, place = memoryview(content), len(_SIGNATURE)
-    while place < len(view):
-        if len(view) - place < 12:
+    view, position = memoryview(content), len(_SIGNATURE)
+    while position < len(view):
+        if len(view) - position < 12:
             raise LayoutError(f"{path}: the PNG is cut off")
-        length = struct.unpack(">I", view[place : place + 4])[0]
-        stop = place + 12 + length
+        length = struct.unpack(">I", view[position : position + 4])[0]
+        stop = position + 12 + length
         if stop > len(view):
             raise LayoutError(f"{path}: the PNG is cut off")
-        if zlib.crc32(view[place + 4 : stop - 4]) != struct.unpack(">I", view[stop - 4 : stop])[0]:
+        if zlib.crc32(view[position + 4 : stop - 4]) != struct.unpack(">I", view[stop - 4 : stop])[0]:
             raise LayoutError(f"{path}: the PNG is damaged, a checksum does not match")
-        kind = bytes(view[place + 4 : place + 8])
+        kind = bytes(view[position + 4 : position + 8])
         yield kind
-        place = stop
+        position = stop
         if kind == b"IEND":
             return
 

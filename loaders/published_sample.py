@@ -19,7 +19,8 @@ from fpp_ml_bench.pixel_sets import object_mask
 from fpp_ml_bench.rig import Rig
 
 AGREEMENT_MM = 0.01
-"""Variants of one depth map may differ by this much: float32 in m keeps 0.0001 mm, a wrong unit or file is mm away."""
+"""Accepted difference between variants of a depth map: float32 in m is exact to 0.0001 mm, and a wrong unit or file
+differs by mm."""
 _UNIT_SLACK = 10.0
 _ROUNDING = 1e-6
 _SHOWN_MISFITS = 3
@@ -27,7 +28,7 @@ _SHOWN_MISFITS = 3
 
 @dataclass(frozen=True)
 class SampleReader:
-    """Reads samples of one tree. ``order`` None: raw frames are not read as frames of a sequence, only checked."""
+    """Reads the samples of a tree. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
     size: tuple[int, int]
     variants: tuple[Normalisation, ...]
@@ -35,7 +36,7 @@ class SampleReader:
     order: FrameOrder | None
 
     def read(self, sample: PublishedSample) -> Row:
-        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError`, a line for each wrong file."""
+        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line per wrong file."""
         problems: list[str] = []
         row = self._read(sample, problems)
         if row is None:
@@ -43,7 +44,7 @@ class SampleReader:
         return row
 
     def problems(self, sample: PublishedSample) -> list[str]:
-        """What is wrong with the sample's files, a line each; empty when it can be read."""
+        """Problems of the sample's files, a line each; empty when the sample can be read."""
         problems: list[str] = []
         self._read(sample, problems)
         return problems
@@ -74,7 +75,7 @@ class SampleReader:
         images = [self._image(path, problems) for path in sample.fringes]
         if images[0] is not None:
             problems += [
-                f"{path}: differs from {sample.fringes[0]}, which must be the same image"
+                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
                 for path, image in zip(sample.fringes[1:], images[1:], strict=True)
                 if image is not None and not np.array_equal(image, images[0])
             ]
@@ -85,15 +86,15 @@ class SampleReader:
     ) -> dict[int, NDArray[np.uint8]]:
         misfits = check_order(files, order, self.rig)
         if misfits:
-            other = find_order(files, self.rig)
-            hint = "it fits no order known here" if other is None else f"it has the order {other.name}"
+            fitting = find_order(files, self.rig)
+            hint = "it fits no named order" if fitting is None else f"it has the order {fitting.name}"
             more = f" (and {len(misfits) - _SHOWN_MISFITS} more)" if len(misfits) > _SHOWN_MISFITS else ""
-            found = "; ".join(misfits[:_SHOWN_MISFITS])
-            problems.append(f"{sample.frames[0].parent}: not in frame order {order.name}, {hint}: {found}{more}")
+            shown = "; ".join(misfits[:_SHOWN_MISFITS])
+            problems.append(f"{sample.frames[0].parent}: not in frame order {order.name}, {hint}: {shown}{more}")
         return {frame.index: image for frame, image in zip(order.frames(self.rig.sequence), files, strict=True)}
 
     def _depth_mm(self, sample: PublishedSample, problems: list[str]) -> NDArray[np.float32] | None:
-        """Depth from the first variant; the others, and the depth range, must agree with it."""
+        """Depth from the first variant; the other variants and the depth range must agree with it."""
         maps: list[tuple[Normalisation, Path, NDArray[np.float64]]] = []
         limits = self._range_mm(sample, problems)
         for variant, path in zip(self.variants, sample.depths, strict=True):
@@ -107,16 +108,19 @@ class SampleReader:
         if not maps or maps[0][1] != sample.depths[0]:
             return None
         depth_mm = maps[0][2].astype(np.float32)
-        for variant, path, other_mm in maps[1:]:
-            worst = _disagreement_mm(other_mm, depth_mm, variant)
-            if worst > AGREEMENT_MM:
-                problems.append(f"{path}: disagrees with {sample.depths[0]} by up to {worst:.3f} mm")
+        for variant, path, variant_mm in maps[1:]:
+            difference_mm = _disagreement_mm(variant_mm, depth_mm, variant)
+            if difference_mm > AGREEMENT_MM:
+                problems.append(
+                    f"{path}: differs from {sample.depths[0]} by up to {difference_mm:.3f} mm; expected at "
+                    f"most {AGREEMENT_MM} mm"
+                )
         if limits is not None and self.variants[0] != "individual":
             inside = depth_mm[object_mask(depth_mm)]
             actual = float(inside.min()), float(inside.max())
             if max(abs(a - b) for a, b in zip(actual, limits, strict=True)) > AGREEMENT_MM:
                 problems.append(
-                    f"{sample.info}: says {limits[0]:.3f} to {limits[1]:.3f} mm, but {sample.depths[0]} has "
+                    f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {sample.depths[0]} has "
                     f"{actual[0]:.3f} to {actual[1]:.3f} mm"
                 )
         return depth_mm
@@ -155,16 +159,16 @@ class SampleReader:
             unit = "m" if variant == "global" else "mm"
             raise LayoutError(
                 f"{path}: depths of {low:.4g} to {high:.4g} mm when {VARIABLES[variant]} is read in {unit}; the "
-                f"working range is {near:g} to {far:g} mm, so the unit is another"
+                f"working range is {near:g} to {far:g} mm, so the file has another unit"
             )
         return depth_mm
 
 
-def _disagreement_mm(other_mm: NDArray[np.float64], depth_mm: NDArray[np.float32], variant: Normalisation) -> float:
+def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float32], variant: Normalisation) -> float:
     expected = depth_mm.astype(np.float64)
     if variant == "individual":
-        # Pixels at the sample's least depth are 0 there, by the paper's rule.
+        # By the paper's rule, pixels at the sample's least depth are 0 in this variant.
         inside = expected[object_mask(expected)]
         share = normalise(expected, "individual", float(inside.min()), float(inside.max()))
         expected = np.where(object_mask(share), expected, 0.0)
-    return float(np.abs(other_mm - expected).max())
+    return float(np.abs(variant_mm - expected).max())

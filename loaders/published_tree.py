@@ -1,7 +1,7 @@
-"""Scanning a published tree: which samples it holds, in which files, and every breach of its layout that names show.
+"""Scanning a published tree: its samples and their files, and all errors in the layout that names alone show.
 
-Nothing but directory entries and PNG headers is read here; contents are checked when a sample is
-(`fpp_ml_bench.loaders.published_sample`). Names that begin with a dot are left aside, as are files beside the folders.
+Only directory entries and PNG headers are read here; contents are checked when a sample is read
+(`fpp_ml_bench.loaders.published_sample`). Names that begin with a dot, and files beside the folders, are ignored.
 """
 
 from collections import Counter
@@ -21,19 +21,19 @@ from fpp_ml_bench.loaders.published_layout import (
     VARIANT_FOLDERS,
     frame_file,
     label_of,
-    refuse,
+    layout_error,
 )  # fmt: skip
 from fpp_ml_bench.loaders.published_png import read_png_header
 from fpp_ml_bench.normalisation import Normalisation
 
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
-Placed = dict[str, dict[str, Path]]
-"""Per split (ours), the files of its samples by stem."""
+FilesBySplit = dict[str, dict[str, Path]]
+"""The files of each split by stem (sample name); keys are this package's split names."""
 
 
 @dataclass(frozen=True)
 class PublishedSample:
-    """Files of one sample: fringe and depth per variant in the tree's order, depth range, raw frames in file order."""
+    """Files of a sample: fringe and depth per variant in the tree's order, depth range, raw frames in file order."""
 
     sample: str
     object: str
@@ -51,7 +51,7 @@ class PublishedSample:
 
 @dataclass(frozen=True)
 class PublishedTree:
-    """A tree whose layout holds: image size (H, W), variants present, samples per split in row order."""
+    """A tree with a valid layout: image size (H, W), variants present, samples per split in row order."""
 
     root: Path
     size: tuple[int, int]
@@ -65,7 +65,7 @@ class PublishedTree:
 
 
 def scan_tree(root: Path, frames: int) -> PublishedTree:
-    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` with every breach found.
+    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
 
     ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself.
     """
@@ -75,7 +75,7 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
 def _locate(root: Path) -> tuple[Path, Path | None]:
     """Folders of the training data and of the raw scans."""
     if not root.is_dir():
-        raise LayoutError(f"{root}: no such folder; give the one that holds {TRAINING}/")
+        raise LayoutError(f"{root}: no such folder; give the folder that holds {TRAINING}/")
     scans = root / RAW_SCANS if (root / RAW_SCANS).is_dir() else None
     training = root / TRAINING if (root / TRAINING).is_dir() else root
     if any((training / folder).is_dir() for folder in VARIANT_FOLDERS.values()):
@@ -87,10 +87,12 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
         )
     if any((training / folder).is_dir() for folder in BACKGROUND_REMOVED_FOLDERS.values()):
         raise LayoutError(
-            f"{training}: only background-removed data, which lack the fringes outside the object; "
+            f"{training}: only background-removed data, without the fringes outside the object; "
             f"add {VARIANT_FOLDERS['raw']}/"
         )
-    raise LayoutError(f"{root}: expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}, found none")
+    raise LayoutError(
+        f"{root}: expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}, got none of them"
+    )
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -113,30 +115,30 @@ class _Scan:
         info = self._info(pairs[0][1], needed=variants == ("individual",))
         scans = self._raw_scans(pairs[0][0]) if self.scans else {}
         samples = {split: self._samples(split, pairs, info, scans) for split in PUBLISHED_SPLIT_FOLDERS}
-        samples = {split: found for split, found in samples.items() if found}
+        samples = {split: split_samples for split, split_samples in samples.items() if split_samples}
         self._objects(samples)
         if not samples and not self.problems:
             self.problems.append(f"{self.training / VARIANT_FOLDERS[variants[0]]}: holds no sample")
         size = self._sizes(samples)
         if self.problems:
-            raise refuse(self.root, self.problems)
+            raise layout_error(self.root, self.problems)
         return PublishedTree(self.root, size, variants, samples, self.scans is not None, self._ignored())
 
-    def _variant(self, folder: Path) -> tuple[Placed, Placed]:
-        """Fringes and depths of one variant, each paired with the other."""
-        found: dict[str, Placed] = {kind: {} for kind in _KINDS}
-        ours = {published: split for split, published in PUBLISHED_SPLIT_FOLDERS.items()}
+    def _variant(self, folder: Path) -> tuple[FilesBySplit, FilesBySplit]:
+        """Fringes and depths of a variant; reports every file without its counterpart."""
+        files: dict[str, FilesBySplit] = {kind: {} for kind in _KINDS}
+        splits = {published: split for split, published in PUBLISHED_SPLIT_FOLDERS.items()}
         for entry in _entries(folder):
-            if entry.name not in ours or not entry.is_dir():
-                self._extra(entry, f"expected the folders {', '.join(ours)}")
+            if entry.name not in splits or not entry.is_dir():
+                self._report_foreign(entry, f"expected the folders {', '.join(splits)}")
                 continue
             for part in _entries(entry):
                 if part.name not in _KINDS or not part.is_dir():
-                    self._extra(part, f"expected the folders {FRINGE} and {DEPTH}")
+                    self._report_foreign(part, f"expected the folders {FRINGE} and {DEPTH}")
             for kind, suffix in _KINDS.items():
-                found[kind][ours[entry.name]] = self._files(entry / kind, suffix)
-        for split in found[FRINGE]:
-            fringes, depths = found[FRINGE][split], found[DEPTH][split]
+                files[kind][splits[entry.name]] = self._files(entry / kind, suffix)
+        for split in files[FRINGE]:
+            fringes, depths = files[FRINGE][split], files[DEPTH][split]
             published = folder / PUBLISHED_SPLIT_FOLDERS[split]
             for stem in sorted(set(fringes) - set(depths)):
                 self.problems.append(f"{published / DEPTH / (stem + '.mat')}: is missing, {fringes[stem]} has no depth")
@@ -144,7 +146,7 @@ class _Scan:
                 self.problems.append(
                     f"{published / FRINGE / (stem + '.png')}: is missing, {depths[stem]} has no fringe"
                 )
-        return found[FRINGE], found[DEPTH]
+        return files[FRINGE], files[DEPTH]
 
     def _files(self, folder: Path, suffix: str) -> dict[str, Path]:
         if not folder.is_dir():
@@ -153,71 +155,74 @@ class _Scan:
         files = {}
         for entry in _entries(folder):
             if entry.suffix != suffix or not entry.is_file():
-                self._extra(entry, f"expected files ending in {suffix}")
+                self._report_foreign(entry, f"expected files ending in {suffix}")
             elif label_of(entry.stem) is None:
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
             else:
                 files[entry.stem] = entry
         return files
 
-    def _extra(self, entry: Path, expected: str) -> None:
+    def _report_foreign(self, entry: Path, expected: str) -> None:
         self.problems.append(f"{entry}: does not belong here; {expected}")
 
-    def _same_stems(self, variants: tuple[Normalisation, ...], pairs: list[tuple[Placed, Placed]]) -> None:
-        """Every variant must hold the samples of the first, in the same split."""
+    def _same_stems(self, variants: tuple[Normalisation, ...], pairs: list[tuple[FilesBySplit, FilesBySplit]]) -> None:
+        """Report samples of the first variant that another variant lacks in the same split, and the reverse."""
         for name, (fringes, _) in zip(variants[1:], pairs[1:], strict=True):
             for split, published in PUBLISHED_SPLIT_FOLDERS.items():
-                first, other = set(pairs[0][0].get(split, {})), set(fringes.get(split, {}))
-                for here, there, stems in ((name, variants[0], first - other), (variants[0], name, other - first)):
-                    folder = self.training / VARIANT_FOLDERS[here] / published / FRINGE
+                first_stems, stems_here = set(pairs[0][0].get(split, {})), set(fringes.get(split, {}))
+                for lacking, holding, stems in (
+                    (name, variants[0], first_stems - stems_here),
+                    (variants[0], name, stems_here - first_stems),
+                ):
+                    folder = self.training / VARIANT_FOLDERS[lacking] / published / FRINGE
                     self.problems += [
-                        f"{folder / (stem + '.png')}: is missing, though {VARIANT_FOLDERS[there]} has it in {published}"
+                        f"{folder / (stem + '.png')}: is missing; {VARIANT_FOLDERS[holding]} has it in {published}"
                         for stem in sorted(stems)
                     ]
 
-    def _info(self, depths: Placed, needed: bool) -> Placed:
+    def _info(self, depths: FilesBySplit, needed: bool) -> FilesBySplit:
         folder = self.training / INFO
         if not folder.is_dir():
             if needed:
-                self.problems.append(f"{folder}: the folder is missing; without it normalised depth has no mm")
+                self.problems.append(
+                    f"{folder}: the folder is missing; normalised depth can't be converted to mm without it"
+                )
             return {}
-        placed: Placed = {}
-        known = {PUBLISHED_SPLIT_FOLDERS[split] for split in depths}
+        files: FilesBySplit = {}
+        split_folders = {PUBLISHED_SPLIT_FOLDERS[split] for split in depths}
         for entry in _entries(folder):
-            if entry.name not in known:
-                self._extra(entry, f"expected the folders {', '.join(sorted(known))}")
+            if entry.name not in split_folders:
+                self._report_foreign(entry, f"expected the folders {', '.join(sorted(split_folders))}")
         for split, expected in depths.items():
             part = folder / PUBLISHED_SPLIT_FOLDERS[split] / DEPTH
-            placed[split] = self._files(part, ".mat")
+            files[split] = self._files(part, ".mat")
             if part.is_dir():
-                missing, extra = set(expected) - set(placed[split]), set(placed[split]) - set(expected)
+                missing, extra = set(expected) - set(files[split]), set(files[split]) - set(expected)
                 self.problems += [f"{part / (stem + '.mat')}: is missing" for stem in sorted(missing)]
-                self.problems += [
-                    f"{placed[split][stem]}: belongs to no sample of this split" for stem in sorted(extra)
-                ]
-        return placed
+                self.problems += [f"{files[split][stem]}: belongs to no sample of this split" for stem in sorted(extra)]
+        return files
 
-    def _raw_scans(self, fringes: Placed) -> dict[str, tuple[Path, ...]]:
+    def _raw_scans(self, fringes: FilesBySplit) -> dict[str, tuple[Path, ...]]:
         root = self.scans
         if root is None:
             return {}
-        known = {stem for split in fringes.values() for stem in split}
+        stems_with_depth = {stem for split in fringes.values() for stem in split}
         scans: dict[str, tuple[Path, ...]] = {}
         for folder in _entries(root):
             if not folder.is_dir():
-                self._extra(folder, "expected one folder an object")
+                self._report_foreign(folder, "expected one folder per object")
                 continue
             for view in _entries(folder):
                 stem = sample_name(folder.name, view.name)
                 if view.name not in VIEWS or not view.is_dir():
-                    self._extra(view, f"expected the folders {', '.join(VIEWS)}")
-                elif stem not in known:
-                    self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no {stem}")
+                    self._report_foreign(view, f"expected the folders {', '.join(VIEWS)}")
+                elif stem not in stems_with_depth:
+                    self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
                 else:
                     scans[stem] = self._frames(view)
         self.problems += [
             f"{root / label[0] / label[1]}: the raw scan is missing"
-            for stem in sorted(known - set(scans)) if (label := label_of(stem))
+            for stem in sorted(stems_with_depth - set(scans)) if (label := label_of(stem))
         ]  # fmt: skip
         return scans
 
@@ -226,49 +231,55 @@ class _Scan:
         present = {entry.name: entry for entry in _entries(folder)}
         self.problems += [f"{folder / name}: is missing" for name in names if name not in present]
         for name in sorted(set(present) - set(names) - set(NOT_STORED)):
-            self._extra(present[name], f"expected {names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
+            self._report_foreign(present[name], f"expected {names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
         return tuple(present[name] for name in names if name in present)
 
     def _samples(
-        self, split: str, pairs: list[tuple[Placed, Placed]], info: Placed, scans: dict[str, tuple[Path, ...]]
+        self,
+        split: str,
+        pairs: list[tuple[FilesBySplit, FilesBySplit]],
+        info: FilesBySplit,
+        scans: dict[str, tuple[Path, ...]],
     ) -> list[PublishedSample]:
-        found = []
+        samples = []
         for stem in pairs[0][0].get(split, {}):
             label = label_of(stem)
             if label is None:
                 continue
-            both = [(fringes.get(split, {}).get(stem), depths.get(split, {}).get(stem)) for fringes, depths in pairs]
-            found.append(
+            files = [(fringes.get(split, {}).get(stem), depths.get(split, {}).get(stem)) for fringes, depths in pairs]
+            samples.append(
                 PublishedSample(
                     stem, *label, split,
-                    tuple(fringe for fringe, _ in both if fringe), tuple(depth for _, depth in both if depth),
+                    tuple(fringe for fringe, _ in files if fringe), tuple(depth for _, depth in files if depth),
                     info.get(split, {}).get(stem), scans.get(stem, ()),
                 )
             )  # fmt: skip
-        return sorted(found, key=lambda sample: (*_place(sample.object), VIEWS.index(sample.view)))
+        return sorted(samples, key=lambda sample: (*_row_order(sample.object), VIEWS.index(sample.view)))
 
     def _objects(self, samples: dict[str, list[PublishedSample]]) -> None:
-        """An object has all its views, in one split."""
-        first: dict[str, dict[str, PublishedSample]] = {}
+        """Report objects that are in two splits or lack views."""
+        first_samples: dict[str, dict[str, PublishedSample]] = {}
         views: dict[str, set[str]] = {}
-        for sample in (sample for found in samples.values() for sample in found):
+        for sample in (sample for split_samples in samples.values() for sample in split_samples):
             views.setdefault(sample.object, set()).add(sample.view)
-            first.setdefault(sample.object, {}).setdefault(sample.split, sample)
-        for name, by_split in first.items():
-            here, *others = (sample.fringes[0] for sample in by_split.values())
-            if others:
-                self.problems.append(f"{here}: object {name} is in two splits, see {', '.join(map(str, others))}")
-        for name, seen in views.items():
-            if missing := [view for view in VIEWS if view not in seen]:
+            first_samples.setdefault(sample.object, {}).setdefault(sample.split, sample)
+        for name, by_split in first_samples.items():
+            first_file, *more_files = (sample.fringes[0] for sample in by_split.values())
+            if more_files:
+                self.problems.append(
+                    f"{first_file}: object {name} is in two splits, see {', '.join(map(str, more_files))}"
+                )
+        for name, object_views in views.items():
+            if missing := [view for view in VIEWS if view not in object_views]:
                 stems = ", ".join(sample_name(name, view) for view in missing)
                 self.problems.append(
-                    f"{next(iter(first[name].values())).fringes[0].parent}: object {name} lacks {stems}"
+                    f"{next(iter(first_samples[name].values())).fringes[0].parent}: object {name} lacks {stems}"
                 )
 
     def _sizes(self, samples: dict[str, list[PublishedSample]]) -> tuple[int, int]:
-        """Image size that most PNG headers say; every other file is a problem."""
+        """Image size of most PNG headers; reports every file of another size."""
         sizes: dict[Path, tuple[int, int]] = {}
-        for sample in (sample for found in samples.values() for sample in found):
+        for sample in (sample for split_samples in samples.values() for sample in split_samples):
             for path in (*sample.fringes, *sample.frames):
                 try:
                     sizes[path] = read_png_header(path).size
@@ -286,11 +297,11 @@ class _Scan:
     def _ignored(self) -> tuple[str, ...]:
         names = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (self.training / name).is_dir()]
         if self.scans:
-            found = (name for name in NOT_STORED if next(self.scans.glob(f"*/*/{name}"), None))
-            names += [f"{RAW_SCANS}/*/*/{name}" for name in found]
+            computed = (name for name in NOT_STORED if next(self.scans.glob(f"*/*/{name}"), None))
+            names += [f"{RAW_SCANS}/*/*/{name}" for name in computed]
         return tuple(names)
 
 
-def _place(name: str) -> tuple[int, str]:
-    """Order of rows: the benchmark's objects in theirs, others after them by name."""
+def _row_order(name: str) -> tuple[int, str]:
+    """Sort key of rows: the benchmark's objects in their order, then all other objects by name."""
     return (OBJECTS.index(name) if name in OBJECTS else len(OBJECTS)), name

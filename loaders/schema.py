@@ -1,15 +1,15 @@
 """The dataset's columns, and the files they live in.
 
-One row per object and view. One column PER FRAME: reading one frame must cost one frame (a stacked column decodes all
-52 to give one). Columns are stored in *groups*, each in files of its own, so that no pixel is stored twice and a
-configuration opens only what it names:
+There is one row per object and view, and one column PER FRAME, so that reading a frame costs a single frame (a stacked
+column would decode all 52). Columns are stored in *groups* of separate files, so that no pixel is stored twice and a
+configuration opens only the files it needs:
 
     data        sample, object, view, split, frame_00, depth, depth_exact, depth_min, depth_max   <split>/data-*.arrow
     horizontal  the other horizontal sinusoids                                     frames/<split>/horizontal-*.arrow
     vertical    the vertical sinusoids                                             frames/<split>/vertical-*.arrow
     codes       Gray code, black, white                                            frames/<split>/codes-*.arrow
 
-The ``data`` group alone is the `single_shot` configuration, and a folder that plain ``datasets`` opens by itself.
+The ``data`` group alone is the `single_shot` configuration, which plain ``datasets`` can open without this package.
 """
 
 import json
@@ -30,25 +30,25 @@ SINGLE_SHOT_FRAME = 0
 
 def stored_groups(sequence: Sequence, stored: str) -> dict[str, tuple[int, ...]]:
     """Column groups of a dataset that stores configuration ``stored``: group name -> frame indices, in file order."""
-    wanted = set(sequence.config(stored))
+    indices = set(sequence.config(stored))
     groups = {
         DATA_GROUP: (SINGLE_SHOT_FRAME,),
         "horizontal": tuple(i for i in sequence.sinusoids("horizontal") if i != SINGLE_SHOT_FRAME),
         "vertical": tuple(sequence.sinusoids("vertical")),
         "codes": tuple(range(2 * sequence.steps, len(sequence))),
     }
-    return {name: frames for name, frames in groups.items() if name == DATA_GROUP or wanted.issuperset(frames)}
+    return {name: frames for name, frames in groups.items() if name == DATA_GROUP or indices.issuperset(frames)}
 
 
 def stored_frames(sequence: Sequence, stored: str) -> tuple[int, ...]:
-    """Frame indices kept on disk, ascending: those of the configuration, and frame 0 always."""
+    """Frame indices on disk, ascending: the frames of the configuration, and always frame 0."""
     return tuple(sorted(i for frames in stored_groups(sequence, stored).values() for i in frames))
 
 
 def available_configs(sequence: Sequence, stored: str) -> tuple[str, ...]:
-    """Configurations that a dataset storing ``stored`` can serve."""
-    have = set(stored_frames(sequence, stored))
-    return tuple(config for config in CONFIGS if have.issuperset(sequence.config(config)))
+    """Configurations that can be read from a dataset storing ``stored``."""
+    available = set(stored_frames(sequence, stored))
+    return tuple(config for config in CONFIGS if available.issuperset(sequence.config(config)))
 
 
 def config_columns(sequence: Sequence, config: str, exact: bool) -> list[str]:
@@ -71,11 +71,11 @@ def _feature(name: str, size: tuple[int, int]) -> dict[str, Any]:
         return {"shape": list(size), "dtype": "float32", "_type": "Array2D"}
     if name.startswith("frame_"):
         return {"shape": list(size), "dtype": "uint8", "_type": "Array2D"}
-    raise DatasetError(f"no column is called {name!r}")
+    raise DatasetError(f"unknown column {name!r}")
 
 
 def group_columns(sequence: Sequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
-    """Column names of one group's files, in order."""
+    """Column names of a group's files, in order."""
     names = [sequence.frames[i].column for i in frames]
     if group != DATA_GROUP:
         return names
@@ -86,7 +86,7 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> "pa.Schema":
     """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``.
 
     Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
-    metadata: a reader that has imported ``datasets`` sees Array2D, any other sees plain lists.
+    metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
     """
     import pyarrow as pa
 

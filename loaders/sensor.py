@@ -1,10 +1,9 @@
-"""The camera's sensor: counter-based noise and 8-bit quantisation, the same bytes whatever is computed when and where.
+"""The camera's sensor: counter-based noise and 8-bit quantisation, the same bytes in any order of computation.
 
 The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit integer hash of the
 pixel number under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles.
-The sum of two normals is normal; it reaches 5.2 sigma and takes 16 million levels, and the tables stay in the
-first-level cache. That is what makes noise cheap (see docs/generating.md) without changing its distribution
-(tests/test_sensor.py).
+The sum of two normals is normal; it reaches 5.2 sigma and has 16 million levels, and the table stays in the first-level
+cache. This makes noise cheap (see docs/generating.md) and keeps its distribution normal (tests/test_sensor.py).
 """
 
 from dataclasses import dataclass
@@ -80,7 +79,7 @@ def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDA
 def quantise(
     signal_grey: NDArray[np.float32], pixels: NDArray[np.uint32], keys: NDArray[np.uint32], noise: Noise
 ) -> NDArray[np.uint8]:
-    """What the sensor reads: signal plus noise, rounded and clipped to 0..255; uint8 of the signal's shape."""
+    """The sensor's grey levels: signal plus noise, rounded and clipped to 0..255; uint8 of the signal's shape."""
     sigma = np.sqrt(_FLOAT(noise.read_variance) + _FLOAT(noise.shot_per_grey) * signal_grey)
     value = signal_grey + sigma * standard_normal(pixels, keys) + _FLOAT(0.5)
     return np.clip(value, _FLOAT(0), _FLOAT(255)).astype(np.uint8)

@@ -1,8 +1,8 @@
-"""The compiled twin of `fpp_ml_bench.loaders.camera`: pattern lookup, shading, noise, quantising, in one pass.
+"""The compiled kernel of `fpp_ml_bench.loaders.camera`: pattern lookup, shading, noise and quantising in one pass.
 
-Pixels are worked off in chunks, and for each chunk all frames: what the frames share (where a pixel reads the pattern,
-how bright it is) is then read from memory once. Each stage is a loop of its own, for simple loops are what the compiler
-turns into vector instructions (2.5 times faster here than one loop that does it all).
+Pixels are processed in chunks, with all frames for each chunk, so that values common to the frames (a pixel's place in
+the pattern, its brightness) are read from memory once. Each stage is a separate loop, because the compiler turns simple
+loops into vector instructions (2.5 times faster here than a single loop with all stages).
 """
 
 import numpy as np
@@ -21,8 +21,9 @@ def expose_kernel(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Expose ``frames`` (k,) at n pixels: row i of ``out`` uint8 (k, n) is frame ``frames[i]``.
 
-    ``light`` float32 (F, L + 1) pattern light along the varying coordinate, ``vertical`` bool (F,) which of the two;
-    per pixel its lookups, ``gain``, ``ambient``, number ``pixels`` uint32; ``keys`` uint32 (k, 2) noise streams.
+    ``light`` float32 (F, L + 1): pattern light along the coordinate in which it varies, u where ``vertical`` bool (F,)
+    is True, else v. Per pixel: indices and weights of the lookup, ``gain``, ``ambient``, pixel number ``pixels``
+    uint32. ``keys`` uint32 (k, 2): noise streams.
     """
     numbers = np.empty(_CHUNK, np.uint32)
     hashes = np.empty(_CHUNK, np.uint32)
@@ -32,8 +33,8 @@ def expose_kernel(  # type: ignore[no-untyped-def]
         # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
         stop = min(start + _CHUNK, pixels.size)
         n = stop - start
-        u_at, u_by = u_index[start:stop], u_weight[start:stop]
-        v_at, v_by = v_index[start:stop], v_weight[start:stop]
+        u_low, u_share = u_index[start:stop], u_weight[start:stop]
+        v_low, v_share = v_index[start:stop], v_weight[start:stop]
         factor, offset, number = gain[start:stop], ambient[start:stop], pixels[start:stop]
         for k in range(n):
             numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
@@ -52,10 +53,10 @@ def expose_kernel(  # type: ignore[no-untyped-def]
             for k in range(n):
                 h = hashes[k]
                 normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
-            at, by = (u_at, u_by) if vertical[frames[row]] else (v_at, v_by)
+            index, weight = (u_low, u_share) if vertical[frames[row]] else (v_low, v_share)
             for k in range(n):
-                low = profile[at[k]]
-                lit[k] = low + by[k] * (profile[at[k] + 1] - low)
+                low = profile[index[k]]
+                lit[k] = low + weight[k] * (profile[index[k] + 1] - low)
             for k in range(n):
                 signal = offset[k] + factor[k] * lit[k]
                 value = signal + np.sqrt(read_variance + shot_per_grey * signal) * normal[k] + np.float32(0.5)

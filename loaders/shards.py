@@ -1,4 +1,4 @@
-"""Writing shards: the rows of a few objects, one Arrow stream file per column group, complete or not at all."""
+"""Writing shards: the rows of a few objects, an Arrow stream file per column group, completely or not at all."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 OBJECTS_PER_SHARD = 4
-"""Four objects are 24 rows: a frame-0 batch of that size no longer notices the file's batch boundaries (measured)."""
+"""Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
 
 
 @dataclass
 class Row:
-    """One sample on its way to disk: frames by index uint8 (H, W), depths float32 (H, W) in mm, what was measured.
+    """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest.
 
-    The memory of its images is free again as soon as the writer asks for the next row.
+    The images' memory may be reused as soon as the writer takes the next row.
     """
 
     sample: str
@@ -53,7 +53,7 @@ class Row:
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """Which samples go into shard ``index`` of ``of`` of a split: (sample, object, view), and the first one's row."""
+    """Samples of shard ``index`` of ``of`` of a split, as (sample, object, view), and the row of the first sample."""
 
     split: str
     index: int
@@ -71,7 +71,7 @@ class ShardPlan:
 
 
 def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> list[ShardPlan]:
-    """Shards of one split from its objects' samples, four objects or a few more each, in the order given."""
+    """Shards of a split from its objects' samples, four objects or a few more each, in the given order."""
     names = list(objects)
     count = max(1, len(names) // OBJECTS_PER_SHARD)
     plans, first_row = [], 0
@@ -83,7 +83,7 @@ def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> l
 
 
 class ShardWriter:
-    """Writes the files of one shard. Rows come in plan order; pixels are copied once, into reused batch buffers."""
+    """Writes the files of a shard. Rows come in plan order; pixels are copied once, into reused batch buffers."""
 
     def __init__(
         self, folder: Path, scratch: Path, plan: ShardPlan, sequence: Sequence, stored: str, exact: bool,
@@ -96,9 +96,9 @@ class ShardWriter:
     def write(
         self, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None
     ) -> tuple[list[ShardFile], list[dict[str, Any]]]:
-        """Write all rows; returns the files and, per row, its labels and measurements. ``row_done`` follows each row.
+        """Write all rows and call ``row_done`` after each; returns the files and, per row, its labels and measurements.
 
-        Raises `BuildError` when the disk is full or can't be written; no unfinished file stays behind.
+        Raises `BuildError` when the disk is full or can't be written; no unfinished file is left.
         """
         import pyarrow as pa
 
@@ -152,20 +152,20 @@ class ShardWriter:
             described = []
             data = _DataBatch(len(self._plan.samples), self._size)
             for row in self._checked(rows):
-                least, greatest = depth_range_mm(row.depth_mm, row.sample)
+                low_mm, high_mm = depth_range_mm(row.depth_mm, row.sample)
                 described.append(
                     {
                         "sample": row.sample,
                         "object": row.object,
                         "view": row.view,
                         "object_px": int(np.count_nonzero(object_mask(row.depth_mm))),
-                        "depth_min_mm": least,
-                        "depth_max_mm": greatest,
+                        "depth_min_mm": low_mm,
+                        "depth_max_mm": high_mm,
                         **row.measured,
                     }
                 )
-                data.add(row, (least, greatest), self._plan.split, self._sequence)
-                # Frames beyond the first leave at once, one row a batch: nothing of them is held.
+                data.add(row, (low_mm, high_mm), self._plan.split, self._sequence)
+                # All frames but the first are written at once, one row per batch, and not held in memory.
                 for group, frames in self._groups.items():
                     if group != DATA_GROUP:
                         images = [self._image(row, index)[None] for index in frames]
@@ -181,8 +181,8 @@ class ShardWriter:
         for planned, _, _ in self._plan.samples:
             row = next(rows, None)
             if row is None or row.sample != planned:
-                came = "nothing" if row is None else f"sample {row.sample!r}"
-                raise BuildError(f"shard {self._plan.name}: expected sample {planned!r}, got {came}")
+                received = "nothing" if row is None else f"sample {row.sample!r}"
+                raise BuildError(f"shard {self._plan.name}: expected sample {planned!r}, got {received}")
             yield row
 
     def _image(self, row: Row, index: int) -> NDArray[np.uint8]:
@@ -190,11 +190,11 @@ class ShardWriter:
 
 
 _buffers: dict[tuple[str, tuple[int, int]], NDArray] = {}
-"""Memory of `_DataBatch`, kept from shard to shard: touching 200 MB of new pages costs more than filling them."""
+"""Memory of `_DataBatch`, reused for all shards: mapping 200 MB of new pages takes longer than filling them."""
 
 
 class _DataBatch:
-    """The one batch of the ``data`` group: labels and copies of frame 0 and the depth maps of all rows of a shard."""
+    """The batch of the ``data`` group: labels and copies of frame 0 and the depth maps of all rows of a shard."""
 
     def __init__(self, rows: int, size: tuple[int, int]) -> None:
         self._rows, self._size, self._filled = rows, size, 0
@@ -207,13 +207,13 @@ class _DataBatch:
         return buffer[: self._rows]
 
     def add(self, row: Row, range_mm: tuple[float, float], split: str, sequence: Sequence) -> None:
-        """Copy what the group holds of a row."""
+        """Copy the columns of the group from a row."""
         values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
         values.update(zip(RANGE, range_mm, strict=True))
         for name, value in values.items():
             self._values.setdefault(name, []).append(value)
-        first = sequence.frames[SINGLE_SHOT_FRAME].column
-        images: dict[str, NDArray] = {first: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
+        first_column = sequence.frames[SINGLE_SHOT_FRAME].column
+        images: dict[str, NDArray] = {first_column: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
         if row.depth_exact_mm is not None:
             images[DEPTH_EXACT] = row.depth_exact_mm
         for column, image in images.items():
@@ -221,7 +221,7 @@ class _DataBatch:
         self._filled += 1
 
     def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
-        """The batch; its images live in the shared buffers until the next shard."""
+        """The batch; its images stay in the shared buffers until the next shard."""
         columns: list[Any] = [
             self._values.get(name) or _buffers[name, self._size][: self._rows] for name in schema.names
         ]
@@ -229,7 +229,7 @@ class _DataBatch:
 
 
 def _checked_image(image: NDArray, size: tuple[int, int], column: str) -> NDArray:
-    """The image, if it is what the column holds: Arrow takes its memory as it is, whatever is in there."""
+    """The image, after a check of shape and dtype: Arrow takes over its memory unchecked."""
     dtype = np.dtype(np.float32 if column in (DEPTH, DEPTH_EXACT) else np.uint8)
     if image.shape != size or image.dtype != dtype:
         raise BuildError(f"column {column}: expected {dtype} {size}, got {image.dtype} {image.shape}")
@@ -237,7 +237,7 @@ def _checked_image(image: NDArray, size: tuple[int, int], column: str) -> NDArra
 
 
 def _record_batch(columns: list[Any], schema: "pa.Schema") -> "pa.RecordBatch":
-    """Columns in the schema's order: images as arrays (rows, H, W), taken without a copy; anything else as lists."""
+    """Columns in the schema's order: images as arrays (rows, H, W), used without a copy; all others as lists."""
     import pyarrow as pa
 
     arrays = [
@@ -264,13 +264,15 @@ def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
 def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
     """Least and greatest depth above 0 of a sample (paper Section 3.3), mm.
 
-    Raises `BuildError` for a map without any, or with a depth that is negative or not finite.
+    Raises `BuildError` for a map without object pixels, or with a depth that is negative or not finite.
     """
     if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
         raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
     inside = depth_mm[object_mask(depth_mm)]
     if inside.size == 0:
-        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm, so there is nothing to measure")
+        raise BuildError(
+            f"sample {sample!r}: its depth map has no pixel above 0 mm; expected an object in the working range"
+        )
     return float(inside.min()), float(inside.max())
 
 

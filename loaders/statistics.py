@@ -1,4 +1,4 @@
-"""What a dataset is like, from what its builder measured: cover, depth range, ground-truth uncertainty per split."""
+"""Statistics of a dataset from its builder's measurements: cover, depth range, ground-truth uncertainty per split."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,10 +10,11 @@ from fpp_ml_bench.loaders.manifest import Manifest
 
 @dataclass(frozen=True)
 class SplitStatistics:
-    """One split; lengths in mm, shares of 1, None where a dataset has no exact depth.
+    """Statistics of a split; lengths in mm, shares from 0 to 1, None where a dataset has no exact depth.
 
-    ``gt_mae_mm`` and ``gt_rmse_mm`` are the ground truth's own uncertainty: decoded against exact depth, averaged over
-    samples like every score, over all object pixels and over those 3 px or more from a depth edge.
+    ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact depth over all
+    object pixels, averaged over samples like every score. ``gt_interior_*``: the same over object pixels 3 px or more
+    from depth edges.
     """
 
     split: str
@@ -33,7 +34,7 @@ class SplitStatistics:
 
 
 def split_statistics(manifest: Manifest) -> list[SplitStatistics]:
-    """Statistics of each split that the manifest has rows for."""
+    """Statistics of each split that has rows in the manifest."""
     return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
 
 
@@ -72,7 +73,7 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> SplitS
 
 
 def ground_truth_summary(manifest: Manifest) -> list[str]:
-    """One sentence a split on how far the decoded ground truth is from the exact depth; none for imported data."""
+    """A sentence per split on the error of the decoded ground truth against the exact depth; none for imported data."""
     return [
         f"{s.split}: ground truth within {s.gt_mae_mm:.3f} mm MAE, {s.gt_rmse_mm:.3f} mm RMSE of the exact depth "
         f"({s.gt_interior_mae_mm:.3f} mm 3 px or more from depth edges); {100 * s.undecoded_share:.2f}% of object "

@@ -1,6 +1,6 @@
-"""Reading a dataset folder by memory map: zero-copy views of single images, with nothing but NumPy and pyarrow loaded.
+"""Reading a dataset folder by memory map: views of single images without a copy; needs only NumPy and pyarrow.
 
-This is what the evaluator, the classical method, the torch dataset and the pictures read through.
+The evaluator, the classical method, the torch dataset and the pictures read datasets through this module.
 `fpp_ml_bench.load_dataset` opens the same files as a ``datasets.Dataset``.
 """
 
@@ -29,20 +29,22 @@ ALL_SPLITS = "all"
 class DatasetFolder:
     """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
 
-    Images come out as read-only memory-mapped views: a frame costs what is read of it. Instances pickle by path, so
-    worker processes map the files anew.
+    Images are read-only memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker
+    processes map the files themselves.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._hold(Path(path), read_manifest(Path(path)))
+        self._attach(Path(path), read_manifest(Path(path)))
         for shard in self.manifest.shards:
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
             if size != shard.bytes:
-                came = "it is missing" if size is None else f"it has {size}"
-                raise DatasetError(f"{file}: expected {shard.bytes} bytes, {came}; build or copy the dataset again")
+                found_size = "it is missing" if size is None else f"it has {size}"
+                raise DatasetError(
+                    f"{file}: expected {shard.bytes} bytes, {found_size}; build or copy the dataset again"
+                )
 
-    def _hold(self, path: Path, manifest: Manifest) -> None:
+    def _attach(self, path: Path, manifest: Manifest) -> None:
         self.path = path
         self.manifest = manifest
         self._batches: dict[str, list[pa.RecordBatch]] = {}
@@ -51,13 +53,13 @@ class DatasetFolder:
 
     @classmethod
     def unchecked(cls, path: Path, manifest: Manifest) -> "DatasetFolder":
-        """The folder opened although some of its files may be missing; for `fpp_ml_bench.loaders.verify`."""
-        opened = cls.__new__(cls)
-        opened._hold(path, manifest)
-        return opened
+        """Open the folder even if some of its files are missing; for `fpp_ml_bench.loaders.verify`."""
+        dataset = cls.__new__(cls)
+        dataset._attach(path, manifest)
+        return dataset
 
     def forget(self, shard: ShardFile) -> None:
-        """Let go of the maps of one file."""
+        """Close the memory maps of a file."""
         self._batches.pop(shard.path, None)
         self._maps.pop(shard.path, None)
         for key in [key for key in self._images if key[0] == shard.path]:
@@ -94,7 +96,7 @@ class DatasetFolder:
 
     @property
     def has_exact(self) -> bool:
-        """Whether ``depth_exact`` is known (generated data; published data has decoded depth only)."""
+        """Whether the dataset has ``depth_exact`` (generated data; published data has decoded depth only)."""
         return self.manifest.exact
 
     @cached_property
@@ -103,11 +105,11 @@ class DatasetFolder:
         return self.manifest.splits
 
     @cached_property
-    def _place(self) -> dict[str, tuple[str, int]]:
+    def _position(self) -> dict[str, tuple[str, int]]:
         return {sample: (split, row) for split, names in self.splits.items() for row, sample in enumerate(names)}
 
     def samples(self, split: str) -> list[str]:
-        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError` for another name."""
+        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError` for other names."""
         if split == ALL_SPLITS:
             return [name for part in SPLITS for name in self.splits.get(part, [])]
         if split not in self.splits:
@@ -119,32 +121,33 @@ class DatasetFolder:
         return self._find(sample)[0]
 
     def measured(self, sample: str) -> dict:
-        """What the builder measured of a sample: labels, cover, distance, ground-truth error where known."""
+        """The builder's measurements of a sample: labels, cover, distance, and the ground-truth error if available."""
         split, row = self._find(sample)
         return self.manifest.samples[split][row]
 
     def _find(self, sample: str) -> tuple[str, int]:
-        if sample not in self._place:
+        if sample not in self._position:
             from difflib import get_close_matches
 
-            near = get_close_matches(sample, self._place, n=3)
-            hint = f"; near it: {', '.join(near)}" if near else ""
+            matches = get_close_matches(sample, self._position, n=3)
+            hint = f"; similar names: {', '.join(matches)}" if matches else ""
             raise DatasetError(f"{self.path}: no sample {sample!r}{hint}")
-        return self._place[sample]
+        return self._position[sample]
 
     def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` where known."""
+        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` if stored."""
         if column not in (DEPTH, DEPTH_EXACT):
-            raise DatasetError(f"no depth column is called {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
+            raise DatasetError(f"unknown depth column {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
         if column == DEPTH_EXACT and not self.has_exact:
             raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
         return self._image(sample, DATA_GROUP, column)
 
     def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """What a prediction is scored against, float32 (H, W) in mm, 0 = background.
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
 
-        The object is the same set of pixels for either column, those with a decoded ``depth``: a surface that the
-        projector does not reach has no ground truth in this benchmark. ``depth_exact`` only gives them exact values.
+        The object is the same set of pixels for either column, the pixels with a decoded ``depth``: a surface that the
+        projector does not reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same
+        pixels.
         """
         depth_mm = self.depth_mm(sample)
         if column == DEPTH:
@@ -162,33 +165,33 @@ class DatasetFolder:
         )
 
     def frames(self, sample: str, indices: "tuple[int, ...] | range | list[int]") -> list[NDArray[np.uint8]]:
-        """Several frames of a sample, each uint8 (H, W), in the order asked."""
+        """Several frames of a sample, each uint8 (H, W), in the order of ``indices``."""
         return [self.frame(sample, index) for index in indices]
 
     def release(self, sample: str) -> None:
-        """Let go of the memory of a sample's images, those that were read. Views of them stay valid.
+        """Release the memory of a sample's images that were read. Views of them stay valid.
 
-        Whoever goes through a split calls it after each sample, and his memory does not grow with their number.
+        Called after each sample of a split, it keeps the memory from growing with the number of samples.
         """
-        from fpp_ml_bench.loaders.mapped_pages import let_go
+        from fpp_ml_bench.loaders.mapped_pages import release_pages
 
         split, row = self._find(sample)
         for shard in self.manifest.shards:
-            whole = self._maps.get(shard.path)
-            if whole is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
+            mapped_file = self._maps.get(shard.path)
+            if mapped_file is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
                 continue
             for column in self.record_batches(shard)[0].schema.names:
                 if (shard.path, column) in self._images:
-                    let_go(self._row_of(shard, column, row), whole.address, whole.size)
+                    release_pages(self._row_of(shard, column, row), mapped_file.address, mapped_file.size)
             if row - shard.first_row == shard.rows - 1:
-                self.forget(shard)  # what stands between its images stays mapped as long as the file is
+                self.forget(shard)  # pages between its images stay mapped as long as the file is
 
     def _image(self, sample: str, group: str, column: str) -> NDArray:
         split, row = self._find(sample)
         return self._row_of(self._shard(split, group, row), column, row)
 
     def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
-        """Image of row ``row`` of the split in one of its files."""
+        """Image of row ``row`` of the split, from the file that holds it."""
         row -= shard.first_row
         for images in self.column_images(shard, column):
             if row < len(images):
@@ -203,22 +206,22 @@ class DatasetFolder:
         raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
 
     def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
-        """Record batches of one file, memory-mapped."""
+        """Record batches of a file, memory-mapped."""
         if shard.path not in self._batches:
             import pyarrow as pa
 
             path = self.path / shard.path
             try:
-                mapped = pa.memory_map(str(path), "r")
-                whole = mapped.read_buffer()
-                self._batches[shard.path] = list(pa.ipc.open_stream(whole))
-                self._maps[shard.path] = whole
+                memory_map = pa.memory_map(str(path), "r")
+                mapped_file = memory_map.read_buffer()
+                self._batches[shard.path] = list(pa.ipc.open_stream(mapped_file))
+                self._maps[shard.path] = mapped_file
             except (pa.ArrowException, OSError) as error:
                 raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
         return self._batches[shard.path]
 
     def column_images(self, shard: ShardFile, column: str) -> list[NDArray]:
-        """A column of one file as images: per record batch one read-only view (rows, H, W)."""
+        """A column of a file as images: a read-only view (rows, H, W) per record batch."""
         key = shard.path, column
         if key not in self._images:
             try:

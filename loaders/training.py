@@ -1,4 +1,4 @@
-"""Training samples as torch tensors: one fringe image in, one depth map out, in the representation of your choice."""
+"""Training samples as torch tensors: pairs of a fringe image and a depth map in a chosen representation."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,10 +19,11 @@ from fpp_ml_bench.pixel_sets import object_mask
 
 
 class FringeDepth(NamedTuple):
-    """One training sample, or a batch of them with a leading axis B.
+    """A training sample, or a batch of samples with a leading axis B.
 
     ``fringe`` float32 (1, H, W) in [0, 1]; ``depth`` float32 (1, H, W) in the chosen representation, 0 = background;
-    ``depth_range_mm`` float32 (2,), D_min and D_max of the sample; ``row`` and ``frame`` int64, where it came from.
+    ``depth_range_mm`` float32 (2,), D_min and D_max of the sample; ``row`` and ``frame`` int64, the sample's row in
+    the split and the frame index.
     """
 
     fringe: torch.Tensor
@@ -33,22 +34,22 @@ class FringeDepth(NamedTuple):
 
 
 class FringeDepthDataset(Dataset[FringeDepth]):
-    """Pairs of one frame and the depth map of its sample (paper Sections 3.3 and 5.4).
+    """Pairs of a frame and the depth map of its sample (paper Sections 3.3 and 5.4).
 
     Parameters
     ----------
     folder : dataset folder.
     split : ``train``, ``validation`` or ``test``.
-    config : which frames are samples of their own: ``single_shot`` (frame 0), ``horizontal``, ``vertical``,
+    config : the frames that form pairs: ``single_shot`` (frame 0), ``horizontal``, ``vertical``,
         ``sinusoidal`` or ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
     normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] per sample, from its own D_min and D_max; a
         flat sample is 0 throughout). See `fpp_ml_bench.normalisation`.
     background_removed : set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
 
-    Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. `batches` is the
-    fast way on one process, with buffers that are reused.
+    Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. In a single
+    process `batches` is faster, as it reuses its buffers.
 
-    Raises `DatasetError` for a folder, split or configuration that is not there.
+    Raises `DatasetError` for a missing folder, split or configuration.
     """
 
     def __init__(
@@ -72,30 +73,30 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         """Row and frame of item ``index``: all frames of a row, then the next row."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"item {index} of {len(self)}")
-        row, place = divmod(index % len(self), len(self.frames))
-        return row, self.frames[place]
+        row, position = divmod(index % len(self), len(self.frames))
+        return row, self.frames[position]
 
     def __getitem__(self, index: int) -> FringeDepth:
         return FringeDepth(*(tensor[0] for tensor in self.read([index])))
 
     def read(self, indices: Sequence[int], out: FringeDepth | None = None) -> FringeDepth:
-        """Items ``indices`` as one batch, fringe and depth (B, 1, H, W); into ``out``, of the same B, if given."""
+        """Items ``indices`` as a batch, fringe and depth (B, 1, H, W); into ``out``, of the same B, if given."""
         batch = self.empty(len(indices)) if out is None else out
         if len(batch.fringe) != len(indices):
             raise ValueError(f"out holds {len(batch.fringe)} items, expected {len(indices)}, one for each index")
         fringes, depths = batch.fringe.numpy(), batch.depth.numpy()
-        for place, index in enumerate(indices):
+        for position, index in enumerate(indices):
             row, frame = self.pair(index)
             sample = self.samples[row]
             depth_mm = self.source.depth_mm(sample)
             measured = self.source.measured(sample)
             low, high = measured["depth_min_mm"], measured["depth_max_mm"]
-            unit_range(self.source.frame(sample, frame), fringes[place, 0])
+            unit_range(self.source.frame(sample, frame), fringes[position, 0])
             if self.background_removed:
-                fringes[place, 0] *= object_mask(depth_mm)
-            normalise(depth_mm, self.normalisation, low, high, out=depths[place, 0])
-            batch.depth_range_mm[place, 0], batch.depth_range_mm[place, 1] = low, high
-            batch.row[place], batch.frame[place] = row, frame
+                fringes[position, 0] *= object_mask(depth_mm)
+            normalise(depth_mm, self.normalisation, low, high, out=depths[position, 0])
+            batch.depth_range_mm[position, 0], batch.depth_range_mm[position, 1] = low, high
+            batch.row[position], batch.frame[position] = row, frame
         return batch
 
     def empty(self, size: int) -> FringeDepth:
@@ -109,8 +110,8 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     def batches(self, size: int, order: Sequence[int] | None = None) -> Iterator[FringeDepth]:
         """Batches of ``size`` items (the last may be smaller) in ``order``, default ascending.
 
-        The tensors are views of one buffer that the next batch overwrites: copy what must outlive the step (moving a
-        batch to a GPU does).
+        The tensors are views of a buffer that the next batch overwrites: copy data that is needed longer (moving a
+        batch to a GPU copies it).
         """
         order = range(len(self)) if order is None else order
         buffer = self.empty(size)
@@ -120,7 +121,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
 
 
 def unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
-    """Grey levels / 255 into ``out``: one product with the float32 reciprocal, within one unit in the last place."""
+    """Grey levels / 255 into ``out``: a product with the float32 reciprocal, within 1 unit in the last place."""
     factor = np.float32(1 / GREY_LEVELS)
     if numba_enabled():
         from fpp_ml_bench.loaders.training_kernel import scale_kernel

@@ -1,4 +1,4 @@
-"""Grey levels to [0, 1] in one pass over memory; the NumPy twin is in `fpp_ml_bench.loaders.training`."""
+"""Grey levels to [0, 1] in one pass over memory; the NumPy version is in `fpp_ml_bench.loaders.training`."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What several test files share: Hugging Face caches out of the way, and one tiny real dataset, built once."""
+"""Shared by all tests: separate Hugging Face caches, and a tiny real dataset that is built once."""
 
 import os
 import tempfile
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-# Before anything imports `datasets`: its caches belong to this run, and it must not look for a network.
+# Before `datasets` is imported: it gets caches for this run only, and must not use the network.
 _CACHE = tempfile.TemporaryDirectory(prefix="fpp-bench-tests-")
 os.environ["HF_HOME"] = _CACHE.name
 os.environ["HF_DATASETS_CACHE"] = str(Path(_CACHE.name) / "datasets")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["HF_HUB_DISABLE_TELEMETRY"] = "1"
-# pytest-xdist's workers have a width of their own, and share the cores: one thread of torch's each.
+# pytest-xdist's workers have their own terminal width, and share the cores: one torch thread each.
 os.environ.pop("COLUMNS", None)
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -20,11 +20,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 TINY_SIZE = 176
 """The smallest size at pitch 18 is about 170 px."""
 TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
-"""Two objects of one split, so that a shard holds more than one; and one of each other split."""
+"""Two objects of the training split, so that a shard holds two, and one object of each other split."""
 
 
 def tiny_settings(**changes):
-    """Settings of the tiny dataset, or of one that differs from it in ``changes``."""
+    """Settings of the tiny dataset, with ``changes``."""
     from fpp_ml_bench.loaders.settings import BuildSettings
     from fpp_ml_bench.rig import paper_rig
 
@@ -32,14 +32,14 @@ def tiny_settings(**changes):
 
 
 def file_bytes(folder):
-    """Every file below a folder by its relative path."""
+    """Content of all files below a folder, by relative path."""
     folder = Path(folder)
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
-    """Folder of the tiny dataset, all 52 frames, on one process. Shared by all tests: copy it before changing it."""
+    """Folder of the tiny dataset, all 52 frames. Shared by all tests: copy it before changing it."""
     from fpp_ml_bench.loaders.build import build
 
     folder = tmp_path_factory.mktemp("tiny") / "dataset"

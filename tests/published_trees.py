@@ -1,4 +1,4 @@
-"""Small published trees on disk: real PNG by OpenCV, real .mat by SciPy and h5py, none through our own writers."""
+"""Small published trees on disk: PNG by OpenCV, .mat by SciPy and h5py, none by this package's writers."""
 
 import io
 import zlib
@@ -11,7 +11,7 @@ import scipy.io
 
 SIZE = (24, 24)
 SPLITS = {"train": ("bowl",), "val": ("mug",), "test": ("power_drill", "my_own_part")}
-"""Published folder names, and an object that is none of the benchmark's 50."""
+"""Published folder names, and an object that is not among the benchmark's 50."""
 VIEWS = ("A0", "A60", "A120", "A180", "A240", "A300")
 FOLDERS = {
     "raw": "training_data_depth_raw",
@@ -62,7 +62,7 @@ def v73_bytes(**values):
 
 
 def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
-    """A training tree in which every rule holds; ``info`` defaults to what the variants need."""
+    """A valid training tree; ``info`` (depth ranges) is written by default if a variant needs it."""
     for split, objects in splits.items():
         for stem in (f"{name}_{view}" for name in objects for view in VIEWS):
             depth = depth_of(stem, size)

@@ -1,4 +1,4 @@
-"""Datasets of noise in milliseconds: real files through the real writer, of any objects and splits."""
+"""Datasets of noise, made in milliseconds by the real writer, of any objects and splits."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_dri
 
 @dataclass(frozen=True)
 class SyntheticShard:
-    """Rows of noise, one seed a sample; ``same`` gives a sample the frame of another one."""
+    """Rows of noise, a seed per sample; ``same`` gives a sample the frame of another, ``spoil`` a wrong depth."""
 
     same: tuple[tuple[str, str], ...] = ()
     spoil: tuple[str, float] | None = None

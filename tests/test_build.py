@@ -1,4 +1,4 @@
-"""Building: the same bytes whatever the order, the workers or what else is stored, and settings that are refused."""
+"""Building: the same bytes for any order of objects and number of workers, and settings that are refused."""
 
 import json
 from dataclasses import replace
@@ -20,39 +20,39 @@ from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.rig import paper_rig
 
 
-def same_bytes(one, other):
-    names = sorted(set(one) | set(other))
-    return [name for name in names if one.get(name) != other.get(name)]
+def differing_files(files, other_files):
+    names = sorted(set(files) | set(other_files))
+    return [name for name in names if files.get(name) != other_files.get(name)]
 
 
 def test_two_workers_and_another_order_of_objects_give_the_same_bytes_in_every_file(tiny, tmp_path):
     settings = tiny_settings(objects=tuple(reversed(TINY_OBJECTS)))
     reported = []
     build(tmp_path / "again", settings, workers=2, progress=reported.append)
-    assert same_bytes(file_bytes(tiny), file_bytes(tmp_path / "again")) == []
+    assert differing_files(file_bytes(tiny), file_bytes(tmp_path / "again")) == []
     assert sum(reported) == 24 and min(reported) >= 0
 
 
 def test_storing_one_frame_keeps_the_bytes_of_frame_and_depth(opened, tmp_path):
     build(tmp_path / "one", tiny_settings(objects=("cork",), stored="single_shot"), workers=1)
-    one = DatasetFolder(tmp_path / "one")
-    assert one.configs == ("single_shot",)
-    for sample in one.samples("train"):
-        np.testing.assert_array_equal(one.frame(sample, 0), opened.frame(sample, 0))
-        np.testing.assert_array_equal(one.depth_mm(sample), opened.depth_mm(sample))
-        np.testing.assert_array_equal(one.depth_mm(sample, "depth_exact"), opened.depth_mm(sample, "depth_exact"))
-        assert one.measured(sample) == opened.measured(sample)
+    dataset = DatasetFolder(tmp_path / "one")
+    assert dataset.configs == ("single_shot",)
+    for sample in dataset.samples("train"):
+        np.testing.assert_array_equal(dataset.frame(sample, 0), opened.frame(sample, 0))
+        np.testing.assert_array_equal(dataset.depth_mm(sample), opened.depth_mm(sample))
+        np.testing.assert_array_equal(dataset.depth_mm(sample, "depth_exact"), opened.depth_mm(sample, "depth_exact"))
+        assert dataset.measured(sample) == opened.measured(sample)
 
 
 @pytest.mark.parametrize("change", [{"seed": 43}, {"noise_sigma_grey": 2.0}, {"placement": "varied"}])
 def test_what_decides_the_bytes_changes_them(opened, tmp_path, change):
     build(tmp_path / "other", tiny_settings(objects=("cork",), stored="single_shot", **change), workers=1)
-    other = DatasetFolder(tmp_path / "other")
-    assert other.fingerprint != opened.fingerprint
-    for sample in other.samples("train"):
-        differing = (other.frame(sample, 0) != opened.frame(sample, 0)).mean()
+    dataset = DatasetFolder(tmp_path / "other")
+    assert dataset.fingerprint != opened.fingerprint
+    for sample in dataset.samples("train"):
+        differing = (dataset.frame(sample, 0) != opened.frame(sample, 0)).mean()
         assert differing > (0.02 if "placement" in change else 0.2)  # elsewhere background and noise are the same
-        moved = (other.depth_mm(sample, "depth_exact") != opened.depth_mm(sample, "depth_exact")).any()
+        moved = (dataset.depth_mm(sample, "depth_exact") != opened.depth_mm(sample, "depth_exact")).any()
         assert moved == ("placement" in change)
 
 
@@ -91,12 +91,12 @@ def test_users_mesh_goes_the_same_way(tmp_path):
     mesh = single_mesh(path)
     settings = BuildSettings(paper_rig(TINY_SIZE), (mesh.name,), stored="single_shot", user_meshes=(mesh,))
     build(tmp_path / "set", settings, workers=1)
-    opened = DatasetFolder(tmp_path / "set")
-    assert opened.splits == {"test": [f"my_part_{view}" for view in VIEWS]}
-    for sample in opened.samples("all"):
-        exact = opened.depth_mm(sample, "depth_exact")
+    dataset = DatasetFolder(tmp_path / "set")
+    assert dataset.splits == {"test": [f"my_part_{view}" for view in VIEWS]}
+    for sample in dataset.samples("all"):
+        exact = dataset.depth_mm(sample, "depth_exact")
         assert exact[exact > 0].min() == pytest.approx(1700, abs=0.5)
-    # Nothing of the machine gets into the dataset, and a changed mesh is another dataset.
+    # No path of the machine gets into the dataset, and a changed mesh makes another dataset.
     assert str(tmp_path) not in (tmp_path / "set" / "manifest.json").read_text()
     trimesh.creation.icosphere(3, 0.11).export(path)
     with pytest.raises(BuildError, match="user_meshes"):
@@ -109,7 +109,7 @@ def test_object_that_does_not_fit_ends_the_build_by_name(tmp_path):
     mesh = single_mesh(path)
     settings = BuildSettings(paper_rig(TINY_SIZE), ("cork", "huge"), user_meshes=(mesh,), stored="single_shot")
     with pytest.raises(MeshError, match=r"'huge'.*scale it"):
-        build(tmp_path / "set", settings, workers=2)  # through a worker process, and whole when it arrives
+        build(tmp_path / "set", settings, workers=2)  # through a worker process, with the whole message
 
 
 # ---- plans and presets
@@ -132,8 +132,8 @@ def test_full_preset_is_the_papers_set():
     assert len(frames) * sum(rows.values()) == 15_600
     assert assembly.bytes_per_row == 960 * 960 * (52 + 8)
     for split in SPLITS:
-        firsts = [(p.first_row, len(p.samples)) for p in assembly.plans if p.split == split]
-        assert [first for first, _ in firsts] == list(np.cumsum([0, *(n for _, n in firsts)])[:-1])
+        shards = [(p.first_row, len(p.samples)) for p in assembly.plans if p.split == split]
+        assert [first_row for first_row, _ in shards] == list(np.cumsum([0, *(count for _, count in shards)])[:-1])
     assert min(len(p.samples) for p in assembly.plans) >= 24  # rows of a record batch: hub.md
 
 
@@ -155,8 +155,8 @@ def test_mini_preset_has_every_split():
 )
 def test_groups_hold_every_frame_once(stored, count, configs):
     groups = stored_groups(PAPER_SEQUENCE, stored)
-    held = [frame for frames in groups.values() for frame in frames]
-    assert len(held) == len(set(held)) == count and 0 in held
+    stored_indices = [frame for frames in groups.values() for frame in frames]
+    assert len(stored_indices) == len(set(stored_indices)) == count and 0 in stored_indices
     assert set(available_configs(PAPER_SEQUENCE, stored)) == configs
 
 
@@ -164,7 +164,7 @@ def test_groups_hold_every_frame_once(stored, count, configs):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"objects": ()}, "no object"),
         ({"objects": ("mugg",)}, "did you mean mug"),
@@ -178,8 +178,8 @@ def test_groups_hold_every_frame_once(stored, count, configs):
         ({"noise_sigma_grey": 51}, "0 to 50"),
     ],
 )
-def test_bad_settings(change, says):
-    with pytest.raises(BuildError, match=says):
+def test_bad_settings(change, message):
+    with pytest.raises(BuildError, match=message):
         tiny_settings(**change)
 
 
@@ -190,10 +190,10 @@ def test_settings_are_in_one_order_whatever_was_given(tmp_path):
         trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
         meshes.append(single_mesh(path))
     objects = ("zeta", "mug", "alpha", "bowl")
-    one = tiny_settings(objects=objects, user_meshes=tuple(meshes))
-    other = tiny_settings(objects=objects[::-1], user_meshes=tuple(meshes[::-1]))
-    assert one == other and one.describe() == other.describe()
-    assert one.objects == ("bowl", "mug", "alpha", "zeta")
+    settings = tiny_settings(objects=objects, user_meshes=tuple(meshes))
+    reversed_settings = tiny_settings(objects=objects[::-1], user_meshes=tuple(meshes[::-1]))
+    assert settings == reversed_settings and settings.describe() == reversed_settings.describe()
+    assert settings.objects == ("bowl", "mug", "alpha", "zeta")
 
 
 # ---- the writer
@@ -210,18 +210,19 @@ def write(tmp_path, rows):
 
 
 @pytest.mark.parametrize(
-    ("value", "says"), [(np.nan, "not finite"), (np.inf, "not finite"), (-1.0, "negative"), (0.0, "no pixel above 0")]
+    ("value", "message"),
+    [(np.nan, "not finite"), (np.inf, "not finite"), (-1.0, "negative"), (0.0, "no pixel above 0")],
 )
-def test_writer_takes_no_bad_depth(tmp_path, value, says):
+def test_writer_takes_no_bad_depth(tmp_path, value, message):
     depth = np.full((8, 6), 1800 if value else 0, np.float32)
     depth[3, 3] = value
-    with pytest.raises(BuildError, match=rf"bowl_A0.*{says}"):
+    with pytest.raises(BuildError, match=rf"bowl_A0.*{message}"):
         write(tmp_path, [row(depth=depth)])
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"),
+    ("rows", "message"),
     [
         ([], "expected sample 'bowl_A0', got nothing"),
         ([row("bowl_A60")], "expected sample 'bowl_A0', got sample 'bowl_A60'"),
@@ -230,7 +231,7 @@ def test_writer_takes_no_bad_depth(tmp_path, value, says):
         ([row(depth=np.full((8, 6), 1800.0))], r"depth: expected float32 \(8, 6\), got float64"),
     ],
 )
-def test_writer_takes_no_other_rows(tmp_path, rows, says):
-    with pytest.raises(BuildError, match=says):
+def test_writer_takes_no_other_rows(tmp_path, rows, message):
+    with pytest.raises(BuildError, match=message):
         write(tmp_path, rows)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]

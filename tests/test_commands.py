@@ -1,4 +1,4 @@
-"""The command line: quick help, bad input without a traceback, output that machines and people can use."""
+"""The command line: quick help, bad input without a traceback, output for machines and people."""
 
 import json
 import os
@@ -21,7 +21,7 @@ HEAVY = ("numpy", "torch", "datasets", "pyarrow", "scipy", "cv2", "numba", "matp
 
 
 def call(*arguments, command=main):
-    """Exit status of a command run in this process; anything but a clean end is raised."""
+    """Exit status of a command run in this process; unexpected errors are raised."""
     try:
         return command([str(a) for a in arguments])
     except SystemExit as stop:
@@ -71,7 +71,7 @@ def test_every_command_of_the_table_has_what_a_command_needs():
 
 
 def test_examples_in_the_help_are_accepted_by_their_parsers():
-    """Every example line of every command parses: help promises nothing that the command does not know."""
+    """All examples of all commands are parsed: the help shows no option that a command lacks."""
     import shlex
     from importlib import import_module
 
@@ -92,7 +92,7 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["bild"], "did you mean 'build'"),
         (["xyz"], "unknown command 'xyz'"),
@@ -134,9 +134,9 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["info", "."], "no manifest.json"),
         (["verify", "OUT"], "no such folder"),
         (["verify", "FILE"], "no such folder"),
-        (["show", "TINY"], "name one SAMPLE, or ask for --sheet"),
-        (["show", "TINY", "mug_A0", "--sheet"], "name one SAMPLE, or ask for --sheet"),
-        (["show", "TINY", "mug_A1", "--out", "x.png"], "near it: mug_A"),
+        (["show", "TINY"], "expected either a SAMPLE or --sheet"),
+        (["show", "TINY", "mug_A0", "--sheet"], "expected either a SAMPLE or --sheet"),
+        (["show", "TINY", "mug_A1", "--out", "x.png"], "similar names: mug_A"),
         (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
         (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
         (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
@@ -156,14 +156,14 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"], "--rate is an option of phase-net"),
     ],
 )
-def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, says):
+def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     for name in ("FILE", "FILE.txt"):
         Path(name).write_text("x")
     before = sorted(tmp_path.iterdir())
     assert call(*[str(tiny) if a == "TINY" else a for a in arguments]) == 2
     captured = capsys.readouterr()
-    assert says in captured.err and "Traceback" not in captured.err
+    assert message in captured.err and "Traceback" not in captured.err
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -216,8 +216,8 @@ def test_info_json_says_what_is_there(tiny, opened, capsys):
         errors, covers = [], []
         for sample in names:
             depth, exact = (opened.depth_mm(sample, c).astype(np.float64) for c in ("depth", "depth_exact"))
-            both = (depth > 0) & (exact > 0)
-            errors.append(np.abs(depth - exact)[both].mean())
+            decoded = (depth > 0) & (exact > 0)
+            errors.append(np.abs(depth - exact)[decoded].mean())
             covers.append((depth > 0).mean())
         assert split["samples"] == len(names)
         assert split["gt_mae_mm"] == pytest.approx(np.mean(errors), rel=1e-9)
@@ -296,15 +296,15 @@ def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
     sheet = cv2.imread(str(out), cv2.IMREAD_GRAYSCALE)
     tile, label = 120, 18
     assert sheet.shape == (2 * (tile + label), 2 * 6 * tile + 8)
-    for place, name in enumerate(("bowl", "cork", "mug", "power_drill")):
-        for number, view in enumerate(VIEWS):
-            top, left = (place // 2) * (tile + label) + label, (place % 2) * (6 * tile + 8) + number * tile
-            shown = sheet[top : top + tile, left : left + tile].astype(float)
+    for number, name in enumerate(("bowl", "cork", "mug", "power_drill")):
+        for view_number, view in enumerate(VIEWS):
+            y, x = (number // 2) * (tile + label) + label, (number % 2) * (6 * tile + 8) + view_number * tile
+            shown = sheet[y : y + tile, x : x + tile].astype(float)
             frame = cv2.resize(opened.frame(f"{name}_{view}", 51), (tile, tile), interpolation=cv2.INTER_AREA)
             assert np.corrcoef(shown.ravel(), frame.astype(float).ravel())[0, 1] > 0.99
 
 
-# ---- the chain of the README, and a mesh of the user's
+# ---- the chain of commands in the README, with a user's mesh
 
 
 def test_build_predict_and_evaluate_with_a_users_mesh(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The decoder as a whole: a simulated capture in, depth and reasons out, compiled and in NumPy."""
+"""The whole decoder: depth and reasons of simulated captures, compiled and in NumPy."""
 
 import subprocess
 import sys
@@ -25,12 +25,15 @@ MODULATION = 0.45 * 127.5
 def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):
     """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8 bits."""
     x, y = rig.camera.rays()
-    u, v = (m.astype(np.float32) for m in rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1)))
+    u, v = (
+        coordinates.astype(np.float32)
+        for coordinates in rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1))
+    )
     rng = np.random.default_rng(seed)
     frames = []
     for index in range(len(rig.sequence)):
-        seen = cv2.remap(pattern_image(rig, index).astype(np.float32), u, v, cv2.INTER_LINEAR)
-        image = ambient + albedo * seen + noise * rng.standard_normal(seen.shape)
+        pattern = cv2.remap(pattern_image(rig, index).astype(np.float32), u, v, cv2.INTER_LINEAR)
+        image = ambient + albedo * pattern + noise * rng.standard_normal(pattern.shape)
         frames.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     return frames
 
@@ -59,19 +62,19 @@ NEEDS_NUMBA = pytest.mark.skipif(not numba_enabled(), reason="numba is not in us
 @pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
 def test_depth_error_is_the_noise_it_must_have(rig, direction):
     depth = tilted(rig)
-    found = decode_stack(capture(rig, depth), rig, direction)
+    decoded = decode_stack(capture(rig, depth), rig, direction)
     x, y = rig.camera.rays()
     u, v = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
-    # Two px inside the pattern, which leaves out the interpolation with the dark beyond its border.
+    # 2 px inside the pattern, to exclude interpolation with the dark outside its border.
     good = (np.abs(u - (rig.projector.width - 1) / 2) < (rig.projector.width - 1) / 2 - 2) & (
         np.abs(v - (rig.projector.height - 1) / 2) < (rig.projector.height - 1) / 2 - 2
     )
-    assert good.mean() > 0.8 and (found.reason[good] == Reason.DECODED).all() and found.depth_mm.dtype == np.float32
+    assert good.mean() > 0.8 and (decoded.reason[good] == Reason.DECODED).all() and decoded.depth_mm.dtype == np.float32
     steps = rig.sequence.steps
     # Noise of one grey level and the variance of rounding, 1/12.
     predicted = depth_noise_mm(rig, depth * 1000, direction, steps, MODULATION, np.sqrt(1 + 1 / 12), rig.camera.rays())
-    error = (found.depth_mm - depth * 1000)[good]
-    assert np.abs(error).max() < 30  # a slipped order is 250 mm
+    error = (decoded.depth_mm - depth * 1000)[good]
+    assert np.abs(error).max() < 30  # an order wrong by 1 is 250 mm
     core = np.abs(error / predicted[good])
     assert np.median(core) == pytest.approx(0.6745, rel=0.06)
 
@@ -82,11 +85,11 @@ def test_error_follows_one_over_root_n(direction):
     frames = capture(PAPER, depth, noise=1.5)
     errors = {}
     for steps in (3, 4, 6, 9, 18):
-        found = decode_stack(frames, PAPER, direction, steps=steps)
-        good = found.depth_mm > 0
-        errors[steps] = np.median(np.abs(found.depth_mm - depth * 1000)[good]) * np.sqrt(steps)
+        decoded = decode_stack(frames, PAPER, direction, steps=steps)
+        good = decoded.depth_mm > 0
+        errors[steps] = np.median(np.abs(decoded.depth_mm - depth * 1000)[good]) * np.sqrt(steps)
         per_direction = 2 if direction == "both" else 1
-        assert len(found.frames_used) == per_direction * (steps + 7)
+        assert len(decoded.frames_used) == per_direction * (steps + 7)
     mean = np.mean(list(errors.values()))
     # N = 4 of 18 is not quite even: its shifts are 0, 100, 180 and 280 degrees.
     assert all(error == pytest.approx(mean, rel=0.08) for error in errors.values()), errors
@@ -95,8 +98,8 @@ def test_error_follows_one_over_root_n(direction):
 @pytest.mark.parametrize("steps", [5, 7, 8, 10, 11, 13, 17])
 def test_uneven_subsets_are_unbiased(steps):
     depth = tilted(PAPER)
-    found = decode_stack(capture(PAPER, depth, noise=0.5), PAPER, "vertical", steps=steps)
-    error = (found.depth_mm - depth * 1000)[found.depth_mm > 0]
+    decoded = decode_stack(capture(PAPER, depth, noise=0.5), PAPER, "vertical", steps=steps)
+    error = (decoded.depth_mm - depth * 1000)[decoded.depth_mm > 0]
     assert abs(np.median(error)) < 0.05 and np.median(np.abs(error)) < 1.0
 
 
@@ -112,13 +115,14 @@ def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
     plain = decode_stack(frames, rig, direction, details=True)
     assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
     assert len(np.unique(plain.reason)) >= 3
+    # Both round a float64 depth once to float32: at most one unit in the last place apart.
     ulp = np.spacing(np.maximum(plain.depth_mm, np.float32(1)))
     assert (np.abs(compiled.depth_mm - plain.depth_mm) <= ulp).all()
-    for one in compiled.details:
-        np.testing.assert_allclose(compiled.details[one].phase, plain.details[one].phase, atol=1e-12, rtol=0)
-        np.testing.assert_array_equal(compiled.details[one].modulation, plain.details[one].modulation)
+    for name in compiled.details:
+        np.testing.assert_allclose(compiled.details[name].phase, plain.details[name].phase, atol=1e-12, rtol=0)
+        np.testing.assert_array_equal(compiled.details[name].modulation, plain.details[name].modulation)
         np.testing.assert_allclose(
-            compiled.details[one].coordinate_px, plain.details[one].coordinate_px, atol=1e-10, rtol=0
+            compiled.details[name].coordinate_px, plain.details[name].coordinate_px, atol=1e-10, rtol=0
         )
 
 
@@ -139,20 +143,20 @@ def test_the_compiled_arctangent_is_numpys_on_every_side():
 def test_mask_threads_and_layout_change_no_bit(switch, monkeypatch):
     monkeypatch.setenv(SWITCH, switch)
     frames = capture(PAPER, tilted(PAPER))
-    whole = decode_stack(frames, PAPER, details=True)
+    full = decode_stack(frames, PAPER, details=True)
     mask = np.random.default_rng(3).random(frames[0].shape) < 0.3
-    part = decode_stack(frames, PAPER, mask=mask, details=True)
-    assert np.array_equal(part.depth_mm, np.where(mask, whole.depth_mm, 0))
-    assert np.array_equal(part.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
-    for one in whole.details:
-        assert np.array_equal(part.details[one].phase[mask], whole.details[one].phase[mask])
-    assert part.counts["not_asked"] == (~mask).sum() and sum(part.counts.values()) == mask.size
+    masked = decode_stack(frames, PAPER, mask=mask, details=True)
+    assert np.array_equal(masked.depth_mm, np.where(mask, full.depth_mm, 0))
+    assert np.array_equal(masked.reason, np.where(mask, full.reason, Reason.NOT_ASKED))
+    for name in full.details:
+        assert np.array_equal(masked.details[name].phase[mask], full.details[name].phase[mask])
+    assert masked.counts["not_asked"] == (~mask).sum() and sum(masked.counts.values()) == mask.size
     read_only = np.stack(frames)
     read_only.flags.writeable = False
     columns = [np.asfortranarray(frame) for frame in frames]
     for variant in (read_only, columns):
         again = decode_stack(variant, PAPER, threads=2)
-        assert np.array_equal(again.depth_mm, whole.depth_mm) and np.array_equal(again.reason, whole.reason)
+        assert np.array_equal(again.depth_mm, full.depth_mm) and np.array_equal(again.reason, full.reason)
     nothing = decode_stack(frames, PAPER, mask=np.zeros_like(mask))
     assert not nothing.depth_mm.any() and nothing.counts["not_asked"] == mask.size
 
@@ -187,15 +191,15 @@ def test_every_reason_is_given_where_it_holds(switch, monkeypatch):
     assert (reasons(flipped, direction="vertical")[inside] == Reason.INCONSISTENT_ORDER).all()
     assert (reasons(flipped, direction="horizontal")[inside] == Reason.DECODED).all()
 
-    shifted = list(frames)  # v read where the surface 100 mm farther would show it, u as before
-    other = capture(PAPER, depth + 0.1, noise=0.3)
+    shifted = list(frames)  # v as of a surface 100 mm farther, u of the true surface
+    farther = capture(PAPER, depth + 0.1, noise=0.3)
     for index in [*sequence.sinusoids("horizontal"), *sequence.gray("horizontal")]:
-        shifted[index] = other[index]
+        shifted[index] = farther[index]
     assert (reasons(shifted)[inside] == Reason.DIRECTIONS_DISAGREE).all()
 
-    far = capture(PAPER, np.full_like(depth, 3.2), noise=0.3)
-    found = decode_stack(far, PAPER)
-    assert (found.reason[inside] == Reason.OUTSIDE_RANGE).all() and not found.depth_mm.any()
+    background = capture(PAPER, np.full_like(depth, 3.2), noise=0.3)
+    decoded = decode_stack(background, PAPER)
+    assert (decoded.reason[inside] == Reason.OUTSIDE_RANGE).all() and not decoded.depth_mm.any()
 
     # A lens that folds 0.3 from the axis, and an image that reaches 0.35: the corners have no ray.
     folded = replace(PAPER, camera=replace(PAPER.camera, fx=280.0, fy=280.0, distortion=(-1.8, 0.0, 0.0, 0.0, 0.0)))
@@ -209,29 +213,29 @@ def test_a_coordinate_beyond_the_patterns_border_is_outside():
     rig = PAPER
     depth = tilted(rig)
     frames = capture(rig, depth, noise=0.0)
-    # A projector that is told to be 100 px narrower than what was projected: the last cells are not its own.
+    # A rig whose projector is 305 px narrower than the projected pattern: the last cells are outside.
     narrow = replace(rig, projector=replace(rig.projector, width=rig.projector.width - 305))
-    found = decode_stack(frames, narrow, "vertical", details=True)
+    decoded = decode_stack(frames, narrow, "vertical", details=True)
     x, y = rig.camera.rays()
     u, _ = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
-    rejected = np.isin(found.reason, [Reason.OUTSIDE_PATTERN, Reason.INCONSISTENT_ORDER])
+    rejected = np.isin(decoded.reason, [Reason.OUTSIDE_PATTERN, Reason.INCONSISTENT_ORDER])
     assert rejected[(u > 607) & (u < 905)].all() and not rejected[(u > 2) & (u < 606)].any()
-    assert (found.reason == Reason.OUTSIDE_PATTERN).any()
+    assert (decoded.reason == Reason.OUTSIDE_PATTERN).any()
 
 
-def test_only_the_needed_frames_are_needed():
+def test_frames_that_are_not_used_may_be_missing():
     frames = capture(PAPER, tilted(PAPER))
-    whole = decode_stack(frames, PAPER, "horizontal", steps=6)
-    kept = [frame if i in whole.frames_used else None for i, frame in enumerate(frames)]
-    again = decode_stack(kept, PAPER, "horizontal", steps=6)
-    assert np.array_equal(again.depth_mm, whole.depth_mm)
-    assert whole.frames_used == (0, 3, 6, 9, 12, 15, *range(36, 43))
-    with pytest.raises(DecodeError, match=r"frame 18: vertical sinusoid, step 0: is needed and missing"):
-        decode_stack(kept, PAPER, "vertical", steps=6)
+    full = decode_stack(frames, PAPER, "horizontal", steps=6)
+    needed = [frame if i in full.frames_used else None for i, frame in enumerate(frames)]
+    again = decode_stack(needed, PAPER, "horizontal", steps=6)
+    assert np.array_equal(again.depth_mm, full.depth_mm)
+    assert full.frames_used == (0, 3, 6, 9, 12, 15, *range(36, 43))
+    with pytest.raises(DecodeError, match=r"frame 18: vertical sinusoid, step 0: expected an image, got None"):
+        decode_stack(needed, PAPER, "vertical", steps=6)
 
 
 @pytest.mark.parametrize(
-    "change, arguments, says",
+    "change, arguments, message",
     [
         (lambda f: f[:-1], {}, "52 frames.*got 51"),
         (lambda f: [x[:, :-1] for x in f], {}, r"expected shape.*\(200, 200\).*got \(200, 199\)"),
@@ -248,20 +252,20 @@ def test_only_the_needed_frames_are_needed():
         (lambda f: f, {"limits": Limits(max_clipped_steps=-1)}, "max_clipped_steps"),
     ],
 )
-def test_what_cannot_be_decoded_is_refused(change, arguments, says):
+def test_what_cannot_be_decoded_is_refused(change, arguments, message):
     frames = [np.zeros((200, 200), dtype=np.uint8)] * 52
-    with pytest.raises(DecodeError, match=says):
+    with pytest.raises(DecodeError, match=message):
         decode_stack(change(frames), PAPER, **arguments)
 
 
 def test_noise_alone_is_never_given_a_depth_by_both_directions():
     frames = list(np.random.default_rng(8).integers(0, 256, (52, 200, 200), dtype=np.uint8))
-    found = decode_stack(frames, PAPER)
-    assert (found.depth_mm > 0).mean() < 1e-3
+    decoded = decode_stack(frames, PAPER)
+    assert (decoded.depth_mm > 0).mean() < 1e-3
 
 
 def test_without_numba_the_decoder_still_works():
-    """In a process of its own where numba can't be imported at all."""
+    """In a separate process in which numba can't be imported."""
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import numpy as np\n"
@@ -269,13 +273,13 @@ def test_without_numba_the_decoder_still_works():
         "from fpp_ml_bench.decoding import decode_stack\n"
         "from fpp_ml_bench.rig import paper_rig\n"
         "assert not numba_enabled() and njit(len) is len\n"
-        "found = decode_stack(np.zeros((52, 200, 200), np.uint8), paper_rig(200))\n"
-        "assert found.counts['low_modulation'] == 40000, found.counts\n"
+        "decoded = decode_stack(np.zeros((52, 200, 200), np.uint8), paper_rig(200))\n"
+        "assert decoded.counts['low_modulation'] == 40000, decoded.counts\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_weights_of_the_chosen_subset_are_the_least_squares_ones():
+def test_weights_of_the_chosen_subset_are_the_least_squares_solution():
     shifts = 2 * np.pi * np.array([0, 4, 7, 11, 14]) / 18
     model = np.stack([np.ones(5), np.cos(shifts), np.sin(shifts)], axis=1)
     np.testing.assert_allclose(phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14)

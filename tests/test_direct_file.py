@@ -1,4 +1,4 @@
-"""Writing past the page cache: every byte in its place, the right hash, and the disk's errors."""
+"""Writing without the page cache: all bytes, the right hash, and errors of the disk."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ BLOCK = 1 << 16
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    """Blocks of 64 KiB, so that a few hundred kB go round all of them several times."""
+    """Blocks of 64 KiB, so that a few hundred kB fill every block several times."""
     monkeypatch.setattr(direct_file, "BLOCK_BYTES", BLOCK)
 
 
@@ -58,16 +58,16 @@ def test_pieces_of_any_size_and_type(tmp_path, small_blocks):
     pieces = [noise(int(n), i) for i, n in enumerate(rng.integers(0, 2 * BLOCK, 40))]
     array = rng.random((30, 1000)).astype(np.float32)
     file = write(tmp_path / "x", [*pieces, array, memoryview(b"end"), bytearray(b"!")])
-    whole = b"".join(pieces) + array.tobytes() + b"end!"
-    assert (tmp_path / "x").read_bytes() == whole and file.xxh3_128 == xxhash.xxh3_128_hexdigest(whole)
+    content = b"".join(pieces) + array.tobytes() + b"end!"
+    assert (tmp_path / "x").read_bytes() == content and file.xxh3_128 == xxhash.xxh3_128_hexdigest(content)
 
 
 def test_a_block_is_not_filled_again_before_the_slow_disk_has_it(tmp_path, small_blocks, monkeypatch):
-    through = direct_file._write_block
+    write_block = direct_file._write_block
 
     def slow(descriptor, view):
         time.sleep(0.005)
-        through(descriptor, view)
+        write_block(descriptor, view)
 
     monkeypatch.setattr(direct_file, "_write_block", slow)
     content = noise(20 * BLOCK + 5)

@@ -1,4 +1,4 @@
-"""``--explain``: what it says is what the data says, and ``--no-skip`` changes nothing but the time."""
+"""``--explain`` counts agree with the data, and ``--no-skip`` changes no result."""
 
 import json
 
@@ -25,17 +25,17 @@ def lines_of(path):
     return content, {line["what"]: line for line in content["left_out"]}
 
 
-def test_the_account_adds_up_and_drops_what_could_not_be_left_out():
-    kept = LeftOut("rays", "rays", 10, 30, None, 0.5, "a rule")
-    found = explained("build", "nothing", [kept, LeftOut("more", "frames", 5, 0, 0, None, "another")])
-    assert found == Explanation("build", "nothing", (kept,), True) and kept.share == 0.75
-    content = found.to_dict()
+def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
+    rays = LeftOut("rays", "rays", 10, 30, None, 0.5, "a rule")
+    explanation = explained("build", "nothing", [rays, LeftOut("more", "frames", 5, 0, 0, None, "another")])
+    assert explanation == Explanation("build", "nothing", (rays,), True) and rays.share == 0.75
+    content = explanation.to_dict()
     assert content["seconds_saved"] == 0.5 and content["bytes_saved"] == 0 and content["left_out"][0]["share"] == 0.75
     with skipping(False):
-        assert not explained("build", "nothing", [kept]).skipping
+        assert not explained("build", "nothing", [rays]).skipping
 
 
-def test_seconds_are_scaled_from_one_to_all_and_measured_in_both_states():
+def test_seconds_are_scaled_up_and_measured_with_skipping_on_and_off():
     states = []
 
     def work():
@@ -75,15 +75,21 @@ def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):
     account = tmp_path / "account.json"
     for name, options in (("on", ["--explain-json", str(account)]), ("off", ["--no-skip"])):
         assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "4", *options]) == 0
-    one, other = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
-    assert len(one) == 7 and [n for n in one if n.endswith(".npy") and one[n] != other[n]] == []
+    skipped, complete = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
+    assert (
+        len(skipped) == 7
+        and [name for name in skipped if name.endswith(".npy") and skipped[name] != complete[name]] == []
+    )
     _, lines = lines_of(account)
     frames = lines["frames that the method does not use"]
     assert (frames["done"], frames["left_out"]) == (6 * 22, 6 * 30) and frames["bytes_saved"] == 180 * PIXELS
-    second = lines["second direction where the first shows no object"]
-    opened = DatasetFolder(tiny)
-    seen = sum(row["object_px"] for row in opened.manifest.samples["test"])
-    assert 0.98 * seen < second["done"] < 1.05 * seen and second["done"] + second["left_out"] == 6 * PIXELS
+    second_direction = lines["second direction where the first shows no object"]
+    dataset = DatasetFolder(tiny)
+    object_px = sum(row["object_px"] for row in dataset.manifest.samples["test"])
+    assert (
+        0.98 * object_px < second_direction["done"] < 1.05 * object_px
+        and second_direction["done"] + second_direction["left_out"] == 6 * PIXELS
+    )
     scores = []
     for name, options in (("a.json", ["--explain-json", str(account)]), ("b.json", ["--no-skip"])):
         result = tmp_path / name
@@ -95,7 +101,7 @@ def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):
     _, lines = lines_of(account)
     columns = lines["columns that no score needs"]
     assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns["bytes_saved"] == 6 * PIXELS * (52 + 4)
-    assert lines["depth edges far from the object"]["done"] > seen
+    assert lines["depth edges far from the object"]["done"] > object_px
     assert "left out" in capsys.readouterr().out
 
 
@@ -103,8 +109,10 @@ def test_the_phase_route_is_counted_by_its_crop(tiny, tmp_path):
     account = tmp_path / "account.json"
     assert main(["predict", "phase", str(tiny), "--out", str(tmp_path / "p"), "--explain-json", str(account)]) == 0
     _, lines = lines_of(account)
-    far = lines["local fits and orders far from the object"]
-    assert far["done"] + far["left_out"] == 6 * PIXELS and 0.1 < far["share"] < 0.95 and far["seconds_saved"] is None
+    line = lines["local fits and orders far from the object"]
+    assert (
+        line["done"] + line["left_out"] == 6 * PIXELS and 0.1 < line["share"] < 0.95 and line["seconds_saved"] is None
+    )
     assert lines["frames that the method does not use"]["left_out"] == 6 * 51
 
 

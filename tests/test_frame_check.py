@@ -1,4 +1,4 @@
-"""A dead sinusoid is refused by name, and no honest capture is."""
+"""A failed sinusoid frame is refused by name; correct captures never are."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_a_black_frame_is_refused_by_name(steps, direction):
         decode_stack(frames, rig, direction="both")
 
 
-def test_a_dimmed_frame_is_refused_and_one_that_is_not_used_is_nobodys_business():
+def test_a_dimmed_frame_is_refused_unless_it_is_not_used():
     rig = coded_rig()
     frames, _ = plane_stack(rig)
     frames[1] = frames[1] // 2
@@ -32,7 +32,7 @@ def test_a_dimmed_frame_is_refused_and_one_that_is_not_used_is_nobodys_business(
 @pytest.mark.parametrize("steps", [4, 5, 6, 18])
 @pytest.mark.parametrize("pitch", [18.0, 900.0])
 @pytest.mark.parametrize("bend", ["gamma", "clipped", "dark", "flat", "black", "random"])
-def test_no_honest_capture_is_refused(steps, pitch, bend):
+def test_no_correct_capture_is_refused(steps, pitch, bend):
     rig = coded_rig(pitch, steps)
     frames, _ = plane_stack(rig, mean=100.0, modulation=90.0)
     change = {

@@ -1,4 +1,4 @@
-"""`load_dataset` and the folder as Hugging Face's own tools open it: the same values every way, and no copy in ours."""
+"""`load_dataset` and Hugging Face's own tools on the same folder: equal values, and `load_dataset` copies nothing."""
 
 import json
 import pickle
@@ -60,52 +60,52 @@ def test_all_splits_at_once_and_the_lazy_name(tiny, opened):
 
 
 def test_plain_load_dataset_and_load_from_disk_give_the_same_values(tiny):
-    ours = load_dataset(tiny, "single_shot", split="train")
+    joined = load_dataset(tiny, "single_shot", split="train")
     plain = datasets.load_dataset(str(tiny), "single_shot", split="train")
     default = datasets.load_dataset(str(tiny), split="train")
     in_place = datasets.load_from_disk(str(tiny))
     assert sorted(in_place) == ["test", "train", "validation"]
-    expected = rows_by_sample(ours, IMAGES)
+    expected = rows_by_sample(joined, IMAGES)
     assert len(expected) == 12
-    for other in (plain, default, in_place["train"]):
-        assert other.column_names == ours.column_names
-        assert other.features == ours.features
-        found = rows_by_sample(other, IMAGES)
-        assert list(found) == list(expected)
+    for loaded in (plain, default, in_place["train"]):
+        assert loaded.column_names == joined.column_names
+        assert loaded.features == joined.features
+        values = rows_by_sample(loaded, IMAGES)
+        assert list(values) == list(expected)
         for sample, images in expected.items():
             for column, image in images.items():
-                np.testing.assert_array_equal(found[sample][column], image)
+                np.testing.assert_array_equal(values[sample][column], image)
     assert datasets.get_dataset_split_names(str(tiny), "single_shot") == ["train", "validation", "test"]
 
 
 def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
-    """Nine objects of one split are two files of 30 and 24 rows."""
+    """Nine objects of a split are two files of 30 and 24 rows."""
     folder = make(tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported")
-    opened = DatasetFolder(folder)
-    assert [s.rows for s in opened.manifest.shards if s.split == "train"] == [30, 24]
+    folder_read = DatasetFolder(folder)
+    assert [s.rows for s in folder_read.manifest.shards if s.split == "train"] == [30, 24]
     expected = [f"{name}_{view}" for name in OBJECTS[:9] for view in VIEWS]
-    doors = {
-        "ours": load_dataset(folder, split="train"),
+    datasets_by_way = {
+        "joined": load_dataset(folder, split="train"),
         "plain": datasets.load_dataset(str(folder), split="train"),
         "in place": datasets.load_from_disk(str(folder))["train"],
     }
-    for dataset in doors.values():
-        assert dataset["sample"][:] == expected == opened.splits["train"]
+    for dataset in datasets_by_way.values():
+        assert dataset["sample"][:] == expected == folder_read.splits["train"]
         formatted = dataset.with_format("numpy")
         for row in (0, 29, 30, 53):
             for column in ("depth", "depth_exact"):
-                np.testing.assert_array_equal(formatted[row][column], opened.depth_mm(expected[row], column))
-            np.testing.assert_array_equal(formatted[row]["frame_00"], opened.frame(expected[row], 0))
+                np.testing.assert_array_equal(formatted[row][column], folder_read.depth_mm(expected[row], column))
+            np.testing.assert_array_equal(formatted[row]["frame_00"], folder_read.frame(expected[row], 0))
     alone = SyntheticShard().row(expected[30], *split_sample_name(expected[30]))
-    np.testing.assert_array_equal(opened.frame(expected[30], 0), alone.frames[0])
-    np.testing.assert_array_equal(opened.depth_mm(expected[30]), alone.depth_mm)
+    np.testing.assert_array_equal(folder_read.frame(expected[30], 0), alone.frames[0])
+    np.testing.assert_array_equal(folder_read.depth_mm(expected[30]), alone.depth_mm)
 
 
 def test_in_place_reading_copies_nothing_into_a_cache(tiny):
-    ours = load_dataset(tiny, "all", split="train")
-    assert ours.cache_files == [] or all(str(tiny) in f["filename"] for f in ours.cache_files)
+    joined = load_dataset(tiny, "all", split="train")
+    assert joined.cache_files == [] or all(str(tiny) in f["filename"] for f in joined.cache_files)
     before = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
-    rows_by_sample(ours, ["frame_00", "frame_51"])
+    rows_by_sample(joined, ["frame_00", "frame_51"])
     after = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
     assert before == after
 
@@ -125,13 +125,13 @@ def test_memory_is_the_files_own_map(tiny):
 
 def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
     folder = tmp_path / "set"
-    seen = []
+    frames = []
     for seed in (1, 2):
         build(folder, tiny_settings(objects=("cork",), stored="single_shot", seed=seed), workers=1)
-        seen.append(np.array(datasets.load_dataset(str(folder), split="train")[0]["frame_00"]))
-        np.testing.assert_array_equal(seen[-1], DatasetFolder(folder).frame("cork_A0", 0))
+        frames.append(np.array(datasets.load_dataset(str(folder), split="train")[0]["frame_00"]))
+        np.testing.assert_array_equal(frames[-1], DatasetFolder(folder).frame("cork_A0", 0))
         shutil.rmtree(folder)
-    assert (seen[0] != seen[1]).any()
+    assert (frames[0] != frames[1]).any()
 
 
 def test_usual_operations(tiny, opened, tmp_path):
@@ -142,11 +142,11 @@ def test_usual_operations(tiny, opened, tmp_path):
     assert (
         sorted(shuffled["sample"]) == sorted(opened.splits["train"]) and shuffled["sample"][:] != dataset["sample"][:]
     )
-    some = shuffled.select([4, 0])
-    for row in some.with_format("numpy"):
+    selected = shuffled.select([4, 0])
+    for row in selected.with_format("numpy"):
         np.testing.assert_array_equal(row["frame_20"], opened.frame(row["sample"], 20))
-    kept = dataset.filter(lambda view: view == "A60", input_columns="view")
-    assert kept["sample"][:] == ["bowl_A60", "cork_A60"]
+    filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
+    assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
     mapped = dataset.select(range(2)).map(lambda row: {"top": max(map(max, row["depth"]))})
     assert mapped["top"][:] == [float(opened.depth_mm(s).max()) for s in opened.splits["train"][:2]]
     import torch
@@ -157,22 +157,24 @@ def test_usual_operations(tiny, opened, tmp_path):
     np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
     joined = datasets.concatenate_datasets([dataset, load_dataset(folder, "vertical", split="test")])
     assert len(joined) == 18
-    assert verify(folder) == []  # and verify does not mind those caches
+    assert verify(folder) == []  # verify ignores those caches
 
 
 def test_fingerprints_follow_the_data(tiny, tmp_path):
     shutil.copytree(tiny, tmp_path / "moved")
-    one = load_dataset(tiny, "single_shot", split="train")._fingerprint
-    assert load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == one
-    others = {load_dataset(tiny, c, split=s)._fingerprint for c, s in (("all", "train"), ("single_shot", "test"))}
-    assert len(others | {one}) == 3
+    fingerprint = load_dataset(tiny, "single_shot", split="train")._fingerprint
+    assert load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == fingerprint
+    other_fingerprints = {
+        load_dataset(tiny, c, split=s)._fingerprint for c, s in (("all", "train"), ("single_shot", "test"))
+    }
+    assert len(other_fingerprints | {fingerprint}) == 3
 
 
 @pytest.mark.parametrize("config", CONFIGS)
 @pytest.mark.parametrize("exact", [True, False])
 def test_schema_is_what_datasets_itself_would_write(config, exact):
     columns = config_columns(PAPER_SEQUENCE, config, exact)
-    made = datasets.Features(
+    expected_features = datasets.Features(
         {
             name: datasets.Value("string")
             if name in ("sample", "object", "view", "split")
@@ -182,24 +184,24 @@ def test_schema_is_what_datasets_itself_would_write(config, exact):
             for name in columns
         }
     )
-    # Through a file, as a reader gets it: with `datasets` imported, the extension type stands up from the metadata.
-    ours, theirs = pa.ipc.read_schema(arrow_schema(columns, (120, 160)).serialize()), made.arrow_schema
-    assert ours.equals(theirs)
-    assert json.loads(ours.metadata[b"huggingface"]) == json.loads(theirs.metadata[b"huggingface"])
-    assert datasets.Features.from_arrow_schema(ours) == made
-    assert datasets.Features.from_dict(features(columns, (120, 160))) == made
+    # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from the metadata.
+    schema, expected = pa.ipc.read_schema(arrow_schema(columns, (120, 160)).serialize()), expected_features.arrow_schema
+    assert schema.equals(expected)
+    assert json.loads(schema.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
+    assert datasets.Features.from_arrow_schema(schema) == expected_features
+    assert datasets.Features.from_dict(features(columns, (120, 160))) == expected_features
 
 
 @pytest.mark.parametrize(
-    ("config", "split", "says"),
+    ("config", "split", "message"),
     [
         ("both", "train", "unknown configuration 'both'"),
         ("single_shot", "val", "no split 'val'"),
-        ("single_shot", "all", "give one of train, validation, test, or None"),
+        ("single_shot", "all", "expected one of train, validation, test, or None"),
     ],
 )
-def test_errors(tiny, config, split, says):
-    with pytest.raises(DatasetError, match=says):
+def test_errors(tiny, config, split, message):
+    with pytest.raises(DatasetError, match=message):
         load_dataset(tiny, config, split=split)
 
 

@@ -1,4 +1,4 @@
-"""MATLAB files: against SciPy, against files that MATLAB itself wrote, and damaged ones that must be refused."""
+"""MATLAB files: compared with SciPy and with files written by MATLAB; damaged files must be refused."""
 
 import io
 from pathlib import Path
@@ -27,16 +27,16 @@ def test_v5_as_scipy_writes_it(tmp_path, dtype, compressed):
     matrix = DEPTH.astype(dtype) if dtype not in ("u1",) else (DEPTH % 251).astype(dtype)
     file = tmp_path / "a.mat"
     file.write_bytes(v5_bytes(compressed, before=np.eye(3), depthMap=matrix, after="text"))
-    found = read_matrix(file, "depthMap")
-    assert found.dtype == matrix.dtype and np.array_equal(found, matrix) and found.flags.c_contiguous
+    read = read_matrix(file, "depthMap")
+    assert read.dtype == matrix.dtype and np.array_equal(read, matrix) and read.flags.c_contiguous
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 def test_v73_comes_out_as_matlab_shows_it_not_transposed(tmp_path, dtype):
     file = tmp_path / "a.mat"
     file.write_bytes(v73_bytes(depthMap=DEPTH.astype(dtype)))
-    found = read_matrix(file, "depthMap")
-    assert found.shape == (11, 7) and np.array_equal(found, DEPTH.astype(dtype)) and found.flags.c_contiguous
+    read = read_matrix(file, "depthMap")
+    assert read.shape == (11, 7) and np.array_equal(read, DEPTH.astype(dtype)) and read.flags.c_contiguous
 
 
 @pytest.mark.skipif(not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data")
@@ -55,8 +55,8 @@ def test_v73_comes_out_as_matlab_shows_it_not_transposed(tmp_path, dtype):
 )
 def test_files_written_by_matlab_read_as_scipy_reads_them(name, variable):
     expected = scipy.io.loadmat(WRITTEN_BY_MATLAB / name)[variable]
-    found = read_matrix(WRITTEN_BY_MATLAB / name, variable)
-    assert np.array_equal(found, expected) and found.shape == expected.shape
+    read = read_matrix(WRITTEN_BY_MATLAB / name, variable)
+    assert np.array_equal(read, expected) and read.shape == expected.shape
 
 
 @pytest.mark.skipif(not WRITTEN_BY_MATLAB.is_dir(), reason="this SciPy was installed without its test data")
@@ -94,31 +94,31 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_by_name(tmp_path, case):
-    content, said = REFUSED[case]
+    content, message = REFUSED[case]
     file = tmp_path / "power_drill_A60.mat"
     file.write_bytes(content)
     with pytest.raises(LayoutError, match="power_drill_A60") as caught:
         read_matrix(file, "depthMap")
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
-def test_a_missing_file_and_a_scalar_that_is_none(tmp_path):
+def test_a_missing_file_and_a_value_that_is_not_a_scalar(tmp_path):
     with pytest.raises(LayoutError, match=r"gone\.mat: can't be read"):
         read_matrix(tmp_path / "gone.mat", "depthMap")
     for value in (DEPTH, np.nan):
         (tmp_path / "a.mat").write_bytes(v5_bytes(depth_min=value))
-        with pytest.raises(LayoutError, match="one finite number"):
+        with pytest.raises(LayoutError, match="depth_min: expected a finite number"):
             read_scalar(tmp_path / "a.mat", "depth_min")
 
 
-@pytest.mark.parametrize("kind", ["compressed", "plain", "v7.3", "ours"])
+@pytest.mark.parametrize("kind", ["compressed", "plain", "v7.3", "written here"])
 def test_damage_is_refused_or_harmless_never_a_crash(tmp_path, kind):
-    """SciPy 1.17 ends the process (segmentation fault) on some of the uncompressed ones."""
+    """SciPy 1.17 ends the process (segmentation fault) on some of the uncompressed files."""
     content = {
         "compressed": v5_bytes(True, depthMap=DEPTH),
         "plain": v5_bytes(False, depthMap=DEPTH),
         "v7.3": v73_bytes(depthMap=DEPTH),
-        "ours": matrix_bytes({"depthMap": DEPTH}),
+        "written here": matrix_bytes({"depthMap": DEPTH}),
     }[kind]
     rng = np.random.default_rng(7)
     file = tmp_path / "a.mat"
@@ -128,13 +128,13 @@ def test_damage_is_refused_or_harmless_never_a_crash(tmp_path, kind):
         if trial % 3 == 0:
             damaged = damaged[: rng.integers(len(damaged))]
         else:
-            for place in rng.integers(min(len(damaged), 2500), size=rng.integers(1, 4)):
-                damaged[place] = rng.integers(256)
+            for position in rng.integers(min(len(damaged), 2500), size=rng.integers(1, 4)):
+                damaged[position] = rng.integers(256)
         file.write_bytes(damaged)
         try:
             unchanged += np.array_equal(read_matrix(file, "depthMap"), DEPTH)
         except LayoutError:
             refused += 1
     assert refused > 200
-    if kind in ("compressed", "ours"):  # a checksum: what is not refused is the truth
+    if kind in ("compressed", "written here"):  # with a checksum, all damage is refused
         assert refused + unchanged == 600

@@ -1,4 +1,4 @@
-"""The house: every package folder is installed, and the checkout works as the current folder too."""
+"""Packaging: every package folder is installed, and the checkout works as the current folder too."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("loaders", "evaluation", "baselines", "leaderboard")
+SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
 
 
 def _setuptools() -> dict:
@@ -16,7 +16,10 @@ def _setuptools() -> dict:
 def _package_folders() -> dict[str, str]:
     """Installed name -> folder of every package in the checkout."""
     folders = {}
-    for top, prefix in (("fpp_ml_bench", "fpp_ml_bench"), *((room, f"fpp_ml_bench.{room}") for room in ROOMS)):
+    for top, prefix in (
+        ("fpp_ml_bench", "fpp_ml_bench"),
+        *((subpackage, f"fpp_ml_bench.{subpackage}") for subpackage in SUBPACKAGES),
+    ):
         for init in sorted((ROOT / top).rglob("__init__.py")):
             parts = init.parent.relative_to(ROOT / top).parts
             folders[".".join((prefix, *parts))] = "/".join((top, *parts))
@@ -35,14 +38,14 @@ def test_packages_come_from_their_folders():
         assert "/".join(filter(None, (mapping[parent], inner))) == folder
 
 
-def test_checkout_as_current_folder_brings_its_own_rooms():
+def test_checkout_as_current_folder_brings_its_own_subpackages():
     code = "import fpp_ml_bench, importlib\n" + "".join(
-        f"print(importlib.import_module('fpp_ml_bench.{room}').__file__)\n" for room in ROOMS
+        f"print(importlib.import_module('fpp_ml_bench.{subpackage}').__file__)\n" for subpackage in SUBPACKAGES
     )
     printed = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.split()
-    assert printed == [str(ROOT / room / "__init__.py") for room in ROOMS]
+    assert printed == [str(ROOT / subpackage / "__init__.py") for subpackage in SUBPACKAGES]
 
 
 def test_module_run_is_the_command():
@@ -52,29 +55,31 @@ def test_module_run_is_the_command():
 
 
 def test_dependencies_flow_one_way():
-    """core <- loaders <- evaluation <- baselines <- leaderboard; only the commands know them all."""
-    order = ("core", *ROOMS)
-    for top in ("fpp_ml_bench", *ROOMS):
-        mine = order.index("core" if top == "fpp_ml_bench" else top)
+    """core <- loaders <- evaluation <- baselines <- leaderboard; only the commands import all of them."""
+    order = ("core", *SUBPACKAGES)
+    for top in ("fpp_ml_bench", *SUBPACKAGES):
+        position = order.index("core" if top == "fpp_ml_bench" else top)
         for path in (ROOT / top).rglob("*.py"):
             relative = path.relative_to(ROOT).parts
             if relative[:2] == ("fpp_ml_bench", "commands") or (
-                path.name in ("__init__.py", "__main__.py") and mine == 0
+                path.name in ("__init__.py", "__main__.py") and position == 0
             ):
                 continue
             text = path.read_text()
-            for later in order[mine + 1 :]:
-                assert f"fpp_ml_bench.{later}" not in text or _only_in_prose(text, later), f"{path} imports {later}"
+            for later_package in order[position + 1 :]:
+                assert f"fpp_ml_bench.{later_package}" not in text or _only_in_prose(text, later_package), (
+                    f"{path} imports {later_package}"
+                )
 
 
-def _only_in_prose(text: str, room: str) -> bool:
+def _only_in_prose(text: str, subpackage: str) -> bool:
     return not any(
-        line.strip().startswith((f"from fpp_ml_bench.{room}", f"import fpp_ml_bench.{room}"))
+        line.strip().startswith((f"from fpp_ml_bench.{subpackage}", f"import fpp_ml_bench.{subpackage}"))
         for line in text.splitlines()
     )
 
 
-def test_the_project_stands_alone():
+def test_the_project_refers_to_no_outside_folder():
     for path in ROOT.rglob("*"):
         if path.suffix in (".py", ".md", ".toml", ".yaml", ".txt") and not {".git", ".venv", "build"} & set(path.parts):
             assert "../" + "shared" not in path.read_text(encoding="utf-8"), path

@@ -1,4 +1,4 @@
-"""Object, background and depth-edge sets: on maps drawn by hand, and against scikit-image and SciPy."""
+"""Object, background and depth-edge sets: on maps drawn by hand, and compared with SciPy."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from fpp_ml_bench.pixel_sets import (
 
 
 def drawn(text):
-    """One character a pixel: '.' background, digits are depth steps of 100 mm from 1500 mm."""
+    """One character per pixel: '.' background, digits are depth steps of 100 mm from 1500 mm."""
     return np.array([[0.0 if c == "." else 1500 + 100 * int(c) for c in line] for line in text.split()], np.float32)
 
 
@@ -47,7 +47,7 @@ def test_step_inside_an_object_marks_both_sides():
 
 
 def test_background_zero_is_no_depth_of_its_own():
-    """A jump so large that even object to background is under it: the outline is an edge all the same."""
+    """With a limit above the jump from object to background, the outline is still an edge."""
     assert depth_edges(drawn("..11 ..11"), 1e6).any()
     assert not depth_edges(drawn(".... ....")).any()
 
@@ -71,11 +71,11 @@ maps = arrays(
 @given(maps)
 def test_distance_is_scipys(depth):
     edge = depth_edges(depth, 50)
-    found = edge_distance_px(depth, 50)
+    distance = edge_distance_px(depth, 50)
     if not edge.any():
-        assert np.isinf(found).all()
+        assert np.isinf(distance).all()
     else:
-        np.testing.assert_allclose(found, ndimage.distance_transform_edt(~edge), atol=1e-3)
+        np.testing.assert_allclose(distance, ndimage.distance_transform_edt(~edge), atol=1e-3)  # OpenCV: float32 px
 
 
 @settings(max_examples=150, deadline=None)

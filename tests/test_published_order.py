@@ -1,4 +1,4 @@
-"""The frame order of a raw scan, told by its images: every named order is found, exchanged files are noticed."""
+"""The frame order of a raw scan, determined from its images: all named orders, and exchanged files."""
 
 from itertools import combinations
 
@@ -19,21 +19,21 @@ def scan(opened):
     return opened.frames("power_drill_A60", range(52)), opened.rig
 
 
-def test_the_papers_order_is_the_sequences_own():
+def test_the_papers_order_is_that_of_the_sequence():
     assert [frame.index for frame in PAPER.frames(PAPER_SEQUENCE)] == list(range(52))
 
 
-def test_every_order_is_a_permutation_with_a_name_of_its_own():
+def test_every_order_is_a_different_permutation_with_its_own_name():
     sequence = Sequence(steps=6, bits_horizontal=8, bits_vertical=7)
     orders = list(all_orders())
-    placed = {tuple(frame.index for frame in order.frames(sequence)) for order in orders}
-    assert len(placed) == len(orders) == 32
-    assert all(sorted(indices) == list(range(len(sequence))) for indices in placed)
+    permutations = {tuple(frame.index for frame in order.frames(sequence)) for order in orders}
+    assert len(permutations) == len(orders) == 32
+    assert all(sorted(indices) == list(range(len(sequence))) for indices in permutations)
     assert [parse_order(order.name) for order in orders] == orders and parse_order("auto") is None
 
 
 @pytest.mark.parametrize("name", ["", "sideways", "paper+upside-down", "white-first", "Paper"])
-def test_an_unknown_name_is_refused_with_those_there_are(name):
+def test_an_unknown_name_is_refused_with_the_list_of_names(name):
     with pytest.raises(LayoutError, match="vertical-first"):
         parse_order(name)
 
@@ -50,7 +50,7 @@ def test_every_view_of_the_dataset_has_the_papers_order(opened):
         assert check_order(opened.frames(sample, range(52)), PAPER, opened.rig) == []
 
 
-def test_any_two_files_exchanged_are_noticed_and_one_of_them_named(scan):
+def test_any_two_exchanged_files_are_noticed_and_at_least_one_is_named(scan):
     frames, rig = scan
     for i, j in list(combinations(range(52), 2))[::5]:
         files = list(frames)
@@ -59,7 +59,7 @@ def test_any_two_files_exchanged_are_noticed_and_one_of_them_named(scan):
         assert f"A_{i}.png" in misfits or f"A_{j}.png" in misfits, (i, j)
 
 
-def test_one_file_twice_is_noticed(scan):
+def test_a_repeated_file_is_noticed(scan):
     frames, rig = scan
     for i in (3, 20, 38, 45):
         files = list(frames)

@@ -1,4 +1,4 @@
-"""Crash safety, with real processes, real signals and a really full disk: nothing half-made, the same bytes at last."""
+"""Crash safety, with real processes, real signals and a really full disk: no partial result, the same bytes at last."""
 
 import contextlib
 import errno
@@ -24,7 +24,7 @@ from fpp_ml_bench.loaders.view import Studio
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = [sys.executable, "-c", "import sys; from fpp_ml_bench.commands import main; sys.exit(main())"]
-ONE = {"objects": ("cork",), "stored": "single_shot"}
+SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 
 def build_arguments(folder, *more, workers=1):
@@ -35,17 +35,17 @@ def build_arguments(folder, *more, workers=1):
 
 
 def start(folder, *more, **options):
-    """A build in a process of its own, in a process group of its own."""
+    """A build in a separate process and process group."""
     return subprocess.Popen(
         [*COMMAND, *build_arguments(folder, *more, **options)], cwd=ROOT, start_new_session=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
 
-def wait_for(seen, process, seconds=300):
-    """Wait until ``seen()`` holds; False when the process ended before."""
+def wait_for(reached, process, seconds=300):
+    """Wait until ``reached()`` holds; False when the process ended before."""
     end = time.monotonic() + seconds
-    while not seen():
+    while not reached():
         if process.poll() is not None:
             return False
         assert time.monotonic() < end, "the build never got that far"
@@ -73,12 +73,12 @@ def group_members(group):
 @pytest.fixture
 def half_built(tmp_path, monkeypatch):
     """A folder whose build was stopped in its second shard, and whose lock is free."""
-    folder, taken = tmp_path / "half", []
+    folder, views = tmp_path / "half", []
     photograph = Studio.photograph
 
     def stop_at_eight(self, mesh, view):
-        taken.append(view)
-        if len(taken) == 8:
+        views.append(view)
+        if len(views) == 8:
             raise KeyboardInterrupt
         return photograph(self, mesh, view)
 
@@ -95,9 +95,9 @@ def half_settings(**changes):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Bytes of what `half_built` becomes when nothing stops it."""
-    folder = tmp_path_factory.mktemp("whole") / "set"
+def uninterrupted(tmp_path_factory):
+    """Files of the dataset of `half_built`, built without interruption."""
+    folder = tmp_path_factory.mktemp("uninterrupted") / "set"
     build(folder, half_settings(), workers=1)
     return file_bytes(folder)
 
@@ -126,19 +126,19 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
         if wait_for(moment, process):
             reached += 1
             if reached == 1:
-                # While it is alive, a second build into the folder is turned away.
+                # While it runs, a second build into the folder is refused.
                 assert main(build_arguments(folder)) == 2
                 assert "another process is writing" in capsys.readouterr().err
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         process.stderr.close()
-        # No worker outlives its parent and goes on writing a folder that nobody holds.
+        # No worker outlives its parent and writes into an unlocked folder.
         end = time.monotonic() + 120
         while group_members(process.pid):
             assert time.monotonic() < end
             time.sleep(0.02)
         whole_shards = file_bytes(tiny)
-        for shard in final_shards(folder):  # whatever has its final name is complete
+        for shard in final_shards(folder):  # a file with its final name is complete
             assert shard.read_bytes() == whole_shards[str(shard.relative_to(folder))]
         if not (folder / "manifest.json").exists():
             with pytest.raises(DatasetError, match="not finished"):
@@ -149,23 +149,23 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
     assert not work.exists()
 
 
-def test_resume_makes_only_what_is_missing(half_built, whole, monkeypatch):
-    taken, photograph = [], Studio.photograph
+def test_resume_makes_only_what_is_missing(half_built, uninterrupted, monkeypatch):
+    names, photograph = [], Studio.photograph
 
     def count(self, mesh, view):
-        taken.append(mesh.name)
+        names.append(mesh.name)
         return photograph(self, mesh, view)
 
     monkeypatch.setattr(Studio, "photograph", count)
     reported = []
     build(half_built, half_settings(), workers=1, progress=reported.append)
-    assert taken == ["mug"] * 6
+    assert names == ["mug"] * 6
     assert reported == [6, *[1] * 6]
-    assert file_bytes(half_built) == whole
+    assert file_bytes(half_built) == uninterrupted
 
 
 @pytest.mark.parametrize("damage", ["flip", "cut", "remove", "mesh", "receipt", "receipt of nothing"])
-def test_resume_trusts_no_damaged_work(half_built, whole, damage):
+def test_resume_trusts_no_damaged_work(half_built, uninterrupted, damage):
     (shard,) = final_shards(half_built)
     receipt = half_built / ".build" / "train-00000-of-00001.json"
     content = bytearray(shard.read_bytes())
@@ -183,10 +183,10 @@ def test_resume_trusts_no_damaged_work(half_built, whole, damage):
     else:
         receipt.write_text('{"files": [], "rows": []}')
     build(half_built, half_settings(), workers=1)
-    assert file_bytes(half_built) == whole
+    assert file_bytes(half_built) == uninterrupted
 
 
-def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(half_built, whole):
+def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(half_built, uninterrupted):
     for name in (
         ".README.md.123.tmp",
         "train/.state.json.9.tmp",
@@ -197,15 +197,15 @@ def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_datas
         (half_built / name).write_text("half a file")
     (half_built / "notes.txt").write_text("mine")
     build(half_built, half_settings(), workers=1)
-    found = file_bytes(half_built)
-    assert found.pop("notes.txt") == b"mine"
-    assert found == whole
+    files = file_bytes(half_built)
+    assert files.pop("notes.txt") == b"mine"
+    assert files == uninterrupted
     findings = verify(half_built)
     assert len(findings) == 1 and "notes.txt" in findings[0]
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"seed": 43}, r"seed \(there 42, now 43\)"),
         ({"objects": ("cork", "bowl")}, r"objects \(there \[\"mug\", \"cork\"\], now"),
@@ -215,10 +215,10 @@ def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_datas
         ({"shadows": True}, "shadows"),
     ],
 )
-def test_other_settings_are_refused_by_name_before_and_after_the_end(half_built, change, says):
+def test_other_settings_are_refused_by_name_before_and_after_the_end(half_built, change, message):
     for _ in range(2):
         before = file_bytes(half_built)
-        with pytest.raises(BuildError, match=says):
+        with pytest.raises(BuildError, match=message):
             build(half_built, half_settings(**change), workers=1)
         assert file_bytes(half_built) == before
         build(half_built, half_settings(), workers=1)
@@ -230,7 +230,7 @@ def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypat
         build(half_built, half_settings(), workers=1)
 
 
-def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, whole, capsys):
+def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, uninterrupted, capsys):
     build(half_built, half_settings(), workers=1)
     stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
     arguments = ["build", str(half_built), "--size", str(TINY_SIZE), "--objects", "mug,cork", "--frames", "single_shot"]
@@ -242,20 +242,20 @@ def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, whole,
     assert "missing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("what", ["file", "folder with files", "dataset of others", "damaged settings"])
-def test_folders_that_are_not_ours(tmp_path, half_built, what, capsys):
+@pytest.mark.parametrize("content", ["file", "folder with files", "dataset of others", "damaged settings"])
+def test_folders_with_other_content(tmp_path, half_built, content, capsys):
     folder = tmp_path / "out"
-    if what == "file":
+    if content == "file":
         folder.write_text("x")
-    elif what == "damaged settings":
+    elif content == "damaged settings":
         folder = half_built
         (folder / ".build" / "settings.json").write_text("{")
     else:
         folder.mkdir()
-        (folder / ("manifest.json" if what == "dataset of others" else "thesis.tex")).write_text("{}")
+        (folder / ("manifest.json" if content == "dataset of others" else "thesis.tex")).write_text("{}")
     with pytest.raises(DatasetError, match=str(folder)):
         build(folder, half_settings(), workers=1)
-    if what == "folder with files":
+    if content == "folder with files":
         assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
 
 
@@ -266,9 +266,9 @@ def test_lock_is_free_after_an_error(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(Studio, "photograph", fail)
         with pytest.raises(BuildError, match="no"):
-            build(tmp_path / "set", tiny_settings(**ONE), workers=1)
+            build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
     assert not list((tmp_path / "set").rglob("*.tmp"))
-    build(tmp_path / "set", tiny_settings(**ONE), workers=1)
+    build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
     assert verify(tmp_path / "set") == []
 
 
@@ -281,15 +281,15 @@ def die(folder, scratch, plan, row_done):
     return assembly_of(half_settings()).work(folder, scratch, plan, row_done)
 
 
-def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, whole):
+def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
     folder = tmp_path / "set"
-    ours = assembly_of(half_settings())
-    broken = Assembly(ours.plans, die, ours.manifest, ours.bytes_per_row, ours.mesh_folder)
+    assembly = assembly_of(half_settings())
+    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.bytes_per_row, assembly.mesh_folder)
     with pytest.raises(BuildError, match="worker process died"):
         assemble(folder, broken, workers=2)
     assert not (folder / "manifest.json").exists()
     build(folder, half_settings(), workers=1)
-    assert file_bytes(folder) == whole
+    assert file_bytes(folder) == uninterrupted
 
 
 # ---- full disks
@@ -310,7 +310,7 @@ def small_disk(tmp_path):
     except OSError:
         mounted = False
     if not mounted:
-        pytest.skip("mounting a small file system needs privileges; the file-size limit below stands in")
+        pytest.skip("mounting a small file system needs privileges; the test with a file-size limit covers the case")
     yield folder
     subprocess.run(["umount", str(folder)], check=True)
 
@@ -323,9 +323,9 @@ def test_full_disk_is_refused_beforehand(small_disk, capsys):
     assert not final_shards(small_disk)
 
 
-def test_disk_that_fills_up_during_the_build(small_disk, whole, monkeypatch, capsys):
-    """Really ENOSPC, in the second shard; then room is made and the same command goes on."""
-    monkeypatch.setattr(assembling, "_enough_space", lambda *_: None)
+def test_disk_that_fills_up_during_the_build(small_disk, uninterrupted, monkeypatch, capsys):
+    """A real ENOSPC in the second shard; after freeing space the same command resumes."""
+    monkeypatch.setattr(assembling, "_check_space", lambda *_: None)
     folder = small_disk / "set"
     for filler_kb in (300, 0):  # 1.2 MB without the filler: one shard fits, not two
         filler = small_disk / "filler"
@@ -333,16 +333,16 @@ def test_disk_that_fills_up_during_the_build(small_disk, whole, monkeypatch, cap
         with pytest.raises(BuildError, match=r"No space left on device.*resumes"):
             build(folder, half_settings(), workers=1)
         for shard in final_shards(folder):
-            assert shard.read_bytes() == whole[str(shard.relative_to(folder))]
+            assert shard.read_bytes() == uninterrupted[str(shard.relative_to(folder))]
         assert not list(folder.rglob("*.tmp"))
         assert not (folder / "manifest.json").exists()
         filler.unlink()
     subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
     build(folder, half_settings(), workers=1)
-    assert file_bytes(folder) == whole
+    assert file_bytes(folder) == uninterrupted
 
 
-def test_files_that_can_not_grow(tmp_path, whole):
+def test_files_that_can_not_grow(tmp_path, uninterrupted):
     """The same through a limit on file sizes (EFBIG), which needs no privileges, and the real command."""
     folder = tmp_path / "set"
     arguments = [
@@ -363,24 +363,24 @@ def test_files_that_can_not_grow(tmp_path, whole):
     assert "Traceback" not in done.stderr
     assert not final_shards(folder) and not list(folder.rglob("*.tmp"))
     build(folder, half_settings(), workers=1)
-    assert file_bytes(folder) == whole
+    assert file_bytes(folder) == uninterrupted
 
 
 @pytest.mark.parametrize("name", ["README.md", "manifest.json", "state.json"])
-def test_disk_that_is_full_at_the_very_end(tmp_path, whole, monkeypatch, name):
-    """No room for a small file: the card, the manifest, a state file."""
+def test_disk_that_is_full_at_the_very_end(tmp_path, uninterrupted, monkeypatch, name):
+    """No space for a small file: the card, the manifest, a state file."""
     folder = tmp_path / "set"
     opened = Path.open
 
-    def no_room(self, mode="r", *more, **options):
+    def no_space(self, mode="r", *more, **options):
         if "w" in mode and name in self.name:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
         return opened(self, mode, *more, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "open", no_room)
+        patched.setattr(Path, "open", no_space)
         with pytest.raises(BuildError, match="No space left on device"):
             build(folder, half_settings(), workers=1)
     assert not (folder / "manifest.json").exists()
     build(folder, half_settings(), workers=1)
-    assert file_bytes(folder) == whole
+    assert file_bytes(folder) == uninterrupted

@@ -1,4 +1,4 @@
-"""The rig against OpenCV's camera model, its own files, and everything that must be refused."""
+"""The rig: compared with OpenCV's camera model, its files, and values that must be refused."""
 
 import json
 
@@ -91,9 +91,9 @@ def test_pixels_beyond_the_lens_fold_have_no_ray():
     # x (1 - 0.5 x^2) peaks at x^2 = 2/3 with 0.544: no ideal point is imaged farther out.
     camera = Pinhole(101, 1, 50.0, 50.0, 50.0, 0.0, (-0.5, 0.0, 0.0, 0.0, 0.0))
     x, _ = camera.rays()
-    seen = np.abs(np.arange(101) - 50) / 50
-    assert np.array_equal(np.isnan(x[0]), seen > np.sqrt(2 / 3) * (1 - 1 / 3))
-    assert np.isnan(camera.pixels(0.9, 0.0)[0])  # and a point beyond the fold has no image, instead of a folded one
+    distorted = np.abs(np.arange(101) - 50) / 50
+    assert np.array_equal(np.isnan(x[0]), distorted > np.sqrt(2 / 3) * (1 - 1 / 3))
+    assert np.isnan(camera.pixels(0.9, 0.0)[0])  # and a point beyond the fold has no image
 
 
 def test_points_behind_a_device_have_no_image():
@@ -126,19 +126,19 @@ def test_a_rotation_vector_is_taken(tmp_path):
 
 def _changed(path: str, value: object) -> dict:
     data = json.loads(json.dumps(rig_to_dict(paper_rig())))
-    *parents, last = path.split(".")
-    place = data
+    *parents, last_key = path.split(".")
+    entry = data
     for key in parents:
-        place = place[key]
+        entry = entry[key]
     if value is _changed:
-        del place[last]
+        del entry[last_key]
     else:
-        place[last] = value
+        entry[last_key] = value
     return data
 
 
 @pytest.mark.parametrize(
-    "path, value, says",
+    "path, value, message",
     [
         ("camera.fx", 0.0, "camera.fx.*positive"),
         ("camera.fx", -5.0, "camera.fx.*positive"),
@@ -176,18 +176,18 @@ def _changed(path: str, value: object) -> dict:
         ("background_m", 2.0, "background_m.*beyond"),
     ],
 )
-def test_what_is_no_rig_is_refused_naming_file_and_key(tmp_path, path, value, says):
+def test_an_invalid_rig_is_refused_naming_file_and_key(tmp_path, path, value, message):
     data = _changed(path, value)
     for name, text in (("rig.yaml", yaml.safe_dump(data)), ("rig.json", json.dumps(data))):
         file = tmp_path / name
         file.write_text(text)
-        with pytest.raises(RigError, match=says) as caught:
+        with pytest.raises(RigError, match=message) as caught:
             load_rig(file)
         assert str(caught.value).startswith(str(file))
 
 
 @pytest.mark.parametrize(
-    "name, content, says",
+    "name, content, message",
     [
         ("rig.yaml", b"", "empty"),
         ("rig.json", b"  \n", "empty"),
@@ -197,15 +197,15 @@ def test_what_is_no_rig_is_refused_naming_file_and_key(tmp_path, path, value, sa
         ("rig.json", b"[" * 100_000, "malformed JSON"),
         ("rig.yaml", b"just text", "expected a mapping"),
         ("rig.yaml", b"1: 2", "text as key"),
-        ("rig.yaml", b"camera: 1\ncamera: 2", "camera stands twice"),
-        ("rig.json", b'{"camera": 1, "camera": 2}', "camera stands twice"),
+        ("rig.yaml", b"camera: 1\ncamera: 2", "camera is given twice"),
+        ("rig.json", b'{"camera": 1, "camera": 2}', "camera is given twice"),
         ("rig.yaml", b"\xff\xfe\x00", "can't be read as text"),
         ("rig.txt", b"camera: 1", "ending in .yaml"),
     ],
 )
-def test_unreadable_files_are_refused(tmp_path, name, content, says):
+def test_unreadable_files_are_refused(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(RigError, match=says) as caught:
+    with pytest.raises(RigError, match=message) as caught:
         load_rig(tmp_path / name)
     assert name in str(caught.value)
 
@@ -217,7 +217,7 @@ def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
         save_rig(paper_rig(), tmp_path / "no" / "rig.yaml")
 
 
-def test_a_projector_that_looks_away_is_told_so():
+def test_a_projector_that_looks_away_is_refused():
     away = Rig(paper_rig().camera, paper_rig().projector, rotation_matrix((0.0, np.pi, 0.0)), (0.1, 0.0, 0.0))
     with pytest.raises(RigError, match="does not look at"):
         away.check_sampling()
@@ -231,7 +231,7 @@ def test_a_nearly_singular_intrinsic_matrix_is_refused(intrinsics):
 
 
 def test_a_lens_that_flattens_out_is_inverted_wherever_it_has_an_inverse():
-    coefficients = (0.6, 0.9, 0.0, 0.0, -0.3)  # Newton from the distorted point itself misses some of these
+    coefficients = (0.6, 0.9, 0.0, 0.0, -0.3)  # Newton from the distorted point misses some of these
     ideal = np.linspace(0.01, 0.98, 400) * np.sqrt(fold_radius_squared(coefficients))
     distorted = distort(ideal, np.zeros_like(ideal), coefficients)
     np.testing.assert_allclose(undistort(*distorted, coefficients)[0], ideal, rtol=1e-10)

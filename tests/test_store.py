@@ -1,4 +1,4 @@
-"""Reading images by memory map: the right pixels, without a copy, read-only, and errors that help."""
+"""Reading images by memory map: the right pixels, without a copy, read-only, and helpful errors."""
 
 import gc
 import pickle
@@ -51,16 +51,16 @@ def test_depths_are_the_values_of_their_file(tiny, opened):
 
 
 def test_views_share_the_mapped_memory_and_are_read_only(opened):
-    one, again = opened.frame("mug_A60", 20), opened.frame("mug_A60", 20)
-    assert np.shares_memory(one, again)
-    assert not one.flags.writeable and not one.flags.owndata
+    view, again = opened.frame("mug_A60", 20), opened.frame("mug_A60", 20)
+    assert np.shares_memory(view, again)
+    assert not view.flags.writeable and not view.flags.owndata
     with pytest.raises(ValueError, match="read-only"):
-        one[0, 0] = 1
+        view[0, 0] = 1
     depth = opened.depth_mm("mug_A60")
     assert not depth.flags.writeable and not depth.flags.owndata
     # The memory is that of the file's map: its address lies in a mapping of that file.
     shard = next(s for s in opened.manifest.shards if s.split == "validation" and s.group == "vertical")
-    address = one.__array_interface__["data"][0]
+    address = view.__array_interface__["data"][0]
     maps = Path("/proc/self/maps").read_text().splitlines()
     inside = [line for line in maps if str(opened.path / shard.path) in line]
     spans = [tuple(int(x, 16) for x in line.split()[0].split("-")) for line in inside]
@@ -68,17 +68,17 @@ def test_views_share_the_mapped_memory_and_are_read_only(opened):
 
 
 def test_a_view_outlives_the_folder_object(tiny):
-    opened = DatasetFolder(tiny)
-    view, copy = opened.depth_mm("cork_A0"), opened.depth_mm("cork_A0").copy()
-    del opened
+    dataset = DatasetFolder(tiny)
+    view, copy = dataset.depth_mm("cork_A0"), dataset.depth_mm("cork_A0").copy()
+    del dataset
     gc.collect()
     np.testing.assert_array_equal(view, copy)
 
 
-def test_frames_in_the_order_asked(opened):
+def test_frames_in_the_order_of_the_indices(opened):
     stack = opened.frames("bowl_A0", [51, 0, 18])
-    for found, index in zip(stack, (51, 0, 18), strict=True):
-        np.testing.assert_array_equal(found, opened.frame("bowl_A0", index))
+    for frame, index in zip(stack, (51, 0, 18), strict=True):
+        np.testing.assert_array_equal(frame, opened.frame("bowl_A0", index))
     # White is brighter than black, and each frame of a sequence is another image.
     white, black = opened.frame("bowl_A0", PAPER_SEQUENCE.white), opened.frame("bowl_A0", PAPER_SEQUENCE.black)
     inside = opened.depth_mm("bowl_A0") > 0
@@ -116,23 +116,26 @@ def test_pickles_by_path(opened):
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
-        (lambda d: d.frame("mug_A61", 0), "no sample 'mug_A61'; near it: mug_A"),
+        (lambda d: d.frame("mug_A61", 0), "no sample 'mug_A61'; similar names: mug_A"),
         (lambda d: d.frame("mug_A60", 52), "frame 52 is not stored"),
         (lambda d: d.frame("mug_A60", -1), "frame -1 is not stored"),
-        (lambda d: d.depth_mm("mug_A60", "depth_min"), "no depth column is called 'depth_min'"),
+        (
+            lambda d: d.depth_mm("mug_A60", "depth_min"),
+            "unknown depth column 'depth_min'; there are depth and depth_exact",
+        ),
         (lambda d: d.samples("val"), "no split 'val'; there are train, validation, test and all"),
         (lambda d: d.split_of_sample(""), "no sample ''"),
     ],
 )
-def test_errors_of_reading(opened, call, says):
-    with pytest.raises(DatasetError, match=says):
+def test_errors_of_reading(opened, call, message):
+    with pytest.raises(DatasetError, match=message):
         call(opened)
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda p: None, "no such folder; build one with"),
         (lambda p: p.mkdir(), "no manifest.json there"),
@@ -145,10 +148,10 @@ def test_errors_of_reading(opened, call, says):
         (lambda p: p.write_text(""), "no such folder"),
     ],
 )
-def test_folders_that_are_no_dataset(tmp_path, make, says):
+def test_folders_that_are_no_dataset(tmp_path, make, message):
     folder = tmp_path / "x"
     make(folder)
-    with pytest.raises(DatasetError, match=says) as caught:
+    with pytest.raises(DatasetError, match=message) as caught:
         DatasetFolder(folder)
     assert str(folder) in str(caught.value)
 

@@ -15,7 +15,7 @@ CAMERA_LENS, PROJECTOR_LENS = (-0.18, 0.09, 0.001, -0.002, -0.01), (0.07, -0.05,
 
 
 def general_rig(camera_lens=(0.0,) * 5, projector_lens=(0.0,) * 5, size=40):
-    """Turned, and with the projector 5 cm ahead of the camera, so that nothing of R and t drops out."""
+    """A rotated rig with the projector 5 cm ahead of the camera, so that all elements of R and t matter."""
     camera = Pinhole(size, size - 6, 2.3 * size, 2.2 * size, 0.52 * size, 0.45 * size, camera_lens)
     projector = Pinhole(400, 300, 700.0, 690.0, 190.3, 155.2, projector_lens)
     turn = rotation_matrix((0.05, -0.09, 0.12))
@@ -43,9 +43,9 @@ def test_exact_coordinates_give_exact_depth(rig):
     rays, depth_mm, u, v = scene(rig)
     np.testing.assert_allclose(depth_from_coordinate(rays, u, rig, "vertical"), depth_mm, atol=1e-6, rtol=0)
     np.testing.assert_allclose(depth_from_coordinate(rays, v, rig, "horizontal"), depth_mm, atol=1e-6, rtol=0)
-    both = depth_from_both(rays, u, v, rig, 0.3, 1.7)
-    np.testing.assert_allclose(both.depth_mm, depth_mm, atol=1e-6, rtol=0)
-    assert both.disagreement_px.max() < 1e-7
+    from_both = depth_from_both(rays, u, v, rig, 0.3, 1.7)
+    np.testing.assert_allclose(from_both.depth_mm, depth_mm, atol=1e-6, rtol=0)
+    assert from_both.disagreement_px.max() < 1e-7
 
 
 @pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
@@ -53,9 +53,9 @@ def test_opencv_triangulates_the_same_points(rig):
     rays, _, u, v = scene(rig)
     camera = np.hstack([np.eye(3), np.zeros((3, 1))])
     projector = np.hstack([rig.R, rig.t[:, None]])
-    seen = np.stack([axis.ravel() for axis in rays])
-    lit = np.stack([axis.ravel() for axis in rig.projector.normalised(u, v)])
-    points = cv2.triangulatePoints(camera, projector, seen, lit)
+    camera_points = np.stack([axis.ravel() for axis in rays])
+    projector_points = np.stack([axis.ravel() for axis in rig.projector.normalised(u, v)])
+    points = cv2.triangulatePoints(camera, projector, camera_points, projector_points)
     expected = (points[2] / points[3]).reshape(u.shape) * 1000
     np.testing.assert_allclose(depth_from_both(rays, u, v, rig).depth_mm, expected, rtol=1e-9)
 
@@ -78,7 +78,7 @@ def test_least_squares_is_the_optimisers(name):
     rng = np.random.default_rng(5)
     u, v = u + rng.normal(0, 0.4, u.shape), v + rng.normal(0, 0.4, v.shape)
     wu, wv = 0.4, 1.9
-    found = depth_from_both(rays, u, v, rig, wu, wv)
+    from_both = depth_from_both(rays, u, v, rig, wu, wv)
     for row, column in [(0, 0), (5, 31), (20, 11), (33, 39)]:
         ray = np.array([rays[0][row, column], rays[1][row, column], 1.0])
         measured = np.array([u[row, column], v[row, column]])
@@ -88,7 +88,7 @@ def test_least_squares_is_the_optimisers(name):
             return (pixel - measured) * np.sqrt([wu, wv])
 
         best = least_squares(misfit, [1 / 1.8], xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        assert found.depth_mm[row, column] == pytest.approx(1000 / best.x[0], abs=1e-4)
+        assert from_both.depth_mm[row, column] == pytest.approx(1000 / best.x[0], abs=1e-4)
 
 
 def test_disagreement_is_the_distance_from_opencvs_epipolar_line():
@@ -100,30 +100,30 @@ def test_disagreement_is_the_distance_from_opencvs_epipolar_line():
     essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rig.R
     device = rig.projector
     inverse = np.linalg.inv([[device.fx, 0, device.cx], [0, device.fy, device.cy], [0, 0, 1]])
-    seen = np.stack([rays[0].ravel(), rays[1].ravel()], axis=-1).reshape(-1, 1, 2)
-    a, b, c = cv2.computeCorrespondEpilines(seen, 1, inverse.T @ essential)[:, 0].T  # (a, b) has length 1
+    camera_points = np.stack([rays[0].ravel(), rays[1].ravel()], axis=-1).reshape(-1, 1, 2)
+    a, b, c = cv2.computeCorrespondEpilines(camera_points, 1, inverse.T @ essential)[:, 0].T  # (a, b) has length 1
     expected = np.abs(a * u.ravel() + b * v.ravel() + c).reshape(u.shape)
     for weights in [(1.0, 1.0), (0.2, 3.0)]:
-        found = depth_from_both(rays, u, v, rig, *weights).disagreement_px
-        np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+        disagreement_px = depth_from_both(rays, u, v, rig, *weights).disagreement_px
+        np.testing.assert_allclose(disagreement_px, expected, rtol=2e-3, atol=1e-6)
 
 
-def test_what_has_no_depth_is_nan_never_a_number():
+def test_pixels_without_depth_are_nan():
     rig = paper_rig(40)
     rays = np.zeros(5), np.zeros(5)
     # Straight ahead: the far point u = cx is parallel, beyond it the intersection lies behind the camera.
     u = np.array([rig.projector.cx, rig.projector.cx - 60, np.nan, np.inf, 455.5 + 1824 * 0.125 / 1.8])
-    found = depth_from_coordinate(rays, u, rig, "vertical")
-    assert np.isnan(found).tolist() == [True, True, True, True, False]
-    assert found[4] == pytest.approx(1800)
-    both = depth_from_both(rays, u, np.full(5, 569.5 - 1824 * 0.1 / 1.8), rig)
-    assert np.isnan(both.depth_mm[[2, 3]]).all() and both.depth_mm[4] == pytest.approx(1800)
+    depth_mm = depth_from_coordinate(rays, u, rig, "vertical")
+    assert np.isnan(depth_mm).tolist() == [True, True, True, True, False]
+    assert depth_mm[4] == pytest.approx(1800)
+    from_both = depth_from_both(rays, u, np.full(5, 569.5 - 1824 * 0.1 / 1.8), rig)
+    assert np.isnan(from_both.depth_mm[[2, 3]]).all() and from_both.depth_mm[4] == pytest.approx(1800)
     missing = np.array([np.nan])
     assert np.isnan(depth_from_coordinate((missing, np.zeros(1)), np.array([500.0]), rig, "vertical")).all()
 
 
 def test_a_point_behind_the_projector_has_no_depth():
-    # The projector stands 1 m ahead: what it seems to show at 0.5 m from the camera would lie behind it.
+    # The projector is 1 m ahead of the camera: a point 0.5 m from the camera lies behind it.
     device = paper_rig().projector
     rig = Rig(paper_rig(40).camera, device, np.eye(3), (0.125, -0.1, -1.0))
     point = np.array([0.0, 0.0, 0.5]) + rig.t
@@ -141,11 +141,11 @@ def test_a_direction_along_the_baseline_measures_nothing():
 def test_projector_distortion_beyond_inversion_is_nan():
     rig = general_rig(projector_lens=(-2.5, 0.0, 0.0, 0.0, 0.0))
     rays, _, u, _ = scene(rig)
-    found = depth_from_coordinate(rays, np.full_like(u, 399.0), rig, "vertical")
-    assert np.isnan(found).any()
-    kept = ~np.isnan(found)  # what is kept projects back to what was measured
-    points = np.stack([rays[0] * found, rays[1] * found, found], axis=-1) / 1000
-    assert np.abs(rig.project(points)[0][kept] - 399.0).max(initial=0.0) < 1e-6
+    depth_mm = depth_from_coordinate(rays, np.full_like(u, 399.0), rig, "vertical")
+    assert np.isnan(depth_mm).any()
+    valid = ~np.isnan(depth_mm)  # these depths project back to the measured coordinate
+    points = np.stack([rays[0] * depth_mm, rays[1] * depth_mm, depth_mm], axis=-1) / 1000
+    assert np.abs(rig.project(points)[0][valid] - 399.0).max(initial=0.0) < 1e-6
 
 
 @pytest.mark.parametrize("rig", [RIGS["paper"], RIGS["general"]], ids=["paper", "general"])

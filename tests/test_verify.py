@@ -1,4 +1,4 @@
-"""`verify` finds every kind of damage and leak, one finding each, and nothing on a clean dataset."""
+"""`verify` reports every kind of damage and leak, with one finding each, and none on a clean dataset."""
 
 import shutil
 from dataclasses import replace
@@ -31,29 +31,29 @@ def shard_of(folder, split="train", group="data"):
     return next(s for s in read_manifest(folder).shards if (s.split, s.group) == (split, group))
 
 
-def flip(path, place=0.5):
+def flip(path, share=0.5):
     content = bytearray(path.read_bytes())
-    content[int(len(content) * place)] ^= 0x10
+    content[int(len(content) * share)] ^= 0x10
     path.write_bytes(content)
 
 
 def restate(folder, **changes):
-    """Write the manifest anew, as somebody would who wants to hide a change: its own fingerprint is right."""
+    """Write the manifest again with a right fingerprint, as someone who wants to hide a change would do."""
     replace(read_manifest(folder), **changes).write(folder)
 
 
 def reseal(folder, shard):
-    """Make the manifest agree with the bytes that a shard has now."""
+    """Make the manifest agree with the present bytes of a shard."""
     path = folder / shard.path
     sealed = replace(shard, bytes=path.stat().st_size, xxh3_128=file_hash(path))
     restate(folder, shards=[sealed if s.path == shard.path else s for s in read_manifest(folder).shards])
 
 
 def test_clean_datasets_have_no_findings(tiny, clean, capsys):
-    seen = []
-    assert verify(tiny, seen.append) == [] and verify(clean) == []
+    reported = []
+    assert verify(tiny, reported.append) == [] and verify(clean) == []
     manifest = read_manifest(tiny)
-    assert seen == [1] * (len(manifest.shards) + len(manifest.others))
+    assert reported == [1] * (len(manifest.shards) + len(manifest.others))
     assert main(["verify", str(tiny)]) == 0
     out = capsys.readouterr().out
     assert "intact" in out and manifest.fingerprint in out
@@ -63,10 +63,10 @@ def test_clean_datasets_have_no_findings(tiny, clean, capsys):
 
 
 @pytest.mark.parametrize("group", ["data", "horizontal", "vertical", "codes"])
-@pytest.mark.parametrize("place", [0.0, 0.5, 0.999999])
-def test_flipped_byte_in_a_shard(copied, group, place, capsys):
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999999])
+def test_flipped_byte_in_a_shard(copied, group, share, capsys):
     path = copied / shard_of(copied, "validation", group).path
-    flip(path, place)
+    flip(path, share)
     (finding,) = verify(copied)
     assert str(path) in finding and "content has changed" in finding
     assert main(["verify", str(copied)]) == 1
@@ -88,20 +88,20 @@ def test_changed_file_beside_the_shards(copied, name):
 
 def test_cut_missing_and_foreign_files(copied):
     cut, gone = copied / shard_of(copied).path, copied / shard_of(copied, "test", "codes").path
-    whole = cut.stat().st_size
+    size = cut.stat().st_size
     cut.write_bytes(cut.read_bytes()[:-8])
     gone.unlink()
     shutil.copy(copied / shard_of(copied, "test").path, copied / "test" / "data-00001-of-00002.arrow")
     (copied / "frames" / "note.txt").write_text("x")
     findings = verify(copied)
     assert len(findings) == 4
-    for name, says in (
-        (cut.name, f"has {whole - 8} bytes, expected {whole}"),
+    for name, message in (
+        (cut.name, f"has {size - 8} bytes, expected {size}"),
         (gone.name, "is missing"),
         ("data-00001-of-00002.arrow", "not part of this dataset"),
         ("note.txt", "not part of this dataset"),
     ):
-        assert any(name in finding and says in finding for finding in findings)
+        assert any(name in finding and message in finding for finding in findings)
 
 
 def test_link_in_place_of_nothing_is_foreign(clean):
@@ -116,13 +116,13 @@ def test_caches_that_datasets_leaves_are_no_finding(clean):
 
 
 def test_swapped_shards(clean):
-    one, other = (clean / shard_of(clean, split).path for split in ("validation", "test"))
-    content = one.read_bytes(), other.read_bytes()
-    other.write_bytes(content[0])
-    one.write_bytes(content[1])
+    validation_path, test_path = (clean / shard_of(clean, split).path for split in ("validation", "test"))
+    content = validation_path.read_bytes(), test_path.read_bytes()
+    test_path.write_bytes(content[0])
+    validation_path.write_bytes(content[1])
     findings = verify(clean)
     assert len(findings) == 2 and all("expected" in f or "changed" in f for f in findings)
-    # The same with a manifest that was made to agree: now the labels inside tell.
+    # With a manifest that agrees with the swapped files, the labels in the rows show it.
     for split in ("validation", "test"):
         reseal(clean, shard_of(clean, split))
     findings = verify(clean)
@@ -158,7 +158,7 @@ def test_other_columns_under_a_right_checksum(clean):
 
 
 @pytest.mark.parametrize(
-    ("value", "says"),
+    ("value", "message"),
     [
         (np.nan, "not finite or negative"),
         (np.inf, "not finite or negative"),
@@ -167,12 +167,12 @@ def test_other_columns_under_a_right_checksum(clean):
         (9000.0, "depth_min and depth_max do not fit"),
     ],
 )
-def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, says):
-    """The writer refuses them; a dataset that another program wrote may hold them all the same."""
+def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, message):
+    """The writer refuses them, but a dataset written by another program may contain them."""
     monkeypatch.setattr(writing, "depth_range_mm", lambda depth, sample: (1500.0, 2100.0))
     folder = make(tmp_path / "set", spoil=("mug_A60", value))
     findings = [finding for finding in verify(folder) if "mug_A60" in finding]
-    assert len(findings) == 1 and says in findings[0] and "column depth" in findings[0]
+    assert len(findings) == 1 and message in findings[0] and "column depth" in findings[0]
 
 
 @pytest.mark.parametrize("key", ["sample", "object", "view", "depth_min_mm"])
@@ -225,7 +225,7 @@ def test_object_without_all_its_views(tmp_path):
     assert len(findings) == 1 and "'bowl'" in findings[0] and "expected the views" in findings[0]
 
 
-def test_rows_that_no_file_holds(clean):
+def test_rows_missing_from_all_files(clean):
     manifest = read_manifest(clean)
     shard = shard_of(clean, "validation")
     (clean / shard.path).unlink()
@@ -234,7 +234,7 @@ def test_rows_that_no_file_holds(clean):
     assert "validation, data: the files hold 0 rows, expected each of 6 once" in finding
 
 
-def test_rows_that_two_files_hold(clean):
+def test_rows_present_in_two_files(clean):
     manifest = read_manifest(clean)
     shard = shard_of(clean, "validation")
     twin = ShardFile(**{**vars(shard), "path": "validation/data-00009-of-00009.arrow"})
@@ -270,23 +270,23 @@ def test_every_kind_of_tampering_with_the_manifest_is_noticed(clean, capsys):
         assert "manifest.json" in err and "Traceback" not in err
 
 
-def test_any_flipped_bit_of_the_manifest_is_noticed_or_says_nothing_of_the_data(clean):
+def test_any_flipped_bit_of_the_manifest_is_noticed_or_does_not_concern_the_data(clean):
     path = clean / "manifest.json"
-    content, whole = path.read_bytes(), read_manifest(clean)
+    content, manifest = path.read_bytes(), read_manifest(clean)
     rng = np.random.default_rng(0)
     harmless = 0
-    for place in rng.integers(0, len(content), 400):
+    for position in rng.integers(0, len(content), 400):
         changed = bytearray(content)
-        changed[place] ^= 1 << rng.integers(0, 8)
+        changed[position] ^= 1 << rng.integers(0, 8)
         path.write_bytes(changed)
         try:
-            found = read_manifest(clean)
+            changed_manifest = read_manifest(clean)
         except DatasetError:
             continue
-        if found.others != whole.others:
+        if changed_manifest.others != manifest.others:
             assert verify(clean)
         harmless += 1
-        assert replace(found, generator=whole.generator, others=whole.others) == whole
+        assert replace(changed_manifest, generator=manifest.generator, others=manifest.others) == manifest
     assert harmless < 150  # white space, the generator's name, the entries of files that are looked at themselves
 
 

@@ -1,4 +1,4 @@
-"""What a person sees of a long job: a progress bar on standard error, and tables on standard output."""
+"""Console output: a progress bar on standard error, and numbers with units for tables."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterator[Callable[[int], None]]:
     """A rich progress bar over ``total`` steps; yields the function that advances it.
 
-    Shows ``unit`` counted as ``per_step`` a step (52 images a sample), their rate and the time left.
+    Shows the rate of ``unit``, of which a step counts ``per_step`` (52 images a sample), and the time left.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -34,7 +34,7 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
 
 
 def gigabytes(count: float) -> str:
-    """A number of bytes for people."""
+    """A number of bytes as text with a decimal unit, B to GB."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -43,7 +43,7 @@ def gigabytes(count: float) -> str:
 
 
 def millimetres(value: float | None) -> str:
-    """A length for a table; a dash where there is none."""
+    """A length in mm as text for a table; a dash for None."""
     return "-" if value is None else f"{value:.3f}"
 
 

@@ -1,4 +1,4 @@
-"""``--explain`` and ``--no-skip`` of build, predict and fpp-eval: what was left out, as a table and as JSON."""
+"""``--explain`` and ``--no-skip`` of build, predict and fpp-eval: which work was left out, as a table and as JSON."""
 
 import argparse
 from collections.abc import Callable, Iterator
@@ -17,61 +17,63 @@ if TYPE_CHECKING:
 
 def add_explain_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--explain``, ``--explain-json`` and ``--no-skip``."""
-    group = parser.add_argument_group("what is left out")
+    group = parser.add_argument_group("skipped work")
     group.add_argument(
-        "--explain", action="store_true", help="say afterwards what was left out and what it saved (takes a moment)"
+        "--explain", action="store_true", help="print which work was left out and what that saved (takes a moment)"
     )
-    group.add_argument("--explain-json", type=Path, metavar="FILE", help="write that here as JSON; implies --explain")
     group.add_argument(
-        "--no-skip", action="store_true", help="leave nothing out: slower, the results are the same bit by bit"
+        "--explain-json", type=Path, metavar="FILE", help="write the same as JSON into FILE; implies --explain"
+    )
+    group.add_argument(
+        "--no-skip", action="store_true", help="leave no work out: slower, the results are the same bit by bit"
     )
 
 
 @contextmanager
 def as_asked(args: argparse.Namespace) -> Iterator[None]:
-    """Skipping as the arguments want it; refuses, before any work, a JSON file that can't be written."""
+    """Switch skipping as the arguments say; raises, before any work, for a JSON file that can't be written."""
     path = args.explain_json
     if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-        raise FppBenchError(f"--explain-json {path}: expected a file in a folder that exists")
+        raise FppBenchError(f"--explain-json {path}: expected a file in an existing folder; create the folder first")
     with skipping(skipping_enabled() and not args.no_skip):
         yield
 
 
 def explain(args: argparse.Namespace, account: "Callable[[], Explanation]") -> None:
-    """Print the account, and write it, if it was asked for."""
+    """Print the account, and write it as JSON, as the arguments say."""
     if not (args.explain or args.explain_json):
         return
-    found = account()
+    explanation = account()
     from rich.console import Console
 
-    Console().print(explanation_table(found))
+    Console().print(explanation_table(explanation))
     if args.explain_json is not None:
         import json
 
         from fpp_ml_bench.loaders.manifest import write_atomically
 
-        text = json.dumps(found.to_dict(), indent=1, allow_nan=False)
+        text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
         write_atomically(args.explain_json, (text + "\n").encode("utf-8"))
         print(f"Written: {args.explain_json}")
 
 
-def explanation_table(found: "Explanation") -> "Table":
-    """The account as a table; the rules by which seconds were found stand below it."""
+def explanation_table(explanation: "Explanation") -> "Table":
+    """The account as a table, with the rules for the seconds below."""
     from rich.table import Table
     from rich.text import Text
 
     from fpp_ml_bench.commands.console import gigabytes
 
-    state = "left out" if found.skipping else "nothing left out (skipping is off); it would have been"
-    rules = list(dict.fromkeys(line.rule for line in found.lines))
+    state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
+    rules = list(dict.fromkeys(line.rule for line in explanation.lines))
     notes = "\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))
-    table = Table(title=Text(f"{found.command}: {state} ({found.subject})"), title_justify="left",
+    table = Table(title=Text(f"{explanation.command}: {state} ({explanation.subject})"), title_justify="left",
                   caption=Text(notes), caption_justify="left")  # fmt: skip
     for name in ("what", "unit"):
         table.add_column(name)
     for name in ("done", "left out", "share", "bytes", "seconds"):
         table.add_column(name, justify="right")
-    for line in found.lines:
+    for line in explanation.lines:
         seconds = (
             "-"
             if line.seconds_saved is None

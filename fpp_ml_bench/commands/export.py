@@ -1,4 +1,4 @@
-"""``fpp-bench export``: a dataset in the forms that others read."""
+"""``fpp-bench export``: a dataset as Parquet, as the published tree, or its meshes and patterns."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ from fpp_ml_bench.errors import BuildError
 
 SUMMARY = "Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns."
 EXAMPLES = (
-    "fpp-bench export data/mini hub --parquet              plain load_dataset opens every configuration of it",
+    "fpp-bench export data/mini hub --parquet              plain load_dataset opens every configuration",
     "fpp-bench export data/mini tree --mat                 the published layout; fpp-bench import reads it back",
     "fpp-bench export data/mini out --meshes --patterns    several forms: out/meshes and out/patterns",
     "fpp-bench export data/mini test --parquet --split test",
@@ -16,7 +16,7 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
-    parser.add_argument("out", type=Path, metavar="OUT", help="new or empty folder; it appears complete or not at all")
+    parser.add_argument("out", type=Path, metavar="OUT", help="new or empty folder; written completely or not at all")
     parser.add_argument("--parquet", action="store_true", help="Parquet and a card, ready for the Hugging Face Hub")
     parser.add_argument("--mat", action="store_true", help="the published tree: PNG fringes, .mat depth, raw scans")
     parser.add_argument("--meshes", action="store_true", help="the objects' meshes as PLY (metres)")
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export. Raises FppBenchError for a dataset, form or folder that won't do."""
+    """Export. Raises FppBenchError for an unusable dataset, form or folder."""
     from fpp_ml_bench.commands.console import gigabytes, progress_bar
     from fpp_ml_bench.hardware import usable_cores
     from fpp_ml_bench.loaders.export_dataset import FORMS, SAMPLE_FORMS, chosen_splits, export

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
     parser.add_argument("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
     parser.add_argument("--sheet", action="store_true", help="all objects and views on one sheet instead")
-    parser.add_argument("--split", default="all", metavar="SPLIT", help="what --sheet shows (default: all)")
+    parser.add_argument("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)"
     )
@@ -28,15 +28,15 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     if args.sheet == (args.sample is not None):
-        raise DatasetError("name one SAMPLE, or ask for --sheet; `fpp-bench info DATASET --json` lists what there is")
+        raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json` lists the samples")
     out = args.out or Path("sheet.png" if args.sheet else f"{args.sample}.png")
     if out.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
-    opened = DatasetFolder(args.dataset)
+    dataset = DatasetFolder(args.dataset)
     if args.sheet:
-        contact_sheet(opened, args.split, out)
+        contact_sheet(dataset, args.split, out)
     else:
-        opened.split_of_sample(args.sample)
-        sample_picture(opened, args.sample, out)
+        dataset.split_of_sample(args.sample)
+        sample_picture(dataset, args.sample, out)
     print(out)
     return 0
