@@ -3,9 +3,10 @@
     python benchmarks/classical_error.py DATASET [--split test] [--out docs/pictures/classical_error.png]
 
 For N = 3, 4, 6, 9, 18 steps of vertical, horizontal and both fringe directions (with their Gray code), over a split of
-a built dataset, against the exact depth. Interior: object pixels 3 px or more from a depth edge that were measured;
-what edge pixels add, and the share of object pixels not measured, stand beside it. Means over samples; seconds are the
-median a sample on one thread, frames in memory. Prints a Markdown table and draws the figure.
+a built dataset, against the exact depth. Interior: measured object pixels 3 px or more from a depth edge. The table
+also gives the error with edge pixels and the share of object pixels that were not measured. Errors are means over
+samples; seconds are the median per sample on one thread, frames in memory. Prints a Markdown table and draws the
+figure.
 """
 
 import argparse
@@ -44,21 +45,21 @@ class Point:
     seconds: float
 
 
-def measure(opened: DatasetFolder, split: str, direction: str, steps: int) -> Point:
-    method = ClassicalMethod(opened.rig, direction=direction, steps=steps)
+def measure(dataset: DatasetFolder, split: str, direction: str, steps: int) -> Point:
+    method = ClassicalMethod(dataset.rig, direction=direction, steps=steps)
     rows, seconds = [], []
-    for number, sample in enumerate(opened.samples(split)):
-        frames = [opened.frame(sample, i) if i in method.frames_used else None for i in range(len(opened.sequence))]
+    for number, sample in enumerate(dataset.samples(split)):
+        frames = [dataset.frame(sample, i) if i in method.frames_used else None for i in range(len(dataset.sequence))]
         if number == 0:
             method.predict(frames)
         frames = [None if frame is None else frame.copy() for frame in frames]
         started = time.perf_counter()
         depth_mm = method.predict(frames)
         seconds.append(time.perf_counter() - started)
-        target_mm = opened.target_mm(sample, "depth_exact")
+        target_mm = dataset.target_mm(sample, "depth_exact")
         scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX)
-        inside = (target_mm > 0) & (depth_mm > 0) & (edge_distance_px(target_mm) >= EDGE_BAND_PX)
-        error = np.abs(depth_mm[inside].astype(np.float64) - target_mm[inside])
+        interior = (target_mm > 0) & (depth_mm > 0) & (edge_distance_px(target_mm) >= EDGE_BAND_PX)
+        error = np.abs(depth_mm[interior].astype(np.float64) - target_mm[interior])
         rows.append(
             (error.mean(), scores.valid.mae_mm, scores.object.mae_mm, scores.missing / scores.object.pixels,
              scores.background.mae_mm)
@@ -109,12 +110,12 @@ def main() -> int:
     parser.add_argument("--split", default="test")
     parser.add_argument("--out", type=Path, default=Path("classical_error.png"))
     args = parser.parse_args()
-    opened = DatasetFolder(args.dataset)
-    steps = [n for n in STEPS if n <= opened.sequence.steps]
-    points = [measure(opened, args.split, direction, n) for direction in COLOURS for n in steps]
-    height, width = opened.size
-    about = f"{args.split}, {len(opened.samples(args.split))} samples of {height}x{width} px"
-    print(f"{args.dataset} {opened.fingerprint[:8]}, {about}\n")
+    dataset = DatasetFolder(args.dataset)
+    steps = [n for n in STEPS if n <= dataset.sequence.steps]
+    points = [measure(dataset, args.split, direction, n) for direction in COLOURS for n in steps]
+    height, width = dataset.size
+    samples = f"{args.split}, {len(dataset.samples(args.split))} samples of {height}x{width} px"
+    print(f"{args.dataset} {dataset.fingerprint[:8]}, {samples}\n")
     columns = ("fringes", "N", "frames", "interior MAE mm", "x sqrt(N)", "with edge pixels", "not measured",
                "background MAE mm", "ms")  # fmt: skip
     print(f"| {' | '.join(columns)} |")

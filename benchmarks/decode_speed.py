@@ -3,15 +3,15 @@
     python benchmarks/decode_speed.py [--size 960] [--repeats 7]
 
 A tilted plane across the working range is seen by the paper's rig, with ambient light, noise of one grey level and
-8-bit rounding. Every method decodes what ITS OWN patterns look like in that scene, with as equal a number of frames as
+8-bit rounding. Every method decodes what its own patterns look like in that scene, with as equal a number of frames as
 it can:
 
 - ours: 18 sinusoids + 7 Gray bits a direction, to depth in mm;
 - fringes: 18 + 7 sinusoids a direction at two frequencies (it has no Gray code), to projector coordinates; and on the
   same 18 + 18 sinusoids as ours, where it unwraps in space, to a phase relative to an unknown number of periods;
-- OpenCV GrayCodePattern: 42 binary frames (21 and their inverses), black and white, to whole projector pixels, one
-  call a pixel from Python (timed on a sample of pixels and scaled up) or a two-camera disparity map in one call (timed
-  on the stack given twice, and halved). It knows no phase;
+- OpenCV GrayCodePattern: 42 binary frames (21 and their inverses), black and white, to whole projector pixels with
+  one call a pixel from Python (timed on a sample of pixels and scaled up), or to a two-camera disparity map in one call
+  (timed on the stack passed twice, and halved). It has no phase;
 - OpenCV SinusoidalPattern (PSP): 3 of our 18 frames of one direction, to a phase unwrapped in space, relative to an
   unknown whole number of periods, which is taken from the truth here.
 
@@ -58,8 +58,8 @@ class Scene(NamedTuple):
         maps = self.u.astype(np.float32), self.v.astype(np.float32)
         images = []
         for pattern in patterns:
-            seen = cv2.remap(pattern.astype(np.float32), *maps, cv2.INTER_LINEAR)
-            noisy = AMBIENT + ALBEDO * seen + NOISE * rng.standard_normal(seen.shape, dtype=np.float32)
+            light = cv2.remap(pattern.astype(np.float32), *maps, cv2.INTER_LINEAR)
+            noisy = AMBIENT + ALBEDO * light + NOISE * rng.standard_normal(light.shape, dtype=np.float32)
             images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
         return images
 
@@ -99,22 +99,22 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
     rows = []
     variants = [("numba", 1), ("numba", os.cpu_count() or 1)] if numba_enabled() else []
     for kind, threads in [*variants, ("NumPy", 1)]:
-        before = os.environ.get(SWITCH)
+        previous = os.environ.get(SWITCH)
         os.environ[SWITCH] = "1" if kind == "numba" else "0"
         for direction in ("both", "vertical"):
 
             def call(direction: Any = direction, threads: int = threads) -> Any:
                 return decode_stack(frames, rig, direction, threads=threads)
 
-            seconds, found = timed(call, repeats)
+            seconds, decoded = timed(call, repeats)
             exact = decode_stack(frames, rig, direction, details=True).details["vertical"].coordinate_px
-            depth = np.where(found.depth_mm > 0, found.depth_mm, np.nan)
+            depth = np.where(decoded.depth_mm > 0, decoded.depth_mm, np.nan)
             name = f"ours, {kind}, {direction}"
             error = depth - scene.depth_mm
-            rows.append(Row(name, "depth", len(found.frames_used), threads, seconds, exact - scene.u, error))
+            rows.append(Row(name, "depth", len(decoded.frames_used), threads, seconds, exact - scene.u, error))
         os.environ.pop(SWITCH)
-        if before is not None:
-            os.environ[SWITCH] = before
+        if previous is not None:
+            os.environ[SWITCH] = previous
     return rows
 
 
@@ -133,8 +133,8 @@ def run_fringes(scene: Scene, repeats: int) -> list[Row]:
     coder.N = [[18, 7]] * 2
     stack = np.stack(scene.capture(list(coder.encode()[..., 0]), seed=2))
     for threads in sorted({1, os.cpu_count() or 1}):
-        seconds, found = timed(lambda threads=threads: coder.decode(stack, threads=threads), repeats)
-        u, v = (found.x[i, ..., 0].astype(np.float64) for i in (0, 1))
+        seconds, decoded = timed(lambda threads=threads: coder.decode(stack, threads=threads), repeats)
+        u, v = (decoded.x[i, ..., 0].astype(np.float64) for i in (0, 1))
         depth = depth_from_both(scene.rig.camera.rays(), u, v, scene.rig).depth_mm
         error = depth - scene.depth_mm
         rows.append(Row("fringes, both", "coordinates", len(stack), threads, seconds, u - scene.u, error))
@@ -151,22 +151,22 @@ def run_fringes(scene: Scene, repeats: int) -> list[Row]:
 
 def run_opencv(scene: Scene, repeats: int) -> list[Row]:
     rig, projector = scene.rig, scene.rig.projector
-    size = rig.camera.width * rig.camera.height
+    count_px = rig.camera.width * rig.camera.height
     code = cv2.structured_light.GrayCodePattern.create(projector.width, projector.height)
     _, patterns = code.generate()
     black, white = (np.full_like(patterns[0], level) for level in (0, 255))
     images = scene.capture([*patterns, black, white], seed=3)
     stack, count = images[:-2], len(images)
-    picked = np.random.default_rng(0).choice(size, 2000, replace=False)
-    u, v = np.full(size, np.nan), np.full(size, np.nan)
+    pixels = np.random.default_rng(0).choice(count_px, 2000, replace=False)
+    u, v = np.full(count_px, np.nan), np.full(count_px, np.nan)
 
     def sample() -> None:
-        for index in picked:
+        for index in pixels:
             failed, pixel = code.getProjPixel(stack, int(index % rig.camera.width), int(index // rig.camera.width))
             u[index], v[index] = (np.nan, np.nan) if failed else pixel
 
     seconds, _ = timed(sample, 1)
-    seconds *= size / len(picked)
+    seconds *= count_px / len(pixels)
     u, v = u.reshape(rig.camera.height, -1), v.reshape(rig.camera.height, -1)
     error = depth_from_both(rig.camera.rays(), u, v, rig).depth_mm - scene.depth_mm
     threads = cv2.getNumThreads()

@@ -1,21 +1,22 @@
-"""Object error against frames captured and against seconds: from one shot to the full sequence, with the paper's rows.
+"""Object error against frames captured and against seconds, from one frame to the full sequence.
 
     fpp-bench build data/full --preset full
     python benchmarks/frames_curve.py data/full --work frames-work --out docs/pictures/frames_curve.png
+    python benchmarks/frames_curve.py --from docs/pictures/frames_curve.csv --out docs/pictures/frames_curve.png
 
 Settings: the phase route with 1 to 18 fringes of one direction, without Gray code; the classical method with N fringes
-and their Gray code, one direction and both; the whole sequence; the learned route. Scored as ``fpp-eval --target
-depth_exact`` does, object pixels left out included, each with its whole depth. Each setting's result is kept in
-``--work`` as JSON and not computed again; ``--settings`` asks for some of them. Seconds are those of the processor,
-one thread, which other work on the machine does not lengthen much; frames are in memory. The paper's rows are what the
-paper reports, one frame a prediction, without seconds.
+and their Gray code, one direction and both; the phase route with learned order, mask and correction. Scored as
+``fpp-eval --target depth_exact`` does: an object pixel without a prediction counts with its whole depth. Each setting's
+result is stored in ``--work`` as JSON and is not computed again; ``--settings`` selects some of them. Seconds are
+processor time of one thread, which other work on the machine lengthens little; frames are in memory. ``--from`` draws
+the figure again from its CSV file and measures nothing.
 """
 
 import argparse
 import csv
 import json
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import process_time
 
@@ -30,39 +31,32 @@ from fpp_ml_bench.commands.console import progress_bar
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, paper_tables
 from fpp_ml_bench.loaders.store import DatasetFolder
 
-FEW = (1, 2, 3, 4, 6, 9, 18)
+FRAME_COUNTS = (1, 2, 3, 4, 6, 9, 18)
 STEPS = (3, 4, 6, 9, 18)
 WRONG_MM = 60.0
-"""An error that no phase makes, only a wrong order or a missed pixel: under a quarter of the shortest period."""
+"""A larger error comes from a wrong order, not from the phase: this is just under a quarter of the shortest period."""
 SETTINGS: dict[str, tuple[str, dict]] = {
-    **{f"phase {way} {n}": ("phase", {"direction": way, "frames": n}) for way in ("horizontal", "vertical")
-       for n in FEW},
-    **{f"classical {way} {n}": ("classical", {"direction": way, "steps": n})
-       for way in ("horizontal", "vertical", "both") for n in STEPS},
-    **{f"phase-net {way} 1": ("phase-net", {"direction": way}) for way in ("horizontal", "vertical")},
+    **{f"phase {direction} {n}": ("phase", {"direction": direction, "frames": n})
+       for direction in ("horizontal", "vertical") for n in FRAME_COUNTS},
+    **{f"classical {direction} {n}": ("classical", {"direction": direction, "steps": n})
+       for direction in ("horizontal", "vertical", "both") for n in STEPS},
+    **{f"phase-net {direction} 1": ("phase-net", {"direction": direction}) for direction in ("horizontal", "vertical")},
 }  # fmt: skip
-"""Line and point of each setting: its method, and its options."""
-ERROR_TICKS = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+"""Each setting's method and options; the setting's last word is the point on its line."""
+ERROR_TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10)
 FRAME_TICKS = (1, 2, 3, 4, 6, 9, 13, 18, 25, 32, 50)
 MS_TICKS = (20, 30, 50, 100, 200, 300, 500, 1000, 2000)
 STYLES = {
     "phase horizontal": ("tab:orange", "o-", "phase route, horizontal"),
     "phase vertical": ("tab:blue", "o-", "phase route, vertical"),
-    "classical horizontal": ("tab:orange", "s--", "N + Gray code, horizontal"),
-    "classical vertical": ("tab:blue", "s--", "N + Gray code, vertical"),
-    "classical both": ("tab:green", "s--", "N + Gray code, both"),
-    "phase-net horizontal": ("tab:red", "*", "learned route, horizontal"),
-    "phase-net vertical": ("tab:purple", "*", "learned route, vertical"),
+    "classical horizontal": ("tab:orange", "s--", "N steps + Gray code, horizontal"),
+    "classical vertical": ("tab:blue", "s--", "N steps + Gray code, vertical"),
+    "classical both": ("tab:green", "s--", "N steps + Gray code, both"),
+    "phase-net horizontal": ("tab:red", "*", "phase-net, horizontal"),
+    "phase-net vertical": ("tab:purple", "*", "phase-net, vertical"),
 }
-PAPER_SHOWN = (
-    ("normalization", "raw", "UNet, raw mm"), ("normalization", "global", "UNet, global"),
-    ("normalization", "individual", "UNet, range given"), ("loss", "hybrid_l1_0.7", "its best loss, range given"),
-    ("multi_frame", "vertical", "trained on 18, range given"),
-)  # fmt: skip
-"""Table, row and label of the paper's rows in the figure."""
 
 
 @dataclass(frozen=True)
@@ -82,78 +76,78 @@ class Point:
     seconds: float
 
 
-def measure(opened: DatasetFolder, split: str, setting: str, made: Method) -> Point:
+def measure(dataset: DatasetFolder, split: str, setting: str, predictor: Method) -> Point:
     rows, seconds = [], []
-    samples = opened.samples(split)
+    samples = dataset.samples(split)
     with progress_bar(setting, len(samples), "samples") as advance:
         for number, sample in enumerate(samples):
-            frames = captured_frames(opened, made, sample)
+            frames = captured_frames(dataset, predictor, sample)
             if number == 0:
-                made.predict(frames)
+                predictor.predict(frames)
             started = process_time()
-            depth_mm = made.predict(frames)
+            depth_mm = predictor.predict(frames)
             seconds.append(process_time() - started)
-            target_mm = opened.target_mm(sample, "depth_exact")
+            target_mm = dataset.target_mm(sample, "depth_exact")
             scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX).metrics()
-            there = (target_mm > 0) & (depth_mm > 0)
-            far = np.count_nonzero(np.abs(depth_mm - target_mm)[there] > WRONG_MM) / np.count_nonzero(target_mm > 0)
+            measured = (target_mm > 0) & (depth_mm > 0)
+            far = np.count_nonzero(np.abs(depth_mm - target_mm)[measured] > WRONG_MM) / np.count_nonzero(target_mm > 0)
             keys = ("object_mae_mm", "object_valid_mae_mm", "object_interior_mae_mm", "object_edge_mae_mm")
-            named = [float(scores[key] or 0.0) for key in keys]
-            rows.append((*named, 100 * far, 100 * (scores["object_missing_share"] or 0), scores["background_mae_mm"]))
+            errors_mm = [float(scores[key] or 0.0) for key in keys]
+            missing = scores["object_missing_share"] or 0
+            rows.append((*errors_mm, 100 * far, 100 * missing, scores["background_mae_mm"]))
             advance(1)
-    table = np.array(rows, dtype=np.float64)
-    whole, measured, interior, edge, far, missing, background = map(float, table.mean(axis=0))
+    scores_by_sample = np.array(rows, dtype=np.float64)
+    whole, valid, interior, edge, far, missing, background = map(float, scores_by_sample.mean(axis=0))
     return Point(
-        setting, len(made.frames_used), whole, float(np.median(table[:, 0])), measured, interior, edge, far, missing,
-        background, float(np.median(seconds)),
+        setting, len(predictor.frames_used), whole, float(np.median(scores_by_sample[:, 0])), valid, interior, edge,
+        far, missing, background, float(np.median(seconds)),
     )  # fmt: skip
 
 
-def point(opened: DatasetFolder, split: str, setting: str, work: Path) -> Point | None:
-    """The kept result of a setting, or a new one; None where there is no such method here."""
+def point(dataset: DatasetFolder, split: str, setting: str, work: Path) -> Point | None:
+    """The stored result of a setting, or a new measurement; None where the method is not available."""
     name, options = SETTINGS[setting]
     path = work / f"{setting.replace(' ', '-')}.json"
     try:
-        made = method(name, opened.rig, **options)
+        predictor = method(name, dataset.rig, **options)
     except (FppBenchError, ImportError) as reason:
         print(f"{setting}: left out ({reason})")
         return None
     key = {
-        "dataset": opened.fingerprint, "split": split,
-        "settings": {one: str(value) for one, value in made.settings.items()},
+        "dataset": dataset.fingerprint, "split": split,
+        "settings": {option: str(value) for option, value in predictor.settings.items()},
     }  # fmt: skip
     if path.is_file():
-        kept = json.loads(path.read_text())
-        if kept["key"] == key:
-            return Point(**kept["point"])
-    found = measure(opened, split, setting, made)
-    path.write_text(json.dumps({"key": key, "point": asdict(found)}, indent=1) + "\n")
-    return found
+        stored = json.loads(path.read_text())
+        if stored["key"] == key:
+            return Point(**stored["point"])
+    measured = measure(dataset, split, setting, predictor)
+    path.write_text(json.dumps({"key": key, "point": asdict(measured)}, indent=1) + "\n")
+    return measured
+
+
+def read_points(path: Path) -> list[Point]:
+    """The points of a CSV file that `table` wrote."""
+    kinds = {field.name: field.type for field in fields(Point)}
+    with path.open(newline="", encoding="utf-8") as file:
+        return [Point(**{key: kinds[key](text) for key, text in row.items()}) for row in csv.DictReader(file)]
 
 
 def draw(points: list[Point], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    fastest, slowest = (1000 * pick(p.seconds for p in points) for pick in (min, max))
+    fastest, slowest = (1000 * extreme(p.seconds for p in points) for extreme in (min, max))
     figure = Figure(figsize=(12.5, 5.4), dpi=110, layout="constrained")
     by_frames, by_time = figure.subplots(1, 2, sharey=True)
     for line, (colour, style, label) in STYLES.items():
-        some = [p for p in points if p.setting.rsplit(" ", 1)[0] == line]
-        if not some:
+        on_line = [p for p in points if p.setting.rsplit(" ", 1)[0] == line]
+        if not on_line:
             continue
-        for axes, x in ((by_frames, [p.frames for p in some]), (by_time, [1000 * p.seconds for p in some])):
-            axes.plot(x, [p.object_mae_mm for p in some], style, color=colour, label=label, markersize=6)
-    for number, (table, row, label) in enumerate(PAPER_SHOWN):
-        (found,) = (one for one in paper_tables()[table].rows if one.row == row)
-        error = found.errors_mm["object_mae_mm"]
-        title = PAPER_HEADING if number == 0 else None
-        by_frames.plot(1, error, "D", color="k", fillstyle="none", label=title)
-        right = 150 if row == "hybrid_l1_0.7" else 8  # beside its neighbours' labels, which lie close above and below
-        text = f"{label}: {error:g}"
-        by_frames.annotate(text, (1, error), xytext=(right, -3), textcoords="offset points", fontsize=7)
+        for axes, x in ((by_frames, [p.frames for p in on_line]), (by_time, [1000 * p.seconds for p in on_line])):
+            axes.plot(x, [p.object_mae_mm for p in on_line], style, color=colour, label=label, markersize=6)
     by_frames.set_xlabel("frames captured")
-    by_time.set_xlabel("milliseconds of one processor thread an image")
+    by_time.set_xlabel("processor milliseconds per image (one thread)")
     by_frames.set_ylabel("object MAE against exact depth, mm")
     by_frames.legend(fontsize=7, loc="upper right")
     for axes in (by_frames, by_time):
@@ -192,17 +186,24 @@ def table(points: list[Point], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", type=Path, help="dataset folder with all frames and the exact depth")
+    parser.add_argument("dataset", type=Path, nargs="?", help="dataset folder with all frames and the exact depth")
+    parser.add_argument("--from", dest="csv", type=Path, metavar="CSV", help="draw this file again, measure nothing")
     parser.add_argument("--split", default="test")
-    parser.add_argument("--work", type=Path, default=Path("frames-work"), help="folder that keeps each result")
+    parser.add_argument("--work", type=Path, default=Path("frames-work"), help="folder that stores each result")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS), metavar="SETTING")
     parser.add_argument("--out", type=Path, default=Path("frames_curve.png"), help="figure; the CSV lies beside it")
     args = parser.parse_args()
+    if (args.dataset is None) == (args.csv is None):
+        parser.error("give a dataset folder, or --from with a CSV file")
+    if args.csv is not None:
+        draw(read_points(args.csv), args.out)
+        print(args.out)
+        return
     cv2.setNumThreads(1)
     args.work.mkdir(parents=True, exist_ok=True)
-    opened = DatasetFolder(args.dataset)
-    found = [point(opened, args.split, setting, args.work) for setting in args.settings]
-    points = [one for one in found if one is not None]
+    dataset = DatasetFolder(args.dataset)
+    measured = [point(dataset, args.split, setting, args.work) for setting in args.settings]
+    points = [p for p in measured if p is not None]
     table(points, args.out.with_suffix(".csv"))
     draw(points, args.out)
     print(f"\n{args.out}\n{args.out.with_suffix('.csv')}")

@@ -3,8 +3,8 @@
     python benchmarks/fresh_objects.py meshes --count 36 --seed 7
     fpp-bench build data/fresh --preset full --frames sinusoidal --meshes meshes/list.yaml
 
-Writes binary PLY files in metres and a list of them, all in the training split. Shapes are drawn without a look at any
-object of the benchmark; sizes are those that its objects have in the image, a tenth of its area more or less.
+Writes binary PLY files in metres and a list of them, all in the training split. The shapes do not depend on the
+benchmark's objects; their sizes are similar, about a tenth of the image area.
 """
 
 import argparse
@@ -20,7 +20,7 @@ FACETS = 32
 
 
 def solid(random: Random, size: np.ndarray) -> trimesh.Trimesh:
-    """One simple solid that fills a box of ``size`` (x, y, z) in m."""
+    """A simple solid that fills a box of ``size`` (x, y, z) in m."""
     kind = random.integers(6)
     if kind <= 1:
         part = trimesh.creation.box((1, 1, 1))
@@ -102,7 +102,7 @@ KINDS: tuple[Callable[[Random], list[trimesh.Trimesh]], ...] = (pile, cluster, f
 
 
 def fresh_mesh(random: Random, kind: Callable[[Random], list[trimesh.Trimesh]]) -> trimesh.Trimesh:
-    """One object in m, centred, 0.2 to 0.55 m across."""
+    """A random object in m, centred, 0.2 to 0.55 m across."""
     mesh = turned(random, trimesh.util.concatenate(kind(random)), 0.3)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     across = float(np.linalg.norm(mesh.extents))

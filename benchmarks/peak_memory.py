@@ -1,4 +1,4 @@
-"""Peak memory of each command against rows and image size: a process each, its largest resident set by the kernel.
+"""Peak memory of each command against rows and image size: each command in a process, its largest resident set.
 
     python benchmarks/peak_memory.py [--rows 24,48,96] [--sizes 240,480,960] [--folder DIR]
 
@@ -24,41 +24,41 @@ ROWS_AT_PX = 240
 _RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); from fpp_ml_bench.{module} import main; sys.exit(main())"
 
 
-def command(name: str, *words: str) -> list[str]:
+def command(name: str, *arguments: str) -> list[str]:
     module = "commands.evaluate" if name == "fpp-eval" else "commands"
     first = [] if name == "fpp-eval" else [name]
-    return [sys.executable, "-c", _RUN.format(module=module), str(ROOT), *first, *words]
+    return [sys.executable, "-c", _RUN.format(module=module), str(ROOT), *first, *arguments]
 
 
-def peak_mib(words: list[str]) -> float:
+def peak_mib(arguments: list[str]) -> float:
     """Largest resident set of a process, MiB. Raises `SystemExit` where it fails."""
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     error = process.stderr.read() if process.stderr else b""
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise SystemExit(f"{' '.join(words[3:])}: {error.decode()[-2000:]}")
+        raise SystemExit(f"{' '.join(arguments[3:])}: {error.decode()[-2000:]}")
     return usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def measure(folder: Path, rows: int, size: int) -> dict[str, float]:
     """MiB by command, on a dataset of its own that is removed again."""
     names = [name for name in OBJECTS if split_of(name) == "train"][: rows // len(VIEWS)]
-    place = Path(tempfile.mkdtemp(prefix="fpp-memory-", dir=folder))
-    data = str(place / "set")
+    scratch = Path(tempfile.mkdtemp(prefix="fpp-memory-", dir=folder))
+    data = str(scratch / "set")
     try:
         build = command("build", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1")
-        found = {"build": peak_mib(build)}
+        peaks = {"build": peak_mib(build)}
         for method, options in (("classical", ()), ("classical --fewest", ("--steps", "3")), ("phase", ())):
-            out = str(place / f"predictions-{len(found)}")
-            words = (*method.split(), data, "--split", "train", "--out", out, *options)
-            found[f"predict {method}"] = peak_mib(command("predict", *words))
-        found["fpp-eval"] = peak_mib(command("fpp-eval", out, "--dataset", data, "--split", "train"))
-        found["verify"] = peak_mib(command("verify", data))
-        found["info"] = peak_mib(command("info", data))
-        return found
+            out = str(scratch / f"predictions-{len(peaks)}")
+            arguments = (*method.split(), data, "--split", "train", "--out", out, *options)
+            peaks[f"predict {method}"] = peak_mib(command("predict", *arguments))
+        peaks["fpp-eval"] = peak_mib(command("fpp-eval", out, "--dataset", data, "--split", "train"))
+        peaks["verify"] = peak_mib(command("verify", data))
+        peaks["info"] = peak_mib(command("info", data))
+        return peaks
     finally:
-        shutil.rmtree(place)
+        shutil.rmtree(scratch)
 
 
 def table(title: str, columns: list[str], results: list[dict[str, float]]) -> None:
@@ -74,7 +74,7 @@ def main() -> int:
     parser.add_argument("--sizes", default="240,480,960", help="image sizes at the first number of rows")
     parser.add_argument("--folder", type=Path, help="where the datasets go (default: a temporary folder)")
     args = parser.parse_args()
-    rows, sizes = ([int(text) for text in given.split(",")] for given in (args.rows, args.sizes))
+    rows, sizes = ([int(number) for number in numbers.split(",")] for numbers in (args.rows, args.sizes))
     by_rows = [measure(args.folder, count, ROWS_AT_PX) for count in rows]
     table(f"rows at {ROWS_AT_PX} px", [f"{count} rows" for count in rows], by_rows)
     by_size = [by_rows[0] if size == ROWS_AT_PX else measure(args.folder, rows[0], size) for size in sizes]

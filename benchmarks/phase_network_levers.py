@@ -1,10 +1,10 @@
-"""What each lever of phase-net is worth, and the paper's UNet as a guide to the order instead of it.
+"""What each learned part of phase-net is worth, and the order taken from the depth of a UNet instead.
 
     python benchmarks/phase_network_levers.py DATASET [--split test] [--fringe vertical] [--per-object] [--hybrid]
         [--brief] [--weights FILE] [--pictures docs/pictures]
 
 Needs a generated dataset at 960 px with the fringe's first frame: ``fpp-bench build data/full --preset full``. Times
-are the processor's, on one thread: what else runs on the machine does not count.
+are processor seconds on one thread.
 """
 
 import argparse
@@ -44,39 +44,39 @@ VARIANTS: dict[str, Levers] = {
     "the same, correction within pi / 8": Levers(bound_rad=np.pi / 8),
 }
 BLIND = "the same, without brightness"
-HYBRID = "order by the paper's UNet (unet-global-rmse, 224 px), nothing else learned"
+HYBRID = "order from a UNet's depth (unet-global-rmse, 224 px), nothing else learned"
 COLUMNS = ("mean", "median view", "wrong order %", "right-order", "missed %", "background", "CPU seconds")
 
 
-def compare(found: Measurement, route: NetworkRoute, target: np.ndarray) -> dict[str, float]:
+def compare(measurement: Measurement, route: NetworkRoute, target: np.ndarray) -> dict[str, float]:
     """Scores of one sample in mm and percent of object pixels; a wrong order is off by more than half a period."""
     inside = object_mask(target)
-    both = inside & (found.depth_mm > 0)
-    layer = route.geometry.layer.at(both)
-    true = layer.absolute_phase(target[both])
-    off = found.wrapped_phase[both] + TAU * found.order[both] - true
-    wrong = np.abs(off) > np.pi
-    error = np.abs(found.depth_mm - target)
+    measured = inside & (measurement.depth_mm > 0)
+    layer = route.geometry.layer.at(measured)
+    true_phase = layer.absolute_phase(target[measured])
+    phase_error = measurement.wrapped_phase[measured] + TAU * measurement.order[measured] - true_phase
+    wrong = np.abs(phase_error) > np.pi
+    error = np.abs(measurement.depth_mm - target)
     return {
         "mean": error[inside].mean(),
         "wrong order %": 100 * wrong.sum() / inside.sum(),
-        "right-order": error[both][~wrong].mean(),
-        "missed %": 100 * (inside & ~both).sum() / inside.sum(),
-        "background": found.depth_mm[~inside].mean(),
+        "right-order": error[measured][~wrong].mean(),
+        "missed %": 100 * (inside & ~measured).sum() / inside.sum(),
+        "background": measurement.depth_mm[~inside].mean(),
     }
 
 
-def guided(asked: Asked, route: NetworkRoute, depth_mm: np.ndarray) -> Measurement:
-    """The candidate order nearest to a depth map's."""
-    seen = asked.seen
-    wanted = np.rint((seen.layer.absolute_phase(np.maximum(depth_mm[seen.crop], 1.0)) - seen.phase_rad) / TAU)
+def measure_with_order_of(depth_mm: np.ndarray, observation: Asked, route: NetworkRoute) -> Measurement:
+    """The phase route's depth with the candidate order nearest to the order of ``depth_mm``."""
+    seen = observation.seen
+    depth_order = np.rint((seen.layer.absolute_phase(np.maximum(depth_mm[seen.crop], 1.0)) - seen.phase_rad) / TAU)
     first, count = seen.candidates.first, seen.candidates.count
-    order = np.clip(wanted, first, first + np.maximum(count, 1) - 1).astype(np.int32)
-    return route.geometry.route.conclude(seen, order, np.zeros_like(asked.margin))
+    order = np.clip(depth_order, first, first + np.maximum(count, 1) - 1).astype(np.int32)
+    return route.geometry.route.conclude(seen, order, np.zeros_like(observation.margin))
 
 
 def unet(size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
-    """The paper's network at its own size, its depth map brought to ``size`` (H, W)."""
+    """The shipped UNet at the image size it was trained at, its depth map resized to ``size`` (H, W)."""
     model = load("unet-global-rmse", "cpu")
     height, width = model.config.image_size
 
@@ -89,9 +89,9 @@ def unet(size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
 
 def table(rows: dict[str, list[dict[str, float]]]) -> None:
     print("| learned | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
-    for title, found in rows.items():
-        means = {key: np.mean([one[key] for one in found]) for key in found[0]}
-        means["median view"] = np.median([one["mean"] for one in found])
+    for title, samples in rows.items():
+        means = {key: np.mean([scores[key] for scores in samples]) for key in samples[0]}
+        means["median view"] = np.median([scores["mean"] for scores in samples])
         print(f"| {title} | " + " | ".join(f"{means[key]:.2f}" if key in means else "" for key in COLUMNS) + " |")
 
 
@@ -99,38 +99,38 @@ def by_object(rows: list[dict[str, float]], names: list[str]) -> None:
     objects = list(dict.fromkeys(name.rsplit("_A", 1)[0] for name in names))
     print("| object | " + " | ".join(key for key in COLUMNS if key in rows[0]) + " |")
     print("|---|" + "---|" * sum(key in rows[0] for key in COLUMNS))
-    for one in objects:
-        own = [row for row, name in zip(rows, names, strict=True) if name.rsplit("_A", 1)[0] == one]
-        print(
-            f"| {one} | " + " | ".join(f"{np.mean([row[k] for row in own]):.2f}" for k in COLUMNS if k in own[0]) + " |"
-        )
+    for item in objects:
+        views = [row for row, name in zip(rows, names, strict=True) if name.rsplit("_A", 1)[0] == item]
+        means = [f"{np.mean([row[key] for row in views]):.2f}" for key in COLUMNS if key in views[0]]
+        print(f"| {item} | {' | '.join(means)} |")
 
 
-def pictures(opened: DatasetFolder, method: PhaseNetMethod, folder: Path) -> None:
+def pictures(dataset: DatasetFolder, method: PhaseNetMethod, folder: Path) -> None:
     """Fringe, wrapped phase, order, depth, error and correction of the views that docs/phase_route.md shows."""
     import matplotlib
 
     matplotlib.use("Agg")
 
     for sample in SHOWN:
-        image, target = np.array(opened.frame(sample, method.frames_used[0])), opened.depth_mm(sample)
-        asked = method.route.observe(image)
-        found = method.route.conclude(asked)
-        shown = object_mask(target) | (found.depth_mm > 0)
+        image, target = np.array(dataset.frame(sample, method.frames_used[0])), dataset.depth_mm(sample)
+        observation = method.route.observe(image)
+        measurement = method.route.conclude(observation)
+        shown = object_mask(target) | (measurement.depth_mm > 0)
         rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
         box = (slice(max(rows[0] - 8, 0), rows[-1] + 8), slice(max(columns[0] - 8, 0), columns[-1] + 8))
-        none = np.where(found.depth_mm > 0, 1.0, np.nan)[box]
+        blank = np.where(measurement.depth_mm > 0, 1.0, np.nan)[box]
         limits = np.percentile(target[object_mask(target)], [1, 99])
         correction = np.zeros(image.shape)
-        correction[asked.seen.crop] = 0 if asked.answers is None else asked.answers.correction_rad
+        if observation.answers is not None:
+            correction[observation.seen.crop] = observation.answers.correction_rad
         error = {"cmap": "RdBu", "vmin": -20, "vmax": 20}
         panels = (
             ("fringe, grey levels", image[box], {"cmap": "gray"}),
-            ("wrapped phase, rad", found.wrapped_phase[box], {"cmap": "twilight"}),
-            ("order", found.order[box] * none, {"cmap": "viridis"}),
-            ("depth, mm", found.depth_mm[box] * none, {"vmin": limits[0], "vmax": limits[1]}),
-            ("error, mm", np.where(shown, found.depth_mm - target, np.nan)[box], error),
-            ("correction, rad", correction[box] * none, {"cmap": "PuOr", "vmin": -0.6, "vmax": 0.6}),
+            ("wrapped phase, rad", measurement.wrapped_phase[box], {"cmap": "twilight"}),
+            ("order", measurement.order[box] * blank, {"cmap": "viridis"}),
+            ("depth, mm", measurement.depth_mm[box] * blank, {"vmin": limits[0], "vmax": limits[1]}),
+            ("error, mm", np.where(shown, measurement.depth_mm - target, np.nan)[box], error),
+            ("correction, rad", correction[box] * blank, {"cmap": "PuOr", "vmin": -0.6, "vmax": 0.6}),
         )
         draw_panels(
             panels, f"{sample}, phase-net, one {method.options.direction} fringe", folder / f"phase_net_{sample}.png"
@@ -144,42 +144,43 @@ def main() -> None:
     parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
     parser.add_argument("--weights", metavar="NAME|FILE", help="default: phase-net, as shipped")
     parser.add_argument("--per-object", action="store_true")
-    parser.add_argument("--brief", action="store_true", help="only the network with all its levers, and with none")
-    parser.add_argument("--hybrid", action="store_true", help="also the paper's UNet as a guide to the order")
+    parser.add_argument("--brief", action="store_true", help="only phase-net and the same with nothing learned")
+    parser.add_argument("--hybrid", action="store_true", help="also the order from the depth of a UNet")
     parser.add_argument("--blind", action="store_true", help="also without brightness")
     parser.add_argument("--every", type=int, default=1, help="only every n-th sample")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="also write the pictures there")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    opened = DatasetFolder(args.dataset)
-    method = PhaseNetMethod(opened.rig, args.fringe, args.weights or DEFAULT)
-    blind = PhaseNetMethod(opened.rig, args.fringe, method.file, shading=False) if args.blind else None
-    guide = unet(opened.size) if args.hybrid else None
+    dataset = DatasetFolder(args.dataset)
+    method = PhaseNetMethod(dataset.rig, args.fringe, args.weights or DEFAULT)
+    blind = PhaseNetMethod(dataset.rig, args.fringe, method.file, shading=False) if args.blind else None
+    predict_depth = unet(dataset.size) if args.hybrid else None
     variants = {title: VARIANTS[title] for title in ((NOTHING_LEARNED, FULL) if args.brief else VARIANTS)}
     rows: dict[str, list[dict[str, float]]] = {}
-    names = opened.samples(args.split)[:: args.every]
+    names = dataset.samples(args.split)[:: args.every]
     for number, name in enumerate(names):
-        image, target = np.array(opened.frame(name, method.frames_used[0])), opened.depth_mm(name)
+        image, target = np.array(dataset.frame(name, method.frames_used[0])), dataset.depth_mm(name)
         if number == 0:
             method.route.measure(image)
         started = process_time()
-        asked = method.route.observe(image)
+        observation = method.route.observe(image)
         shared = process_time() - started
         started = process_time()
         method.route.geometry.route.observe(image)
         network = shared - (process_time() - started)
         for title, levers in variants.items():
             started = process_time()
-            found = method.route.conclude(asked, levers)
+            measurement = method.route.conclude(observation, levers)
             seconds = shared + process_time() - started
             if levers == NOTHING:
                 seconds -= network
-            rows.setdefault(title, []).append(compare(found, method.route, target) | {"CPU seconds": seconds})
+            rows.setdefault(title, []).append(compare(measurement, method.route, target) | {"CPU seconds": seconds})
         if blind is not None:
             rows.setdefault(BLIND, []).append(compare(blind.route.measure(image), method.route, target))
-        if guide is not None:
-            rows.setdefault(HYBRID, []).append(compare(guided(asked, method.route, guide(image)), method.route, target))
+        if predict_depth is not None:
+            hybrid = measure_with_order_of(predict_depth(image), observation, method.route)
+            rows.setdefault(HYBRID, []).append(compare(hybrid, method.route, target))
     print(
         f"\n{args.dataset.name}, {args.split}, {args.fringe} fringe: {len(names)} samples, object and background in mm"
     )
@@ -189,7 +190,7 @@ def main() -> None:
             print(f"\n{title}")
             by_object(rows[title], names)
     if args.pictures:
-        pictures(opened, method, args.pictures)
+        pictures(dataset, method, args.pictures)
 
 
 if __name__ == "__main__":

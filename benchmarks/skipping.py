@@ -1,16 +1,16 @@
-"""What leaving out saves on a sparse scene, and what it costs on a full one: the same work with skipping on and off.
+"""What skipping unneeded work saves on a sparse scene and costs on a full one: the same work with skipping on and off.
 
     python benchmarks/skipping.py [--size 960] [--repeats 5] [--scenes pen,drum] [--no-builds]
         [--folder DIR] [--json FILE]
 
 Two scenes go through everything: a pen (about 3% of the image) and the largest drum that still fits the image and the
-working range (about three quarters of it). Each piece of work runs with skipping on and off in turns, in this one
-process; the figures are medians of processor seconds, which a busy machine does not move much, and the ratio is of
+working range (about 70% of the image). Each piece of work runs with skipping on and off in turns, in one process; the
+figures are medians of processor seconds, which other work on the machine changes little, and the ratio is taken of
 those. Results are compared bit by bit as they come. The first round compiles and is not counted.
 
 - build: the real builder, six views, all 52 frames stored, and frame 0 alone.
-- decode: 52 frames to depth from both directions, when nobody asks for reasons (what ``predict classical`` does); and
-  asked for the object's mask alone, against the whole image.
+- decode: 52 frames to depth from both directions without the reasons of invalid pixels (as ``predict classical`` does);
+  and inside the object mask alone, against the whole image.
 - the fewest frames: the same depth from 36 frames, and from 6 instead of 20.
 - phase: the single-shot phase route in its crop around the object, against the whole image. The crop is part of that
   method, so its maps are not compared.
@@ -91,36 +91,36 @@ def measure(
     user = single_mesh(mesh)
     rows: list[dict[str, Any]] = []
 
-    def add(what: str, on: Work, off: Work, compared: bool = True, rounds: int = repeats) -> None:
+    def add(title: str, on: Work, off: Work, compared: bool = True, rounds: int = repeats) -> None:
         first, second, same = seconds(on, off, rounds)
         if compared and not same:
-            raise SystemExit(f"{name}, {what}: the results differ")
-        rows.append({"what": what, "on_s": first, "off_s": second, "ratio": second / first, "compared": compared})
-        print(f"  {what:44s} {1000 * first:9.1f} {1000 * second:9.1f} ms {second / first:6.2f}", flush=True)
+            raise SystemExit(f"{name}, {title}: the results differ")
+        rows.append({"what": title, "on_s": first, "off_s": second, "ratio": second / first, "compared": compared})
+        print(f"  {title:44s} {1000 * first:9.1f} {1000 * second:9.1f} ms {second / first:6.2f}", flush=True)
 
     for stored in ("all", "single_shot") if builds else ():
         settings = BuildSettings(paper_rig(size), (user.name,), stored=stored, user_meshes=(user,))
 
-        def made(settings: BuildSettings = settings) -> list[str]:
+        def build_hashes(settings: BuildSettings = settings) -> list[str]:
             with tempfile.TemporaryDirectory(dir=folder) as target:
                 build(Path(target) / "set", settings, workers=1)
                 return [file_hash(path) for path in sorted((Path(target) / "set").rglob("*")) if path.is_file()]
 
-        add(f"build, 6 views, {'52 frames' if stored == 'all' else 'frame 0'}", *switched(made),
+        add(f"build, 6 views, {'52 frames' if stored == 'all' else 'frame 0'}", *switched(build_hashes),
             rounds=max(1, repeats // 2))  # fmt: skip
     build(folder / name / "all", BuildSettings(paper_rig(size), (user.name,), user_meshes=(user,)), workers=1)
-    opened = DatasetFolder(folder / name / "all")
-    rig, samples = opened.rig, opened.samples("test")
-    stacks = {sample: [frame.copy() for frame in opened.frames(sample, range(52))] for sample in samples[:2]}
+    dataset = DatasetFolder(folder / name / "all")
+    rig, samples = dataset.rig, dataset.samples("test")
+    stacks = {sample: [frame.copy() for frame in dataset.frames(sample, range(52))] for sample in samples[:2]}
     frames = stacks[samples[0]]
-    seen = opened.depth_mm(samples[0], "depth_exact") > 0
+    mask = dataset.depth_mm(samples[0], "depth_exact") > 0
 
     def depth(**options: Any) -> bytes:
         return decode_stack(frames, rig, **options).depth_mm.tobytes()
 
     add("decode, depth alone", *switched(lambda: depth(reasons=False)))
-    add("decode in the mask, against whole and masked", lambda: depth(mask=seen, reasons=False),
-        lambda: np.where(seen, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes())  # fmt: skip
+    add("decode in the mask, against whole and masked", lambda: depth(mask=mask, reasons=False),
+        lambda: np.where(mask, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes())  # fmt: skip
     add("36 frames against 50", lambda: depth(fewest=True, reasons=False), lambda: depth(reasons=False))
     add("6 frames against 20", lambda: depth(steps=3, fewest=True, reasons=False),
         lambda: depth(steps=3, reasons=False))  # fmt: skip
@@ -131,14 +131,14 @@ def measure(
     rng = np.random.default_rng(0)
     pairs = []
     for sample in samples:
-        target = opened.depth_mm(sample).copy()
+        target = dataset.depth_mm(sample).copy()
         pairs.append(((target + rng.normal(0, 2, target.shape) * (target > 0)).astype(np.float32), target))
 
     def scores() -> list[Any]:
         return [score_sample(*pair).metrics() for pair in pairs]
 
     add("every score of 6 samples", *switched(scores))
-    cover = sum(opened.measured(sample)["object_px"] for sample in samples) / (len(samples) * size * size)
+    cover = sum(dataset.measured(sample)["object_px"] for sample in samples) / (len(samples) * size * size)
     return f"{name}, {100 * cover:.1f}% cover", rows
 
 

@@ -6,17 +6,17 @@
 At the paper's scale on a GPU (960 px, width 64), at the cpu preset's on a processor (224 px, width 8).
 
 Both train the same network from the same weights with RMSE and RMSprop on the same images, which it builds and exports
-itself (``fpp-bench build``, ``fpp-bench export --mat``), each in a process of its own, taking turns epoch by epoch.
+itself (``fpp-bench build``, ``fpp-bench export --mat``), each in its own process, in turns, epoch by epoch.
 
 - ours: the engine itself (`fpp_ml_bench.baselines.training.engine`) on the memory-mapped Arrow files; on a GPU with
   bfloat16, channels_last and torch.compile as the paper's preset says, on a processor in float32.
 - plain: torch's ``Dataset`` and ``DataLoader`` over PNG (cv2) and .mat (scipy), torch's default settings, float32,
   ``loss.item()`` after every step. With ``--loader-workers N`` once more with that many reading processes.
 
-"epoch" is whole epochs with nothing waited for in between, in ms a step: the ratio is taken there. "data" and "compute"
-are other epochs, in which a GPU is waited for after each part. Medians over epochs, the first one (compilation, caches)
-left out. "loss" is that of the last epoch: the two learn alike. "GiB" is the GPU's peak of allocated memory, on a
-processor the process's peak.
+"epoch" is the time of whole epochs without synchronisation, in ms a step; the ratio is taken of it. "data" and
+"compute" come from further epochs, in which the GPU is synchronised after each part. Medians over epochs without the
+first, which compiles and fills caches. "loss" is that of the last epoch and shows that both learn alike. "GiB" is the
+GPU's peak of allocated memory, or the process's peak on a CPU.
 
 The table is the engine's step alone, on random images already in place and without torch.compile.
 """
@@ -60,14 +60,14 @@ def make_data(scratch: Path, size: int, count: int) -> tuple[Path, Path]:
         ["build", dataset, "--size", size, "--objects", objects, "--frames", "single_shot"],
         ["export", dataset, tree, "--mat"],
     ):
-        made = subprocess.run([*command, *map(str, arguments)], cwd=root, capture_output=True, text=True)
-        if made.returncode:
-            raise SystemExit(f"fpp-bench {arguments[0]} failed:\n{made.stderr}")
+        completed = subprocess.run([*command, *map(str, arguments)], cwd=root, capture_output=True, text=True)
+        if completed.returncode:
+            raise SystemExit(f"fpp-bench {arguments[0]} failed:\n{completed.stderr}")
     return dataset, tree
 
 
 def check_same(dataset: Path, tree: Path) -> None:
-    """Both ways must read the same numbers."""
+    """Raise `SystemExit` unless both read the same numbers."""
     ours, plain = FringeDepthDataset(dataset, "train"), PngAndMat(tree)
     names = {path.stem: index for index, path in enumerate(plain.fringes)}
     if len(ours) != len(plain):
@@ -82,24 +82,26 @@ def compare(args: argparse.Namespace, scratch: Path) -> None:
     dataset, tree = make_data(scratch, args.size, args.objects)
     check_same(dataset, tree)
     job = Job(dataset, scratch, args.network, args.size, args.width, args.batch, args.threads)
-    ways: list[tuple[str, type[Ours] | type[Plain], Job]] = [("plain loop, PNG + .mat", Plain, job._replace(data=tree))]
+    loops: list[tuple[str, type[Ours] | type[Plain], Job]] = [
+        ("plain loop, PNG + .mat", Plain, job._replace(data=tree))
+    ]
     if args.loader_workers:
         name = f"plain loop, {args.loader_workers} reading processes"
-        ways.append((name, Plain, job._replace(data=tree, loader_workers=args.loader_workers)))
-    ways.append(("ours", Ours, job))
-    whole: list[list[Epoch]] = [[] for _ in ways]
-    apart: list[list[Epoch]] = [[] for _ in ways]
+        loops.append((name, Plain, job._replace(data=tree, loader_workers=args.loader_workers)))
+    loops.append(("ours", Ours, job))
+    whole: list[list[Epoch]] = [[] for _ in loops]
+    apart: list[list[Epoch]] = [[] for _ in loops]
     with contextlib.ExitStack() as stack:
-        pools = [stack.enter_context(process(start, kind, task)) for _, kind, task in ways]
-        for found, split in [(None, False), *[(whole, False), (apart, True)] * args.epochs]:
-            for place, pool in enumerate(pools):
+        pools = [stack.enter_context(process(start, kind, task)) for _, kind, task in loops]
+        for records, split in [(None, False), *[(whole, False), (apart, True)] * args.epochs]:
+            for index, pool in enumerate(pools):
                 epoch = pool.submit(run_epoch, split).result()
-                if found is not None:
-                    found[place].append(epoch)
+                if records is not None:
+                    records[index].append(epoch)
     columns = "".join(f"{column:>10s}" for column in ("epoch", "data", "compute", "loss", "GiB", "faster"))
     print(f"\n{'ms a step':34s}{columns}")
     first = median(whole[0], "step")
-    for (name, *_), epochs, parts in zip(ways, whole, apart, strict=True):
+    for (name, *_), epochs, parts in zip(loops, whole, apart, strict=True):
         step, data, compute = median(epochs, "step"), median(parts, "data"), median(parts, "compute")
         print(
             f"{name:34s}{1e3 * step:10.1f}{1e3 * data:10.1f}{1e3 * compute:10.1f}{parts[-1].loss:10.4f}"
@@ -138,13 +140,13 @@ def main() -> int:
     parser.add_argument("--objects", type=int, default=8, help="training objects, six pairs each (default: 8)")
     parser.add_argument("--epochs", type=int, default=5, help="epochs measured of each kind (default: 5)")
     parser.add_argument("--threads", type=int, help="of torch on the processor (default: torch's own)")
-    parser.add_argument("--loader-workers", type=int, default=0, help="a third way: plain loop with so many processes")
+    parser.add_argument("--loader-workers", type=int, default=0, help="also a plain loop with N reading processes")
     parser.add_argument("--no-table", action="store_true", help="leave out the table of step costs")
-    parser.add_argument("--quick", action="store_true", help=f"a look in a minute or two: {QUICK}, a small table")
+    parser.add_argument("--quick", action="store_true", help=f"rough, in a minute or two: {QUICK}, a small table")
     args = parser.parse_args()
     scale = GPU if torch.cuda.is_available() else CPU
-    given = {name: value for name, value in vars(args).items() if value is not None}
-    vars(args).update({**scale, **given, **(QUICK if args.quick else {})})
+    options = {name: value for name, value in vars(args).items() if value is not None}
+    vars(args).update({**scale, **options, **(QUICK if args.quick else {})})
 
     machine = describe_hardware()
     where = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{machine.cpu}, {machine.cores} cores"

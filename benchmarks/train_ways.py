@@ -1,4 +1,4 @@
-"""What `train_speed` measures, one training in a process of its own: our engine, and the plain loop of a lab."""
+"""The two training loops that `train_speed` compares, each in its own process: our engine and a plain PyTorch loop."""
 
 import contextlib
 import resource
@@ -21,11 +21,11 @@ from fpp_ml_bench.loaders.published_layout import DEPTH, FRINGE, TRAINING, VARIA
 from fpp_ml_bench.loaders.training import FringeDepth
 
 ENOUGH_S = 3.0
-"""A step's cost is measured for about so long, and three times at least."""
+"""Seconds for which a step is timed, at least three times."""
 
 
 class Job(NamedTuple):
-    """What a process is told: ``data`` is the dataset for ours, the exported tree for the plain loop."""
+    """Settings of a process: ``data`` is the dataset for our engine, the exported tree for the plain loop."""
 
     data: Path
     scratch: Path
@@ -38,7 +38,7 @@ class Job(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were not told apart."""
+    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were not timed apart."""
 
     step: float
     data: float
@@ -66,7 +66,7 @@ class Ours:
 
 
 class Plain:
-    """What the paper's readers would write in an afternoon."""
+    """A plain PyTorch loop: RMSprop, default settings, the loss read after every step."""
 
     def __init__(self, job: Job) -> None:
         torch.manual_seed(42)
@@ -123,11 +123,11 @@ def recipe_of(job: Job, compiled: bool) -> Recipe:
 
 
 _surroundings = contextlib.ExitStack()
-"""Never left: what the engine sets in a process stays set for as long as it lives."""
+"""Never closed: the engine's settings stay in force until the process ends."""
 
 
 def surround(job: Job) -> None:
-    """Set in this process what the engine sets around a training."""
+    """Apply to this process the settings that the engine applies around a training."""
     _set_threads(job)
     _surroundings.enter_context(environment.reproducible(recipe_of(job, compiled=False)))
 
@@ -137,14 +137,14 @@ def _set_threads(job: Job) -> None:
         torch.set_num_threads(job.threads)
 
 
-_way: Ours | Plain
+_loop: Ours | Plain
 
 
 def start(kind: type[Ours] | type[Plain], job: Job) -> None:
-    """Begin a training in this process."""
-    global _way
+    """Start a training in this process."""
+    global _loop
     _set_threads(job)
-    _way = kind(job)
+    _loop = kind(job)
 
 
 def run_epoch(apart: bool) -> Epoch:
@@ -157,7 +157,7 @@ def run_epoch(apart: bool) -> Epoch:
     data, compute, losses = 0.0, 0.0, []
     wait()
     started = perf_counter()
-    batches = iter(_way.batches())
+    batches = iter(_loop.batches())
     while True:
         before = perf_counter()
         batch = next(batches, None)
@@ -167,7 +167,7 @@ def run_epoch(apart: bool) -> Epoch:
         data += middle - before
         if batch is None:
             break
-        losses.append(_way.step(batch))
+        losses.append(_loop.step(batch))
         if apart:
             wait()
         compute += perf_counter() - middle
