@@ -1,8 +1,8 @@
 """The switch between compiled (numba) and plain NumPy kernels.
 
 Kernels live in modules of their own that are imported only when `numba_enabled` says so, each beside a NumPy function
-that gives the same numbers. The environment variable ``FPP_BENCH_NUMBA=0`` selects NumPy; so does a machine on which
-numba can't be imported.
+that gives the same numbers; ray casting has no such function and is always compiled. The environment variable
+``FPP_BENCH_NUMBA=0`` selects NumPy; so does a machine on which numba can't be imported.
 """
 
 import os
@@ -32,8 +32,9 @@ def numba_enabled() -> bool:
 def njit(function: Function) -> Function:
     """Compile ``function`` to run without the GIL; the machine code is kept on disk for the next process.
 
-    No ``fastmath``: the order of every sum stays as written, so the same input gives the same bytes whatever the number
-    of threads. Without numba the function is returned as it is (correct and very slow).
+    No ``fastmath``, and no multiplication is fused with an addition: the order of every sum stays as written, so the
+    same input gives the same bytes on every processor and for any number of threads. Without numba the function is
+    returned as it is (correct and very slow).
     """
     if not _importable():
         return function

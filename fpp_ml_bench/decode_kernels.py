@@ -45,6 +45,13 @@ def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
 
 
 @njit
+def minus_atan2_kernel(sine, cosine, phase):  # type: ignore[no-untyped-def]
+    """`phase.minus_atan2`: fills ``phase``; all flat float64 of one length."""
+    for i in range(phase.size):
+        phase[i] = _minus_atan2(sine[i], cosine[i])
+
+
+@njit
 def decode_block(  # type: ignore[no-untyped-def]
     frames, weights, bits, centres, pitch, length, limits, codes, coordinate, modulation, phase, reason
 ):

@@ -63,16 +63,16 @@ def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients
     """Points whose radial distortion alone is that of (xd, yd), to a few digits; at the fold for those beyond it."""
     k1, k2, _, _, k3 = coefficients
     measured = np.sqrt(xd * xd + yd * yd)
-    wanted = float(np.max(measured, initial=0.0, where=np.isfinite(measured)))
+    farthest = float(np.max(measured, initial=0.0, where=np.isfinite(measured)))
     fold = math.sqrt(fold_radius_squared(coefficients))
 
     def distorted(r: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = r * r
         return r * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
 
-    reach = wanted
+    reach = farthest
     for _ in range(MAX_ITERATIONS):  # a radius that is distorted beyond all of the points, or the fold
-        if reach >= fold or float(distorted(np.array(reach))) >= wanted:
+        if reach >= fold or float(distorted(np.array(reach))) >= farthest:
             break
         reach *= 2
     radius = np.linspace(0.0, min(reach, fold), START_TABLE)

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from fpp_ml_bench.acceleration import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
 
 
 class Phase(NamedTuple):
@@ -25,14 +26,14 @@ class Phase(NamedTuple):
     mean: NDArray[np.floating]
 
 
-def choose_steps(steps: int, wanted: int) -> tuple[int, ...]:
-    """``wanted`` of ``steps`` frames, spread over the circle as evenly as they go: floor(i steps / wanted + 1/2).
+def choose_steps(steps: int, count: int) -> tuple[int, ...]:
+    """``count`` of ``steps`` frames, spread over the circle as evenly as they go: floor(i steps / count + 1/2).
 
-    Exactly equal where ``wanted`` divides ``steps``. Raises `DecodeError` for fewer than 3 or more than ``steps``.
+    Exactly equal where ``count`` divides ``steps``. Raises `DecodeError` for fewer than 3 or more than ``steps``.
     """
-    if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or not 3 <= wanted <= steps:
-        raise DecodeError(f"steps: expected a whole number from 3 to the {steps} that were projected, got {wanted!r}")
-    return tuple((2 * i * steps + wanted) // (2 * wanted) for i in range(wanted))
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 3 <= count <= steps:
+        raise DecodeError(f"steps: expected a whole number from 3 to the {steps} that were projected, got {count!r}")
+    return tuple((2 * i * steps + count) // (2 * count) for i in range(count))
 
 
 def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
@@ -108,8 +109,17 @@ def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> li
 
 
 def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``-atan2(sine, cosine)`` in [-pi, pi): +pi is mapped to -pi. float64."""
-    phase = -np.arctan2(sine, cosine)
+    """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor.
+
+    +pi is mapped to -pi.
+    """
+    if numba_enabled():
+        from fpp_ml_bench.decode_kernels import minus_atan2_kernel
+
+        phase = np.empty(np.shape(sine))
+        minus_atan2_kernel(np.ravel(sine), np.ravel(cosine), phase.ravel())
+        return phase
+    phase = -arctangent2(sine, cosine)
     phase[phase >= np.pi] = -np.pi
     return phase
 

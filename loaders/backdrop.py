@@ -46,10 +46,10 @@ class Backdrop:
     def _may_be_shadowed(self, traced: TracedObject, covered: NDArray[np.int64]) -> NDArray[np.int64]:
         """Flat pixels of the plane that are lit, not hidden from the camera, and seen by the projector within the
         object's bounding box."""
-        asked = self._empty.gain > 0
-        asked[covered] = False
-        asked &= traced.may_shadow(self._directions, projector_centre_m(self._rig))
-        return np.flatnonzero(asked)
+        possible = self._empty.gain > 0
+        possible[covered] = False
+        possible &= traced.may_shadow(self._directions, projector_centre_m(self._rig))
+        return np.flatnonzero(possible)
 
     @cached_property
     def _plane(self) -> Hits:

@@ -52,13 +52,13 @@ def _studio_of(settings: BuildSettings) -> Studio:
 
 def plan_build(settings: BuildSettings) -> list[ShardPlan]:
     """Shards of a build: splits in order, objects in the benchmark's order, then the user's."""
-    mine = {mesh.name: mesh.split for mesh in settings.user_meshes}
+    user_splits = {mesh.name: mesh.split for mesh in settings.user_meshes}
     plans = []
     for split in SPLITS:
         objects = {
             name: [(sample_name(name, view), name, view) for view in VIEWS]
             for name in settings.objects
-            if mine.get(name, split_of(name)) == split
+            if user_splits.get(name, split_of(name)) == split
         }
         if objects:
             plans += plan_shards(split, objects)

@@ -18,19 +18,19 @@ from fpp_ml_bench.loaders.view import Studio
 RULE = "processor seconds of one view ({sample}) with skipping off less on, measured now, times what all views left out"
 
 
-class OneView:
-    """A view of the build, ready to repeat each stage; the one of median cover."""
+class SingleView:
+    """A view of the build, ready to repeat each stage; that of median cover."""
 
     def __init__(self, manifest: Manifest, settings: BuildSettings) -> None:
         rows = [row for part in manifest.samples.values() for row in part]
         self.row = sorted(rows, key=lambda row: row["exact_px"])[len(rows) // 2]
-        name, view = self.row["object"], self.row["view"]
+        name, angle = self.row["object"], self.row["view"]
         self.studio, rig = Studio(settings), settings.rig
         mesh = solid_mesh(name, settings.user_meshes)
-        self.traced = TracedObject(mesh, place(mesh, view, rig, settings.placement, settings.seed)[0])
+        self.traced = TracedObject(mesh, place(mesh, angle, rig, settings.placement, settings.seed)[0])
         self.hits = self.traced.primary(PixelRays.of(rig.camera))
         self.lit = lit_object(self.hits, rig, self.studio.lighting, self.traced)
-        self.stream = (settings.seed, name, view)
+        self.stream = (settings.seed, name, angle)
         self.seen = np.zeros((rig.camera.height, rig.camera.width), dtype=bool)
         self.seen.ravel()[self.hits.pixels] = True
         self.expose()
@@ -51,14 +51,14 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     if manifest.origin != GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
-    one = OneView(manifest, settings)
-    rule = RULE.format(sample=one.row["sample"])
+    view = SingleView(manifest, settings)
+    rule = RULE.format(sample=view.row["sample"])
     rig, views = settings.rig, len(rows)
     pixels = rig.camera.width * rig.camera.height
-    seen, seen_here = sum(row["exact_px"] for row in rows), one.row["exact_px"]
-    sequence, stored = rig.sequence, len(one.studio.stored)
+    seen, seen_here = sum(row["exact_px"] for row in rows), view.row["exact_px"]
+    sequence, stored = rig.sequence, len(view.studio.stored)
     decoded = len(sequence) - 2
-    unstored = len(one.studio.unstored)
+    unstored = len(view.studio.unstored)
     unneeded = len(sequence) - stored - unstored
 
     def exposed(px: int, count: int) -> int:
@@ -66,21 +66,21 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
 
     lines = []
     if settings.shadows:
-        lines.append(_shadow_rays(one, rows, pixels, rule))
+        lines.append(_shadow_rays(view, rows, pixels, rule))
     else:
         again = pixels * (views - 1)
-        saved, how = saved_by(one.light_background, pixels, again), rule + "; lit once a process, one process assumed"
+        saved, how = saved_by(view.light_background, pixels, again), rule + "; lit once a process, one process assumed"
         lines.append(LeftOut("empty background again", "pixels", pixels, again, None, saved, how))
     left = views * pixels * len(sequence) - exposed(seen, views)
     left_here = pixels * len(sequence) - exposed(seen_here, 1)
     lines += [
         LeftOut(
             f"exposures ({unstored} unstored frames off the object, {unneeded} everywhere)", "pixels",
-             exposed(seen, views), left, None, saved_by(one.expose, left_here, left), rule,
+             exposed(seen, views), left, None, saved_by(view.expose, left_here, left), rule,
         ),
         LeftOut(
             "ground truth off the object", "grey levels", seen * decoded, (views * pixels - seen) * decoded,
-            None, saved_by(one.decode, (pixels - seen_here) * decoded, (views * pixels - seen) * decoded), rule,
+            None, saved_by(view.decode, (pixels - seen_here) * decoded, (views * pixels - seen) * decoded), rule,
         ),
         LeftOut(
             "frames not asked for", "frames", stored * views, (len(sequence) - stored) * views,
@@ -92,11 +92,11 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     return explained("build", about, lines)
 
 
-def _shadow_rays(one: OneView, rows: list[dict], pixels: int, rule: str) -> LeftOut:
+def _shadow_rays(view: SingleView, rows: list[dict], pixels: int, rule: str) -> LeftOut:
     """Shadow rays that pass the object; a ray for every pixel of the image would be all of them."""
     traced = sum(row["shadow_rays"] for row in rows)
-    left, here = len(rows) * pixels - traced, pixels - one.row["shadow_rays"]
+    left, here = len(rows) * pixels - traced, pixels - view.row["shadow_rays"]
     return LeftOut(
-        "shadow rays past the object's box", "rays", traced, left, None, saved_by(one.light_background, here, left),
+        "shadow rays past the object's box", "rays", traced, left, None, saved_by(view.light_background, here, left),
         rule,
     )  # fmt: skip

@@ -59,25 +59,26 @@ class LitPixels:
     ambient: NDArray[np.float32]
     shadow_rays: int = field(default=0)
 
-    def patched(self, where: NDArray[np.int64], other: "LitPixels") -> "LitPixels":
-        """A copy in which the pixels at flat indices ``where`` are those of ``other``."""
+    def patched(self, where: NDArray[np.int64], patch: "LitPixels") -> "LitPixels":
+        """A copy in which the pixels at flat indices ``where`` are those of ``patch``."""
 
-        def patch(mine: NDArray, theirs: NDArray) -> NDArray:
-            copy = mine.copy()
-            copy[where] = theirs
+        def replaced(values: NDArray, patches: NDArray) -> NDArray:
+            copy = values.copy()
+            copy[where] = patches
             return copy
 
         lookup = {
             direction: PatternLookup(
-                patch(mine.index, other.lookup[direction].index), patch(mine.weight, other.lookup[direction].weight)
+                replaced(lookup.index, patch.lookup[direction].index),
+                replaced(lookup.weight, patch.lookup[direction].weight),
             )
-            for direction, mine in self.lookup.items()
+            for direction, lookup in self.lookup.items()
         }
         return LitPixels(
             lookup,
-            patch(self.gain, other.gain),
-            patch(self.ambient, other.ambient),
-            self.shadow_rays + other.shadow_rays,
+            replaced(self.gain, patch.gain),
+            replaced(self.ambient, patch.ambient),
+            self.shadow_rays + patch.shadow_rays,
         )
 
 

@@ -26,9 +26,9 @@ _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
 
 def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
     """Mesh ``name`` ready for the scene: metres, z up, about its turning axis."""
-    mine = {mesh.name: mesh for mesh in user_meshes}
-    if name in mine:
-        return load_user_mesh(mine[name])
+    user = {mesh.name: mesh for mesh in user_meshes}
+    if name in user:
+        return load_user_mesh(user[name])
     from fpp_ml_bench.loaders.objects import object_mesh
 
     return _solid(name, object_mesh(name))
@@ -132,12 +132,12 @@ def single_mesh(path: Path) -> UserMesh:
 
 
 def _entry(entry: object, where: str, folder: Path) -> UserMesh:
-    known = {item.name for item in fields(UserMesh)} - {"content"}
+    keys = {item.name for item in fields(UserMesh)} - {"content"}
     if not isinstance(entry, dict) or not {"name", "path"} <= set(entry):
         raise MeshError(f"{where}: expected a mapping with name and path, got {entry!r}")
-    unknown = set(map(str, entry)) - known
+    unknown = set(map(str, entry)) - keys
     if unknown:
-        raise MeshError(f"{where}: unknown key {sorted(unknown)[0]!r}; there are {', '.join(sorted(known))}")
+        raise MeshError(f"{where}: unknown key {sorted(unknown)[0]!r}; there are {', '.join(sorted(keys))}")
     name = entry["name"]
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         raise MeshError(f"{where}: name must be of a-z, 0-9 and _, got {name!r}")

@@ -96,7 +96,7 @@ class TracedObject:
         )
 
     def _window(self, rays: PixelRays) -> tuple[tuple[int, int], tuple[int, int]]:
-        """First row and column, and the ones behind the last, of the box that the object can cover in the image."""
+        """First row and column, and those behind the last, of the box that the object can cover in the image."""
         z = self._corners[..., 2]
         if z.min() <= 0:
             return (0, rays.x.shape[0]), (0, rays.x.shape[1])

@@ -20,12 +20,12 @@ _NEAR_M = 1e-6
 
 
 @njit
-def _first_at_least(values, wanted):  # type: ignore[no-untyped-def]
-    """First index with ``values[index] >= wanted``; values ascend."""
+def _first_at_least(values, limit):  # type: ignore[no-untyped-def]
+    """First index with ``values[index] >= limit``; values ascend."""
     low, high = 0, values.size
     while low < high:
         middle = (low + high) // 2
-        if values[middle] >= wanted:
+        if values[middle] >= limit:
             high = middle
         else:
             low = middle + 1

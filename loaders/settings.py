@@ -44,21 +44,21 @@ class BuildSettings:
     user_meshes: tuple[UserMesh, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        known = {*OBJECTS, *(mesh.name for mesh in self.user_meshes)}
+        names = {*OBJECTS, *(mesh.name for mesh in self.user_meshes)}
         for name in self.objects:
-            if name not in known:
+            if name not in names:
                 from difflib import get_close_matches
 
-                near = ", ".join(get_close_matches(name, sorted(known), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
+                near = ", ".join(get_close_matches(name, sorted(names), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
                 raise BuildError(f"unknown object {name!r}; did you mean {near}?")
         if not self.objects:
             raise BuildError("no object to build: name at least one")
         if len(set(self.objects)) != len(self.objects):
             twice = next(name for name in self.objects if self.objects.count(name) > 1)
             raise BuildError(f"object {twice!r} is named twice")
-        mine = sorted(self.user_meshes, key=lambda mesh: mesh.name)
-        order = (*OBJECTS, *(mesh.name for mesh in mine))
-        object.__setattr__(self, "user_meshes", tuple(mine))
+        user_meshes = sorted(self.user_meshes, key=lambda mesh: mesh.name)
+        order = (*OBJECTS, *(mesh.name for mesh in user_meshes))
+        object.__setattr__(self, "user_meshes", tuple(user_meshes))
         object.__setattr__(self, "objects", tuple(sorted(self.objects, key=order.index)))
         if self.placement not in PLACEMENTS:
             raise BuildError(f"placement {self.placement!r}: expected {' or '.join(PLACEMENTS)}")

@@ -68,11 +68,11 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
 
 def foreign_files(folder: Path, manifest: Manifest) -> list[str]:
     """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are not counted."""
-    known = {MANIFEST, *(shard.path for shard in manifest.shards), *(other.path for other in manifest.others)}
+    listed = {MANIFEST, *(shard.path for shard in manifest.shards), *(other.path for other in manifest.others)}
     return [
         f"{path}: is not part of this dataset; remove it"
         for path in dataset_files(folder)
-        if path.relative_to(folder).as_posix() not in known and not path.name.startswith("cache-")
+        if path.relative_to(folder).as_posix() not in listed and not path.name.startswith("cache-")
     ]
 
 
@@ -185,8 +185,8 @@ def split_findings(manifest: Manifest) -> list[str]:
 def duplicate_images(places: ImagePlaces) -> list[str]:
     """Images that stand in more than one split, by the hash of their pixels."""
     findings = []
-    for found in places.values():
-        if len({split for split, _, _ in found}) > 1:
-            named = ", ".join(f"{split}/{sample} {column}" for split, sample, column in found[:4])
+    for copies in places.values():
+        if len({split for split, _, _ in copies}) > 1:
+            named = ", ".join(f"{split}/{sample} {column}" for split, sample, column in copies[:4])
             findings.append(f"the same image stands in two splits: {named}")
     return findings

@@ -4,7 +4,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from fpp_ml_bench.portable import cosine_of_turns, power, sine_of_turns
+from fpp_ml_bench.acceleration import SWITCH
+from fpp_ml_bench.phase import minus_atan2
+from fpp_ml_bench.portable import arctangent2, cosine_of_turns, power, sine_of_turns
 
 mpmath.mp.dps = 50
 
@@ -31,3 +33,18 @@ def test_power(exponent):
     allowed = 4e-16 * np.maximum(1, exponent * np.abs(np.log(base)))
     assert (np.abs(power(base, exponent) - expected) <= allowed * expected).all()
     assert power(np.array([0.0, 1.0]), exponent).tolist() == ([1.0, 1.0] if exponent == 0 else [0.0, 1.0])
+
+
+def test_arctangent_of_two_arguments(monkeypatch):
+    rng = np.random.default_rng(2)
+    y, x = rng.normal(size=(2, 4000)) * 10.0 ** rng.integers(-8, 8, (2, 4000))
+    y[:9], x[:9] = np.repeat([-1.0, 0.0, 1.0], 3), np.tile([-1.0, 0.0, 1.0], 3)
+    expected = np.array(
+        [float(mpmath.atan2(mpmath.mpf(float(b)), mpmath.mpf(float(a)))) for a, b in zip(x, y, strict=True)]
+    )
+    np.testing.assert_allclose(arctangent2(y, x), expected, rtol=4.5e-16, atol=0)
+    answers = []
+    for switch in ("1", "0"):
+        monkeypatch.setenv(SWITCH, switch)
+        answers.append(minus_atan2(y, x))
+    np.testing.assert_array_equal(*answers)

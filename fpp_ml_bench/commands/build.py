@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
     parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a processor)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
     parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
     parser.add_argument("--noise-sigma", type=float, default=1.0, metavar="GREY",

@@ -1,0 +1,74 @@
+"""Does a build give the same bytes on other processors? Builds a small set as if this were one, and compares.
+
+    python benchmarks/same_bytes.py [--preset mini] [--size 176] [--objects mug,mustard_bottle] [--work DIR]
+
+Each build is a process of its own that is denied some of this processor's instruction sets: numba compiles for a
+generic x86-64, NumPy and the C library leave out AVX2, AVX-512 and fused multiply-adds, OpenBLAS takes its oldest
+kernels. Prints a fingerprint for each; exit status 1 if two differ. With no options a minute or two; ``--preset full
+--size 960`` is the whole benchmark.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+NO_AVX512 = "X86_V4 AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+NO_AVX = f"AVX2 FMA3 X86_V3 {NO_AVX512}"
+GLIBC = "glibc.cpu.hwcaps=-AVX512F,-AVX2,-AVX,-FMA,-FMA4"
+WAYS: dict[str, dict[str, str]] = {
+    "as it is": {},
+    "one worker": {"WORKERS": "1"},
+    "numba for a generic processor": {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+    "NumPy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": NO_AVX512},
+    "NumPy without AVX": {"NPY_DISABLE_CPU_FEATURES": NO_AVX},
+    "C library without AVX and FMA": {"GLIBC_TUNABLES": GLIBC},
+    "OpenBLAS for Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
+    "all of these": {
+        "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": NO_AVX,
+        "GLIBC_TUNABLES": GLIBC, "OPENBLAS_CORETYPE": "Nehalem", "WORKERS": "1",
+    },
+}  # fmt: skip
+
+
+def fingerprint(way: str, settings: list[str], work: Path) -> str:
+    """Fingerprint of a build by `fpp-bench build` with the environment of ``way``."""
+    environment = {**os.environ, **WAYS[way]}
+    workers = environment.pop("WORKERS", "2")
+    if "NUMBA_CPU_NAME" in WAYS[way]:
+        environment["NUMBA_CACHE_DIR"] = str(work / "compiled")
+    folder = work / way.replace(" ", "-")
+    command = [sys.executable, "-m", "fpp_ml_bench", "build", str(folder), *settings, "--workers", workers]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{way}: the build failed:\n{done.stderr}")
+    return str(json.loads((folder / "manifest.json").read_text())["fingerprint"])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", choices=("mini", "full"), default="mini", help="preset (default: mini)")
+    parser.add_argument("--size", type=int, default=176, metavar="PX", help="image size (default: 176)")
+    parser.add_argument("--objects", metavar="A,B", help="objects (default: the preset's)")
+    parser.add_argument("--shadows", action="store_true", help="with cast shadows")
+    parser.add_argument("--work", type=Path, help="folder to work in (default: a temporary one, removed afterwards)")
+    parser.add_argument("--only", nargs="+", choices=WAYS, metavar="WAY", help="some of the ways")
+    args = parser.parse_args()
+    settings = ["--preset", args.preset, "--size", str(args.size)]
+    settings += ["--objects", args.objects] if args.objects else []
+    settings += ["--shadows"] if args.shadows else []
+    prints = {}
+    with tempfile.TemporaryDirectory(dir=args.work) as folder:
+        for way in args.only or WAYS:
+            prints[way] = fingerprint(way, settings, Path(folder))
+            print(f"{prints[way][:16]}  {way}", flush=True)
+    same = len(set(prints.values())) == 1
+    print(f"{len(prints)} builds, {'one fingerprint' if same else 'DIFFERENT fingerprints'}")
+    return 0 if same else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
