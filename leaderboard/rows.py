@@ -1,4 +1,4 @@
-"""The leaderboard's rows as files: a result of ``fpp-eval``, and who stands for its numbers.
+"""The leaderboard's rows as files: a result of ``fpp-eval``, and who vouches for its numbers.
 
 A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which then counts as
 self-reported, or a row file: that result and a ``provenance``, which the maintainers set when they take it in. A PNG of
