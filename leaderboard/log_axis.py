@@ -20,8 +20,8 @@ class LogAxis:
     def around(cls, values: Sequence[float], start: float, end: float) -> "LogAxis":
         """An axis that holds all ``values`` with room at both ends, at least a factor of 2 in all."""
         low, high = min(values), max(values)
-        room = max(0.08 * math.log(high / low), 0.5 * (math.log(2) - math.log(high / low)), 0.05)
-        return cls(low * math.exp(-room), high * math.exp(room), start, end)
+        margin = max(0.08 * math.log(high / low), 0.5 * (math.log(2) - math.log(high / low)), 0.05)
+        return cls(low * math.exp(-margin), high * math.exp(margin), start, end)
 
     def at(self, value: float) -> float:
         """Where ``value`` lies, in px."""
@@ -33,8 +33,8 @@ class LogAxis:
         first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
         chosen: list[float] = []
         for factors in _FACTORS:
-            found = [float(f"{factor}e{power}") for power in range(first, last + 1) for factor in factors]
-            inside = [value for value in found if self.low <= value <= self.high]
+            candidates = [float(f"{factor}e{power}") for power in range(first, last + 1) for factor in factors]
+            inside = [value for value in candidates if self.low <= value <= self.high]
             if len(inside) > most and chosen:
                 break
             chosen = inside[:: max(1, math.ceil(len(inside) / most))]

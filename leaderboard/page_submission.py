@@ -168,8 +168,8 @@ def _reading(result: Result) -> str:
     ]
     table = html_table("Counterfactual scenes", ("Part", "Value"), rows, text_columns=1)
     return (
-        f"<section><h2>What it reads</h2><p>Phase reliance {measured.score:.2f}{span}{free}: {measured.samples} samples "
-        f"of {measured.objects} objects, answers in {escaped(measured.units)}, data "
+        f"<section><h2>What it reads</h2><p>Phase reliance {measured.score:.2f}{span}{free}: {measured.samples} "
+        f"samples of {measured.objects} objects, answers in {escaped(measured.units)}, data "
         f"{escaped(measured.dataset_fingerprint[:8])}. 1 follows the fringe's phase and nothing else, 0 does not "
         f"follow it. Changes are given in units of the change that the moved phase demands.</p>{table}</section>\n"
     )

@@ -14,11 +14,11 @@ from fpp_ml_bench.evaluation.compare import compare
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.leaderboard import reproduce_plan
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
-from fpp_ml_bench.leaderboard.reproduce_data import default_folder, the_dataset
+from fpp_ml_bench.leaderboard.reproduce_data import default_folder, open_dataset
 from fpp_ml_bench.leaderboard.reproduce_lines import Line, Scored, scored_entry
 from fpp_ml_bench.leaderboard.reproduce_order import Ordering, orderings
 from fpp_ml_bench.leaderboard.reproduce_plan import Folders, places, planned, variants
-from fpp_ml_bench.leaderboard.reproduce_table import orderings_said, table_markdown
+from fpp_ml_bench.leaderboard.reproduce_table import orderings_sentence, table_markdown
 from fpp_ml_bench.leaderboard.rows import Entry
 
 
@@ -86,27 +86,27 @@ def test_a_dataset_of_another_size_is_refused(tmp_path):
     other = make_dataset(tmp_path / "other")
     jobs = planned(["normalization"], "cpu")
     with pytest.raises(DatasetError, match=r"expected images of 224 x 224 px, which preset cpu .* got 40 x 32.*--size"):
-        the_dataset(other.path, jobs, folders(tmp_path), print)
+        open_dataset(other.path, jobs, folders(tmp_path), print)
 
 
 def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
     with pytest.raises(
         DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
     ):
-        the_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
+        open_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
 
 
 def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
     jobs, where = planned(["normalization"], "cpu"), folders(tmp_path)
-    first = the_dataset(dataset.path, jobs, where, print)
-    assert the_dataset(dataset.path, jobs, where, print).fingerprint == first.fingerprint
+    first = open_dataset(dataset.path, jobs, where, print)
+    assert open_dataset(dataset.path, jobs, where, print).fingerprint == first.fingerprint
     known = json.loads(where.dataset_record.read_text())
     where.dataset_record.write_text(json.dumps({**known, "fingerprint": 64 * "a"}))
-    with pytest.raises(DatasetError, match=r"was trained on aaaaaaaa .*give that one as --data, or another --runs"):
-        the_dataset(dataset.path, jobs, where, print)
+    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
+        open_dataset(dataset.path, jobs, where, print)
     where.dataset_record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
-        the_dataset(dataset.path, jobs, where, print)
+        open_dataset(dataset.path, jobs, where, print)
 
 
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
@@ -144,9 +144,9 @@ def test_orderings_are_judged_by_number():
     assert found[0].gap_mm == pytest.approx(2.0)
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
     assert [item.verdict for item in turned] == ["reversed"]
-    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_said(found)
+    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_sentence(found)
     assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
-    assert "none of its orderings" in orderings_said([])
+    assert "none of its orderings" in orderings_sentence([])
 
 
 @pytest.mark.parametrize(

@@ -18,14 +18,14 @@ from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.leaderboard import tradeoff_report
 from fpp_ml_bench.leaderboard.page import page_files
-from fpp_ml_bench.leaderboard.tradeoff import Plan, Wish, planned, tradeoff
+from fpp_ml_bench.leaderboard.tradeoff import Plan, TradeoffSettings, planned, tradeoff
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_journal import JOURNAL
 from fpp_ml_bench.leaderboard.tradeoff_measure import Setting, measured
 from fpp_ml_bench.leaderboard.tradeoff_points import Point, Tradeoff, read_tradeoff
 from fpp_ml_bench.leaderboard.tradeoff_precision import DecodeInType
 from fpp_ml_bench.leaderboard.tradeoff_report import remarks, write_report
-from fpp_ml_bench.leaderboard.tradeoff_views import some_views
+from fpp_ml_bench.leaderboard.tradeoff_views import choose_views
 from fpp_ml_bench.loaders.folder_lock import exclusive
 
 QUICK = Rules(runs=3, limit_s=0.05)
@@ -66,7 +66,7 @@ def setting(dataset, key="one", made=(), **changes):
             made.append(key)
         return method
 
-    return Setting(key, "classical", f"Setting {key}", make, some_views(dataset, 2))
+    return Setting(key, "classical", f"Setting {key}", make, choose_views(dataset, 2))
 
 
 def test_a_point_is_what_the_evaluator_says(small, tmp_path):
@@ -101,11 +101,11 @@ def test_untrained_is_timed_and_never_scored(small):
 
 
 def test_views_are_spread_and_differ_between_objects(small):
-    views = some_views(small, 1)
+    views = choose_views(small, 1)
     assert views.names == ["power_drill_A0", "wooden_boards_A60"] and views.objects == ["power_drill", "wooden_boards"]
-    assert list(some_views(small, 9).names) == small.samples("test")
+    assert list(choose_views(small, 9).names) == small.samples("test")
     with pytest.raises(DatasetError, match="no split"):
-        some_views(small, 1, "nowhere")
+        choose_views(small, 1, "nowhere")
 
 
 def point(key, seconds, frames, error, group="classical", **changes):
@@ -169,8 +169,8 @@ def test_a_busy_machine_shows(small):
 
 def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path):
     made: list[str] = []
-    wish = Wish(small.path, tmp_path / "out", quick=True)
-    plan = Plan(small, some_views(small, 1), [setting(small, key, made) for key in "ab"], [])
+    wish = TradeoffSettings(small.path, tmp_path / "out", quick=True)
+    plan = Plan(small, choose_views(small, 1), [setting(small, key, made) for key in "ab"], [])
     plan.settings.append(setting(small, "lost", made, frames_used=(7,)))
     seen: list[str] = []
     first = tradeoff(wish, plan, seen.append)
@@ -184,17 +184,17 @@ def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path):
 
 
 def test_runs_of_other_rules_do_not_mix(small, tmp_path):
-    plan = Plan(small, some_views(small, 1), [setting(small)], [])
-    tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+    plan = Plan(small, choose_views(small, 1), [setting(small)], [])
+    tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
     with pytest.raises(SubmissionError, match=r"another rules .*give another --out"):
-        tradeoff(Wish(small.path, tmp_path), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path), plan)
     with pytest.raises(SubmissionError, match="another views"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), Plan(small, some_views(small, 2), [], []))
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), Plan(small, choose_views(small, 2), [], []))
     (tmp_path / JOURNAL).write_text("nonsense\n")
     with pytest.raises(SubmissionError, match="expected what a run of fpp-bench tradeoff left"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
     with exclusive(tmp_path / ".lock", tmp_path, "measuring"), pytest.raises(BuildError, match="another process"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
 
 
 def test_files_hold_what_was_measured(small, tmp_path):
@@ -266,7 +266,7 @@ def test_the_command_measures_and_feeds_the_page(tiny, tmp_path, capsys, monkeyp
 
 
 def test_sizes_are_photographed_and_scored(tiny):
-    plan = planned(Wish(tiny, tiny, only=("sizes",), quick=True))
+    plan = planned(TradeoffSettings(tiny, tiny, only=("sizes",), quick=True))
     first, second, third = (one for one in plan.settings if one.views.rig.camera.width == 240)
     assert first.title == second.title.replace("vertical", "both").replace("=3", "=18") and third.key.endswith("phase")
     found = measured(first, QUICK)
@@ -289,7 +289,7 @@ def test_refusals(small, tiny, tmp_path, capsys):
 
 def test_settings_without_their_frames_do_not_stop_the_others(small, tmp_path):
     """A dataset of single shots: classical steps are refused one by one, and the run ends well."""
-    wish = Wish(small.path, tmp_path / "out", only=("precision",), quick=True)
+    wish = TradeoffSettings(small.path, tmp_path / "out", only=("precision",), quick=True)
     found = tradeoff(wish, planned(wish))
     assert [("frame" in one.failed) for one in found.points] == [True, True] and found.front() == []
     assert {path.name for path in write_report(found, wish.out)} == {"tradeoff.json", "tradeoff.csv"}

@@ -8,7 +8,7 @@ from fpp_ml_bench.leaderboard import tradeoff_clock
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_figure import draw_growth
 from fpp_ml_bench.leaderboard.tradeoff_growth import fit_power, growth
-from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, Rung, climb
+from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, Rung, time_ladder
 from fpp_ml_bench.leaderboard.tradeoff_report import growth_csv
 
 AMOUNTS = [10, 20, 40, 80, 160]
@@ -96,7 +96,7 @@ def quadratic(world, folders):
 
 def test_climbing_takes_the_least_time_and_flags_a_loop_in_a_loop(world):
     folders = []
-    whole, search, rest = climb(quadratic(world, folders))
+    whole, search, rest = time_ladder(quadratic(world, folders))
     assert whole.stage == "look up" and whole.over == "rows" and whole.amounts == [4, 8, 16, 32]
     assert whole.seconds == pytest.approx([0.016, 0.064, 0.256, 1.024]) and whole.flag == "steeper than linear"
     assert search.stage == "look up: search" and search.exponent == 2.0 and rest.exponent == 0.0 and rest.flag is None
@@ -104,11 +104,11 @@ def test_climbing_takes_the_least_time_and_flags_a_loop_in_a_loop(world):
 
 
 def test_parts_are_the_walls_and_are_left_out_of_processor_time(world):
-    assert [one.stage for one in climb(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
+    assert [one.stage for one in time_ladder(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
 
 
 def test_csv_of_growth(world, tmp_path):
-    found = climb(quadratic(world, []))
+    found = time_ladder(quadratic(world, []))
     lines = growth_csv(found).splitlines()
     assert lines[0].startswith("stage,over,amount,seconds,exponent") and len(lines) == 1 + 3 * 4
     assert lines[1] == "look up,rows,4,0.016,2,2,2,2,steeper than linear"

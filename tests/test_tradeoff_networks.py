@@ -16,7 +16,7 @@ from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_ladders import frame_ladders, pixel_ladders
 from fpp_ml_bench.leaderboard.tradeoff_measure import measured
 from fpp_ml_bench.leaderboard.tradeoff_networks import calibration, network_settings
-from fpp_ml_bench.leaderboard.tradeoff_views import some_views
+from fpp_ml_bench.leaderboard.tradeoff_views import choose_views
 from fpp_ml_bench.rig import paper_rig
 
 SIZE = (32, 48)
@@ -33,7 +33,7 @@ def grey_scene(seed):
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory):
-    return some_views(make_dataset(tmp_path_factory.mktemp("data") / "grey", SIZE, scene=grey_scene), 1)
+    return choose_views(make_dataset(tmp_path_factory.mktemp("data") / "grey", SIZE, scene=grey_scene), 1)
 
 
 @pytest.fixture(scope="module")

@@ -75,18 +75,20 @@ def run(args: argparse.Namespace) -> int:
         return _list(tables, folders)
     if args.table is None:
         raise RecipeError(f"expected a table: {', '.join(PAPER_TABLES)} or {ALL}; --list shows their rows")
-    from fpp_ml_bench.leaderboard.reproduce import Wish, reproduce
+    from fpp_ml_bench.leaderboard.reproduce import ReproduceSettings, reproduce
     from fpp_ml_bench.leaderboard.reproduce_lines import table_lines
     from fpp_ml_bench.leaderboard.reproduce_order import orderings
-    from fpp_ml_bench.leaderboard.reproduce_table import orderings_said, table_rich
+    from fpp_ml_bench.leaderboard.reproduce_table import orderings_sentence, table_rich
 
     command = _command(args)
     outcome = reproduce(
-        Wish(tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, say=_say)
+        ReproduceSettings(
+            tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, report=_report
+        )
     )
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = table_lines(table, outcome.jobs, folders, outcome.opened)
-        show(table_rich(table, lines, args.preset), orderings_said(orderings(lines)))
+        show(table_rich(table, lines, args.preset), orderings_sentence(orderings(lines)))
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
@@ -97,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _say(line: str) -> None:
+def _report(line: str) -> None:
     """On stderr, where the engine's progress is; with the time, for a run of hours is read afterwards."""
     import sys
     from datetime import datetime
@@ -125,17 +127,17 @@ def _list(tables: "tuple[str, ...]", folders: "Folders") -> int:
     from fpp_ml_bench.leaderboard.reproduce_training import state_of
 
     jobs = planned(tables, folders.preset)
-    shown = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     for title in ("Row", "Training", "State", "Rows written"):
-        shown.add_column(title, overflow="fold")
+        table.add_column(title, overflow="fold")
     for job in jobs:
-        wanted = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
-        shown.add_row(
+        row_files = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
+        table.add_row(
             "\n".join(place.recipe_name for place in job.places),
             job.recipe.name,
             state_of(folders.training(job.recipe)),
-            f"{sum(path.is_file() for path in wanted)} of {len(wanted)}",
+            f"{sum(path.is_file() for path in row_files)} of {len(row_files)}",
         )
-    show(shown)
+    show(table)
     print(f"{len(jobs)} trainings fill {sum(len(job.places) for job in jobs)} rows.")
     return 0
