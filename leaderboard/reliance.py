@@ -31,7 +31,8 @@ def check_same_method(entry: Entry, method: "Method") -> None:
         if of_row != of_method:
             raise SubmissionError(
                 f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
-                f"{printable(str(of_method))} for the method to be measured; phase reliance belongs to the scored method: give the same options"
+                f"{printable(str(of_method))} for the method to measure; phase reliance belongs to the very "
+                "method that was scored: give the same options"
             )
 
 

@@ -145,8 +145,8 @@ def _twins_explained(lines: Sequence[Line]) -> list[str]:
             "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought "
             "to mm with a range predicted by a small head from the image, or with the mean range of the training "
             "samples. The difference between their object MAE and the row's own is what the oracle gave: the range, "
-            "and also the mask, because a twin must find the object itself, and an object pixel that it misses costs its "
-            "whole depth.",
+            "and also the mask, because a twin must find the object itself, and an object pixel that it misses costs "
+            "its whole depth.",
             "",
         ]
     if without:

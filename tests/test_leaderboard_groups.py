@@ -47,9 +47,9 @@ def test_rank_ranges_against_their_definition(drawn, without_value):
         if interval is None:
             assert (best, worst) == (len(drawn) + 1, len(values))
             continue
-        known = intervals[: len(drawn)]
-        assert best == 1 + sum(rival[1] < interval[0] for rival in known)
-        assert worst == len(values) - without_value - sum(rival[0] > interval[1] for rival in known)
+        with_value = intervals[: len(drawn)]
+        assert best == 1 + sum(rival[1] < interval[0] for rival in with_value)
+        assert worst == len(values) - without_value - sum(rival[0] > interval[1] for rival in with_value)
     # Sorted by value, each row is within its range.
     order = sorted(range(len(drawn)), key=lambda index: values[index])
     assert all(ranges[index][0] <= place <= ranges[index][1] for place, index in enumerate(order, start=1))

@@ -73,8 +73,8 @@ def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path
     (out / "submissions" / "notes.html").write_text("mine")
     (out / "CNAME").write_text("example.org")
     assert main(["leaderboard", str(files[0]), "--page", str(out)]) == 0
-    left = sorted(path.name for path in (out / "submissions").iterdir())
-    assert len(left) == 2 and "notes.html" in left and (out / "CNAME").exists()
+    remaining = sorted(path.name for path in (out / "submissions").iterdir())
+    assert len(remaining) == 2 and "notes.html" in remaining and (out / "CNAME").exists()
 
 
 def test_groups_stay_apart_and_the_papers_rows_too(files):

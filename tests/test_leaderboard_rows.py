@@ -191,7 +191,7 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
     assert lines == ["Slow and fine", "Fast and rough", "Beaten", "Was told"]
     assert block(readme, *files[::-1]) == 0 and readme.read_text() == text
     assert block(readme, *files, "--check") == 0
-    assert "is what the rows give" in capsys.readouterr().out
+    assert "is up to date with the rows" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("extra", [0, 1, 4])

@@ -102,9 +102,9 @@ def test_v73_files_double_depth_and_rgb_copies_read_the_same(tmp_path):
 
 def test_two_workers_write_what_one_writes_and_the_root_may_be_the_training_folder(tmp_path):
     tree = make_tree(tmp_path / "tree", info=True)
-    one = imported(tree, tmp_path / "one")
-    two = imported(tree / TRAINING, tmp_path / "two", workers=2)
-    assert one.fingerprint == two.fingerprint
+    first = imported(tree, tmp_path / "first")
+    second = imported(tree / TRAINING, tmp_path / "second", workers=2)
+    assert first.fingerprint == second.fingerprint
 
 
 def test_dot_files_and_what_lies_beside_the_folders_are_left_aside(tmp_path):
@@ -229,10 +229,10 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_tree_is_refused_and_the_file_named(tmp_path, case):
-    breaking, said = BROKEN[case]
+    breaking, message = BROKEN[case]
     tree = make_tree(tmp_path / "tree")
     breaking(tree)
-    assert said in refusal(tree, tmp_path / "out")
+    assert message in refusal(tree, tmp_path / "out")
 
 
 def normalised_path(tree):
@@ -302,10 +302,10 @@ BROKEN_VARIANTS = {
 
 @pytest.mark.parametrize("case", BROKEN_VARIANTS)
 def test_variants_and_ranges_that_do_not_fit_together(tmp_path, case):
-    variants, breaking, said = BROKEN_VARIANTS[case]
+    variants, breaking, message = BROKEN_VARIANTS[case]
     tree = make_tree(tmp_path / "tree", variants)
     breaking(tree)
-    assert said in refusal(tree, tmp_path / "out")
+    assert message in refusal(tree, tmp_path / "out")
 
 
 def test_every_offender_is_listed_at_once_wherever_it_stands(tmp_path):
@@ -313,22 +313,22 @@ def test_every_offender_is_listed_at_once_wherever_it_stands(tmp_path):
     cut(fringe_path(tree, "train", "bowl_A0"))
     set_pixel(depth_path(tree, "val", "mug_A120"), np.nan)
     write_mat(depth_path(tree, "test", "my_own_part_A300"), depthMapMeters=depth_of("my_own_part_A300"))
-    said = refusal(tree, tmp_path / "out")
-    assert "3 problems" in said
+    message = refusal(tree, tmp_path / "out")
+    assert "3 problems" in message
     for name in ("bowl_A0.png", "mug_A120.mat", "my_own_part_A300.mat"):
-        assert said.count(name) == 1
+        assert message.count(name) == 1
 
 
 def test_a_long_list_of_offenders_is_cut_with_their_count(tmp_path):
     tree = make_tree(tmp_path / "tree", splits={"train": tuple(f"object_{n}" for n in range(10))})
     for path in (tree / TRAINING / FOLDERS["raw"] / "train" / "depth").iterdir():
         path.write_bytes(b"")
-    said = refusal(tree, tmp_path / "out").splitlines()
-    assert len(said) == 52 and "60 problems" in said[0] and said[-1].strip() == "... and 10 more"
+    message = refusal(tree, tmp_path / "out").splitlines()
+    assert len(message) == 52 and "60 problems" in message[0] and message[-1].strip() == "... and 10 more"
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda t: None, "no such folder"),
         (lambda t: t.mkdir(), "expected training_datasets/"),
@@ -338,9 +338,9 @@ def test_a_long_list_of_offenders_is_cut_with_their_count(tmp_path):
         (lambda t: (t / TRAINING / FOLDERS["raw"]).mkdir(parents=True), "holds no sample"),
     ],
 )
-def test_what_is_no_published_tree(tmp_path, make, said):
+def test_what_is_no_published_tree(tmp_path, make, message):
     make(tmp_path / "tree")
-    assert said in refusal(tmp_path / "tree", tmp_path / "out")
+    assert message in refusal(tmp_path / "tree", tmp_path / "out")
 
 
 def test_an_interrupted_import_resumes_and_reads_a_changed_file_again(tmp_path, monkeypatch):
@@ -389,9 +389,9 @@ def test_the_command_imports_and_says_what_it_took(tmp_path, capsys):
     tree = make_tree(tmp_path / "tree", ALL_VARIANTS)
     save_rig(paper_rig(24), tmp_path / "rig.yaml")
     assert command("import", tree, tmp_path / "out", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
-    said = capsys.readouterr().out
-    assert "train 6, validation 6, test 12 samples" in said and f"depth taken from {FOLDERS['raw']}" in said
-    assert "assumed" not in said
+    message = capsys.readouterr().out
+    assert "train 6, validation 6, test 12 samples" in message and f"depth taken from {FOLDERS['raw']}" in message
+    assert "assumed" not in message
 
 
 @pytest.mark.parametrize(
@@ -412,8 +412,8 @@ def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatc
     (tmp_path / "a_file").write_text("")
     monkeypatch.chdir(tmp_path)
     assert command(*words) == 2
-    said = capsys.readouterr().err
-    assert "error:" in said and "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "error:" in message and "Traceback" not in message
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 

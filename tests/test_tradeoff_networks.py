@@ -54,8 +54,8 @@ def chosen(views, runs):
 
 
 def of(chosen, *parts):
-    (found,) = (setting for key, setting in chosen.items() if all(part in key for part in parts))
-    return found
+    (setting,) = (setting for key, setting in chosen.items() if all(part in key for part in parts))
+    return setting
 
 
 def test_every_network_in_every_precision(chosen):
@@ -80,8 +80,8 @@ def test_precisions_of_one_network_agree_up_to_their_type(chosen, views):
 
 
 def test_an_oracle_range_is_told_and_a_range_without_heads_is_refused(chosen, views):
-    told = measured(of(chosen, "individual", "oracle-fp32"), QUICK)
-    assert told.given == "depth range" and told.object_mae_mm > 0 and told.parameters > 1000
+    oracle = measured(of(chosen, "individual", "oracle-fp32"), QUICK)
+    assert oracle.given == "depth range" and oracle.object_mae_mm > 0 and oracle.parameters > 1000
     refused = measured(of(chosen, "individual", "predicted-fp32"), QUICK)
     assert "holds no range heads" in refused.failed
 

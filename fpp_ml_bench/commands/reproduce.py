@@ -11,11 +11,11 @@ from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
 if TYPE_CHECKING:
     from fpp_ml_bench.leaderboard.reproduce_plan import Folders
 
-SUMMARY = "Train, predict, time and score the rows of the paper's tables, and set them beside its numbers."
+SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
 EXAMPLES = (
     "fpp-bench reproduce --list",
     "fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop",
-    "fpp-bench reproduce all --only-missing                 every table; rows that hold are kept",
+    "fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept",
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
@@ -40,15 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
     parser.add_argument(
         "--only-missing", action="store_true",
-        help="keep rows that hold for the dataset and the weights; without it, they are predicted and scored again. "
-        "Finished trainings are kept either way",
+        help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
+        "again. Finished trainings are always kept",
     )  # fmt: skip
     parser.add_argument(
         "--minutes", type=_minutes, metavar="M",
-        help="stop before an epoch that would outlast them, everything saved; exit status 1, the same command goes on",
+        help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
+        "continues",
     )  # fmt: skip
-    parser.add_argument("--anyway", action="store_true", help="train preset paper without a GPU all the same")
-    parser.add_argument("--list", action="store_true", help="show rows, recipes and what is done, and stop")
+    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
+    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
 
 
 def _minutes(text: str) -> float:
@@ -62,7 +63,7 @@ def _minutes(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what is missing, print the tables. Raises FppBenchError where something can't be done or a training failed."""
+    """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
     from fpp_ml_bench.commands import CHECK_FAILED
     from fpp_ml_bench.errors import RecipeError, TrainingError
     from fpp_ml_bench.evaluation.console import show
@@ -94,13 +95,13 @@ def run(args: argparse.Namespace) -> int:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
         raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
     if outcome.stopped is not None:
-        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Go on with: {command}")
+        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Continue with: {command}")
         return CHECK_FAILED
     return 0
 
 
 def _report(line: str) -> None:
-    """On stderr, where the engine's progress is; with the time, for a run of hours is read afterwards."""
+    """Print a line with the time on stderr, where the engine's progress is too."""
     import sys
     from datetime import datetime
 
@@ -108,7 +109,7 @@ def _report(line: str) -> None:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command that goes on where this one stops, keeping what it has done."""
+    """The command that continues where this run stops, keeping its results."""
     words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
     for option, value in (("--data", args.data), ("--rows", args.rows)):
         words += [] if value is None else [option, str(value)]
