@@ -236,12 +236,14 @@ def test_types_of_the_decoder(opened):
     sample = opened.samples("test")[0]
     frames = opened.frames(sample, range(len(opened.sequence)))
     for direction in ("vertical", "horizontal"):
-        theirs = ClassicalMethod(opened.rig, direction, 18).predict(frames)
+        packaged = ClassicalMethod(opened.rig, direction, 18).predict(frames)
         double = DecodeInType(opened.rig, direction, 18, "float64").predict(frames)
         single = DecodeInType(opened.rig, direction, 18, "float32").predict(frames)
-        both = (theirs > 0) & (double > 0) & (single > 0)
-        assert both.sum() > 0.99 * (theirs > 0).sum()
-        assert np.abs(theirs - double)[both].max() < 2e-4  # one unit in the last place of the float32 that they end in
+        both = (packaged > 0) & (double > 0) & (single > 0)
+        assert both.sum() > 0.99 * (packaged > 0).sum()
+        assert (
+            np.abs(packaged - double)[both].max() < 2e-4
+        )  # one unit in the last place of the float32 that they end in
         assert 0 < np.abs(single - double)[both].mean() < 0.01
 
 
