@@ -1,13 +1,13 @@
-"""Make the leaderboard's own rows again: predict, time, score, and write one row file and one picture a method.
+"""Make the leaderboard's own rows again: predict, time, score, and write a row file and a picture for each method.
 
     fpp-bench build data/full --preset full
     python benchmarks/make_rows.py data/full --work rows-work
     fpp-bench leaderboard --readme README.md
     fpp-bench leaderboard --page page
 
-Every step is a command of the package, printed before it runs; the same data gives the same scores, and times that this
-machine measured. Test split; the classical method against the exact depth, for against ``depth`` the full sequence
-scores 0, because it made it. The phase routes against ``depth``, as the paper's networks.
+Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
+machine. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
+decoded from the full sequence, and the phase routes against ``depth``, as the paper's networks are.
 """
 
 import argparse
@@ -26,17 +26,22 @@ CLASSICAL = (
     (18, "both"), (18, "vertical"), (18, "horizontal"), (9, "both"), (9, "vertical"), (6, "vertical"), (4, "vertical"),
     (3, "vertical"),
 )  # fmt: skip
-"""Steps and directions of the classical method; 18 is divisible by all but 4, whose phases are not evenly spaced."""
-FEW = ((2, "horizontal"), (3, "horizontal"), (3, "vertical"))
-"""Frames of the phase route beyond one."""
+"""Steps and directions of the classical method; 18 is divisible by all but 4, so the 4 phases are not evenly spaced."""
+SEVERAL_FRAMES = ((2, "horizontal"), (3, "horizontal"), (3, "vertical"))
+"""Frames and direction of the phase route with more than one frame."""
 METHODS: dict[str, tuple[object, ...]] = {
-    **{f"classical-{n:02d}-{way}": ("classical", "--steps", n, "--direction", way) for n, way in CLASSICAL},
-    **{f"phase-{way}": ("phase", "--fringe", way) for way in ("horizontal", "vertical")},
-    **{f"phase-{n:02d}-{way}": ("phase", "--frames", n, "--fringe", way) for n, way in FEW},
-    **{f"phase-net-{way}": ("phase-net", "--fringe", way) for way in ("horizontal", "vertical")},
     **{
-        f"phase-net-fresh-{way}": ("phase-net", "--weights", "phase-net-fresh", "--fringe", way)
-        for way in ("horizontal", "vertical")
+        f"classical-{n:02d}-{direction}": ("classical", "--steps", n, "--direction", direction)
+        for n, direction in CLASSICAL
+    },
+    **{f"phase-{direction}": ("phase", "--fringe", direction) for direction in ("horizontal", "vertical")},
+    **{
+        f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
+    },
+    **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
+    **{
+        f"phase-net-fresh-{direction}": ("phase-net", "--weights", "phase-net-fresh", "--fringe", direction)
+        for direction in ("horizontal", "vertical")
     },
     "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
@@ -44,7 +49,7 @@ METHODS: dict[str, tuple[object, ...]] = {
 
 
 def run(command: str, *words: object) -> None:
-    """Run one command and stop at the first that fails."""
+    """Run a command; exit where it fails."""
     arguments = [str(word) for word in words]
     print("$", command, shlex.join(arguments), flush=True)
     status = (fpp_eval if command == "fpp-eval" else fpp_bench)(arguments)
@@ -53,7 +58,7 @@ def run(command: str, *words: object) -> None:
 
 
 def make_row(dataset: Path, work: Path, out: Path, name: str, repeats: int) -> None:
-    """Predictions, time, result, row and picture of one setting."""
+    """Predictions, time, result, row and picture of a setting."""
     predictions, result = work / name, work / f"{name}.json"
     method, *options = METHODS[name]
     settings = [method, dataset, *options]
@@ -72,8 +77,8 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, help="dataset folder with all frames")
     parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
-    parser.add_argument("--only", nargs="+", choices=METHODS, metavar="NAME", help="these rows alone")
-    parser.add_argument("--repeats", type=int, default=40, help="timed runs a method")
+    parser.add_argument("--only", nargs="+", choices=METHODS, metavar="NAME", help="only these rows")
+    parser.add_argument("--repeats", type=int, default=40, help="timed runs of each method")
     args = parser.parse_args()
     if args.work.exists() and any(args.work.iterdir()):
         parser.error(f"{args.work} is not empty")

@@ -1,4 +1,4 @@
-"""Put the phase reliance into the leaderboard's rows: of every row whose method can be made again from what is here.
+"""Put the phase reliance into the leaderboard's rows, for every row whose method can be built on this machine.
 
     fpp-bench build data/cpu224 --preset full --size 224
     fpp-bench reproduce all --preset cpu --data data/cpu224
@@ -6,9 +6,9 @@
     fpp-bench leaderboard --readme README.md
 
 A network's row is measured on the data it was scored on, with the weights file whose SHA-256 it names (below ``--runs``
-or shipped with the package); a classical or phase row on its own data where that is given, else on the first of
-``--data``, for which the block says so. Rows that have a block of the same version, data and weights are left alone, so
-an interrupted run goes on. Rows of other methods or of weights that are not here are named and left as they are.
+or shipped with the package). A classical or phase row is measured on its own data where given, else on the first
+dataset of ``--data``, which the row then names. Rows that have a reliance of the same version, data and weights are
+skipped, so an interrupted run continues. Rows of other methods, or of weights that are missing, are named and skipped.
 """
 
 import argparse
@@ -53,102 +53,102 @@ def weights_by_hash(runs: list[Path]) -> dict[str, Path]:
     return {sha256(path.read_bytes()).hexdigest(): path for path in files}
 
 
-class OnePass:
-    """A network's answers to an image in every depth range, from one pass; the rows of one network share them."""
+class SharedAnswers:
+    """A network's answers to an image in every depth range, from a single pass that all rows of the network share."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._kept: dict[bytes, dict[str | None, NDArray[np.float32]]] = {}
+        self._answers: dict[bytes, dict[str | None, NDArray[np.float32]]] = {}
 
     def answer(self, fringe: NDArray[np.uint8], depth_range: str | None) -> NDArray[np.float32]:
         """As `NetworkMethod.predict` in that depth range."""
         model, key = self.model, blake2b(fringe.tobytes()).digest()
-        if key not in self._kept:
+        if key not in self._answers:
             batch = fringe_batch([fringe], model.config.image_size, model.config.name)
             with torch.inference_mode(), probed(model.network) as probe:
                 values = represent(model.network, batch, model.config.name).float()
-                found: dict[str | None, torch.Tensor] = {"oracle": values}
+                answers: dict[str | None, torch.Tensor] = {"oracle": values}
                 if model.config.normalisation != "individual":
                     mm = denormalise(values.numpy(), model.config.normalisation, 0.0, 0.0)
-                    found[None] = torch.from_numpy(mm.astype(np.float32))
+                    answers[None] = torch.from_numpy(mm.astype(np.float32))
                 elif model.heads is not None:
-                    found |= {twin: model.heads.depth_mm(values, probe, twin) for twin in TWINS}
-            self._kept[key] = {name: answer[0, 0].numpy() for name, answer in found.items()}
-        return self._kept[key][depth_range]
+                    answers |= {twin: model.heads.depth_mm(values, probe, twin) for twin in TWINS}
+            self._answers[key] = {name: answer[0, 0].numpy() for name, answer in answers.items()}
+        return self._answers[key][depth_range]
 
 
-class SharedPass(NetworkMethod):
-    """A `NetworkMethod` whose answers come from a pass that its twins share."""
+class SharingMethod(NetworkMethod):
+    """A `NetworkMethod` that takes its answers from `SharedAnswers`."""
 
-    def __init__(self, once: OnePass, depth_range: Any, frame: Any) -> None:
-        super().__init__(once.model, depth_range, frame)
-        self._once = once
+    def __init__(self, shared: SharedAnswers, depth_range: Any, frame: Any) -> None:
+        super().__init__(shared.model, depth_range, frame)
+        self._shared = shared
 
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
         fringe = frames[self.frame]
         if fringe is None:
             raise FppBenchError(f"{self.name} needs frame {self.frame}")
-        return self._once.answer(fringe, self.depth_range)
+        return self._shared.answer(fringe, self.depth_range)
 
 
-class Bench:
+class Materials:
     """Datasets, weights and scenes, each opened once."""
 
     def __init__(self, data: list[Path], runs: list[Path], views: int) -> None:
-        self.books = [SceneBook(DatasetFolder(folder), views) for folder in data]
+        self.scenes = [SceneBook(DatasetFolder(folder), views) for folder in data]
         self.weights = weights_by_hash(runs)
-        self._pass: tuple[str, OnePass] | None = None
+        self._pass: tuple[str, SharedAnswers] | None = None
 
-    def book_of(self, entry: Entry, anywhere: bool) -> SceneBook:
-        """The scenes of the row's own data; of the first dataset where it is not given and ``anywhere`` will do."""
-        wanted = entry.result.dataset.fingerprint
-        for book in self.books:
-            if book.dataset.fingerprint == wanted:
-                return book
+    def scenes_of(self, entry: Entry, anywhere: bool) -> SceneBook:
+        """The scenes of the row's own data; with ``anywhere``, of the first dataset where its own is not given."""
+        fingerprint = entry.result.dataset.fingerprint
+        for scenes in self.scenes:
+            if scenes.dataset.fingerprint == fingerprint:
+                return scenes
         if not anywhere:
-            raise FppBenchError(f"its data {wanted[:8]} is not among --data")
-        return self.books[0]
+            raise FppBenchError(f"its data {fingerprint[:8]} is not among --data")
+        return self.scenes[0]
 
-    def method_of(self, entry: Entry) -> tuple[Method, SceneBook]:
-        """The row's method, made again, and the scenes to ask it about. Raises FppBenchError where it can't be."""
+    def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneBook]:
+        """The row's method, built again, and the scenes to measure it on. FppBenchError where it can't be built."""
         about = entry.result.submission
         if about.method in METHODS:
-            book = self.book_of(entry, anywhere=True)
-            return method(about.method, book.dataset.rig, **_options(about.settings)), book
-        wanted = about.settings.get("weights_sha256")
-        if not isinstance(wanted, str) or wanted not in self.weights:
-            raise FppBenchError("its weights are not here" if wanted else "not a method of this package")
-        book = self.book_of(entry, anywhere=False)
-        if self._pass is None or self._pass[0] != wanted:
-            self._pass = wanted, OnePass(load(self.weights[wanted], "cpu"))
-        once, settings = self._pass[1], about.settings
-        return SharedPass(once, settings.get("depth_range"), settings.get("frame")), book
+            scenes = self.scenes_of(entry, anywhere=True)
+            return method(about.method, scenes.dataset.rig, **_options(about.settings)), scenes
+        weights_sha256 = about.settings.get("weights_sha256")
+        if not isinstance(weights_sha256, str) or weights_sha256 not in self.weights:
+            raise FppBenchError("its weights are missing" if weights_sha256 else "not a method of this package")
+        scenes = self.scenes_of(entry, anywhere=False)
+        if self._pass is None or self._pass[0] != weights_sha256:
+            self._pass = weights_sha256, SharedAnswers(load(self.weights[weights_sha256], "cpu"))
+        shared, settings = self._pass[1], about.settings
+        return SharingMethod(shared, settings.get("depth_range"), settings.get("frame")), scenes
 
 
-_SAID_ONLY = ("weights_sha256", "device", "mask_threshold", "order_lead")
-"""Settings that say what the weights are; they are no options."""
+_NO_OPTIONS = ("weights_sha256", "device", "mask_threshold", "order_lead")
+"""Settings that describe the weights and are no options of the method."""
 
 
 def _options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in _SAID_ONLY}
+    return {key: value for key, value in settings.items() if key not in _NO_OPTIONS}
 
 
-def fill(bench: Bench, path: Path, again: bool) -> str:
-    """Put the block into the row at ``path`` where it lacks one; what became of it, in words."""
+def fill(materials: Materials, path: Path, again: bool) -> str:
+    """Write the phase reliance into the row at ``path`` unless it is up to date; returns the outcome in words."""
     entry = read_entry(path)
-    asked, book = bench.method_of(entry)
-    check_same_method(entry, asked)
-    weights = asked.settings.get("weights_sha256")
-    before = entry.reliance
-    if before is not None and not again:
-        same = (before.version, before.dataset_fingerprint, before.weights_sha256)
-        if same == (RELIANCE_VERSION, book.dataset.fingerprint, weights):
-            return f"{before.score:.3f}, as it was"
+    row_method, scenes = materials.method_and_scenes(entry)
+    check_same_method(entry, row_method)
+    weights = row_method.settings.get("weights_sha256")
+    stored = entry.reliance
+    if stored is not None and not again:
+        same = (stored.version, stored.dataset_fingerprint, stored.weights_sha256)
+        if same == (RELIANCE_VERSION, scenes.dataset.fingerprint, weights):
+            return f"{stored.score:.3f}, unchanged"
     started = time.perf_counter()
-    found, _ = measure(asked, book, weights if isinstance(weights, str) else None)
-    write_reliance(entry, found)
-    low, high = found.interval
-    return f"{found.score:.3f} ({low} to {high}), {time.perf_counter() - started:.1f} s"
+    reliance, _ = measure(row_method, scenes, weights if isinstance(weights, str) else None)
+    write_reliance(entry, reliance)
+    low, high = reliance.interval
+    return f"{reliance.score:.3f} ({low} to {high}), {time.perf_counter() - started:.1f} s"
 
 
 def table(entries: list[Entry]) -> str:
@@ -156,23 +156,28 @@ def table(entries: list[Entry]) -> str:
     titles = ("Row", "Reliance", "95% interval", "Periods aside", "Follows phase", "Follows brightness",
               "Change by outline", "No fringe inside", "No fringe outside", "Object MAE, mm", "Track")  # fmt: skip
     measured = [(entry, entry.reliance) for entry in entries if entry.reliance is not None]
-    measured.sort(key=lambda one: (-one[1].score, one[0].name))
+    measured.sort(key=lambda pair: (-pair[1].score, pair[0].name))
     lines = []
-    for entry, found in measured:
-        parts = found.parts
+    for entry, measured_reliance in measured:
+        parts = measured_reliance.parts
         values = (parts.follows_phase, parts.follows_light, parts.change_outline, parts.change_no_fringe_inside,
                   parts.change_no_fringe_outside)  # fmt: skip
-        cells = [entry.name, f"{found.score:.3f}", reliance_interval(entry), _two(found.order_free_score)]
-        cells += [*map(_two, values), millimetres(entry.value("object_mae_mm")), entry.result.track]
+        cells = [
+            entry.name,
+            f"{measured_reliance.score:.3f}",
+            reliance_interval(entry),
+            _two_decimals(measured_reliance.order_free_score),
+        ]
+        cells += [*map(_two_decimals, values), millimetres(entry.value("object_mae_mm")), entry.result.track]
         lines.append([markdown_text(cell) for cell in cells])
     right = [0 < place < len(titles) - 1 for place in range(len(titles))]
-    made = (
+    footer = (
         "Made by `python benchmarks/reliance_rows.py --table docs/tables/reliance.md` from the rows that have a block."
     )
-    return "\n".join([*markdown_rows(titles, right, lines), "", made]) + "\n"
+    return "\n".join([*markdown_rows(titles, right, lines), "", footer]) + "\n"
 
 
-def _two(value: float | None) -> str:
+def _two_decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
@@ -183,29 +188,29 @@ def main() -> int:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="dataset folders with all frames")
     parser.add_argument("--runs", type=Path, nargs="+", default=[Path("runs")], help="folders with trained weights")
     parser.add_argument("--rows", type=Path, default=SHIPPED_ROWS, help="folder of the rows")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows alone, by file name without .json")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="only these rows, by file name without .json")
     parser.add_argument("--views", type=int, default=VIEWS_PER_OBJECT, help="samples of each test object")
     parser.add_argument("--table", type=Path, metavar="FILE", help="write the rows' reliance as Markdown here")
-    parser.add_argument("--again", action="store_true", help="measure rows that have a block anew")
+    parser.add_argument("--again", action="store_true", help="measure all rows again")
     args = parser.parse_args()
-    bench = Bench(args.data, args.runs, args.views)
+    materials = Materials(args.data, args.runs, args.views)
     paths = [path for path in sorted(args.rows.glob("*.json")) if not args.only or path.stem in args.only]
-    left = _each(paths, lambda path: fill(bench, path, args.again))
+    unmeasured = _each(paths, lambda path: fill(materials, path, args.again))
     if args.table is not None:
         write_atomically(args.table, table([read_entry(path) for path in paths]).encode("utf-8"))
-    print(f"{len(paths) - left} rows have a phase reliance, {left} have not")
+    print(f"{len(paths) - unmeasured} rows have a phase reliance, {unmeasured} do not")
     return 0 if paths else REFUSED
 
 
 def _each(paths: list[Path], work: Callable[[Path], str]) -> int:
-    left = 0
+    unmeasured = 0
     for path in paths:
         try:
             print(f"{path.stem}: {work(path)}", flush=True)
         except FppBenchError as error:
-            left += 1
-            print(f"{path.stem}: left as it is, {error}", flush=True)
-    return left
+            unmeasured += 1
+            print(f"{path.stem}: skipped, {error}", flush=True)
+    return unmeasured
 
 
 if __name__ == "__main__":

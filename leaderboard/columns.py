@@ -6,23 +6,28 @@ from dataclasses import dataclass
 from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.paper import PaperRow
-from fpp_ml_bench.leaderboard.ranking import Ranked
+from fpp_ml_bench.leaderboard.assumptions import assumption
+from fpp_ml_bench.leaderboard.groups import TOLD, Ranked
+from fpp_ml_bench.leaderboard.paper import PaperRow, PaperTable
 from fpp_ml_bench.leaderboard.rows import Entry
 
-NAME_WIDTH = 90
 DEVICE_WIDTH = 40
 SELF_REPORTED = "*"
 NOT_MEASURED = "not measured"
+RANK_NOTE = (
+    "Rank: the best and the worst that the 95% intervals allow. Best: 1 + the rows whose whole interval is better; "
+    "worst: all rows minus those whose whole interval is worse."
+)
 NOTE = (
-    "Errors in mm, mean over samples; 95% interval from a bootstrap over objects. Rank: 1 and the number of methods "
-    f"whose whole interval is better. {SELF_REPORTED} time as reported by its author, not measured here."
+    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {SELF_REPORTED} time as "
+    "reported by its author, not measured here."
 )
 
 
 @dataclass(frozen=True)
 class Column:
-    """``text`` makes the cell; numbers stand on the right. Narrower than ``from_width`` characters, it is left out."""
+    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. A terminal of fewer than ``from_width``
+    characters leaves the column out."""
 
     title: str
     text: Callable[[Ranked], str]
@@ -41,8 +46,8 @@ def _time(row: Ranked) -> str:
 
 def _interval(key: str) -> Callable[[Ranked], str]:
     def text(row: Ranked) -> str:
-        found = row.entry.interval(key)
-        return "-" if found is None else "-".join(millimetres(end) for end in found)
+        ends = row.entry.interval(key)
+        return "-" if ends is None else "-".join(millimetres(end) for end in ends)
 
     return text
 
@@ -69,7 +74,9 @@ def device(entry: Entry) -> str:
 
 
 MIDDLE, WIDE, WIDEST = 100, 140, 170
-"""Characters from which on more columns fit."""
+"""Characters of a terminal from which on more columns fit."""
+ONLY_IN_FILES = 1_000_000
+_LONGEST_NAME = 90
 _TITLES = {
     "object_mae_mm": ("Object MAE", 0),
     "object_rmse_mm": ("Object RMSE", 0),
@@ -83,14 +90,14 @@ _ALWAYS_SORTABLE = ("seconds_per_sample", "frames_used")
 
 
 def columns(sort: str) -> list[Column]:
-    """Columns of a ranking by ``sort``; a key that has no column of its own gets one."""
+    """Columns of a ranking by ``sort``; a key without a column gets its own."""
     shown = list(_TITLES)
     if sort not in shown and sort not in _ALWAYS_SORTABLE:
         shown.insert(0, sort)
     titled = {key: _TITLES.get(key, (key.removesuffix("_mm").replace("_", " "), 0)) for key in shown}
     return [
-        Column("#", lambda row: str(row.rank)),
-        Column("Method", lambda row: printable(row.entry.name, NAME_WIDTH), right=False),
+        Column("Rank", lambda row: row.ranks),
+        Column("Method", lambda row: printable(row.short_name), right=False),
         *(
             column
             for key, (title, from_width) in titled.items()
@@ -100,12 +107,14 @@ def columns(sort: str) -> list[Column]:
         Column("Frames", lambda row: str(row.entry.frames)),
         Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE),
         Column("Provenance", lambda row: row.entry.provenance, right=False, from_width=MIDDLE),
+        Column("Assumes", lambda row: assumption(row.entry.result) or "-", right=False, from_width=WIDEST),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
+        Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
     ]
 
 
 def _with_interval(key: str, title: str, sort: str, from_width: int) -> list[Column]:
-    """The column of ``key``, and that of its interval beside the one that is ranked by."""
+    """The column of ``key``; beside the key that the rows are ranked by, the column of its interval."""
     column = Column(title, _metric(key), from_width=0 if key == sort else from_width)
     return [column, Column("95% interval", _interval(key), from_width=MIDDLE)] if key == sort in HEADLINE else [column]
 
@@ -120,3 +129,10 @@ def paper_cells(row: PaperRow) -> list[str]:
     """Cells under `PAPER_TITLES`, errors with the paper's two decimals."""
     keys = (f"{pixels}_{error}_mm" for pixels in ("object", "overall", "background") for error in ("mae", "rmse"))
     return [row.label, row.track, str(row.test_samples), *(f"{row.errors_mm[key]:.2f}" for key in keys)]
+
+
+def paper_note(paper: PaperTable) -> str:
+    """Below a table of the paper: other data, and what the methods of its tracks were told."""
+    tracks = sorted({row.track for row in paper.rows})
+    told = [f"{track}: told {TOLD[track]}." for track in tracks if TOLD[track]]
+    return " ".join(["Other data, not ranked with the rows above.", *told])

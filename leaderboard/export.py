@@ -7,15 +7,16 @@ from dataclasses import asdict
 from typing import Any
 
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, device, paper_cells
+from fpp_ml_bench.leaderboard.assumptions import assumption_sentences
+from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, device, paper_cells, paper_note
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, Group, Ranked
 from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperTable
-from fpp_ml_bench.leaderboard.ranking import Group, Ranked
 
 _PLAIN = frozenset(" -,+()/%=.")
 
 
 def markdown_text(text: str) -> str:
-    """``text`` as Markdown that shows exactly it: punctuation that could mean something becomes a character entity.
+    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
 
     Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins.
     """
@@ -24,8 +25,9 @@ def markdown_text(text: str) -> str:
 
 
 def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; ``right`` says which columns stand on the right. Cells are Markdown already."""
-    lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(" ---: " if r else " --- " for r in right) + "|"]
+    """Lines of a Markdown table; ``right`` says which columns are aligned to the right. Cells are Markdown already."""
+    rules = (" ---: " if to_right else " --- " for to_right in right)
+    lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(rules) + "|"]
     return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
 
@@ -35,8 +37,9 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
     shown = columns(sort)
     for group in groups:
         rows = [[markdown_text(column.text(row)) for column in shown] for row in group.rows]
-        titles = [column.title.replace("#", "Rank") for column in shown]
-        lines += [f"### {markdown_text(group.title)}", "", *markdown_rows(titles, [c.right for c in shown], rows), ""]
+        titles, right = [column.title for column in shown], [column.right for column in shown]
+        lines += [f"### {markdown_text(group.key.title)}", "", *markdown_rows(titles, right, rows), ""]
+        lines += [LEGACY_NOTE, ""] if group.key.is_legacy else []
     if groups:
         lines += [NOTE.replace("*", "\\*"), ""]
     if papers:
@@ -49,6 +52,8 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
             "",
             *markdown_rows(PAPER_TITLES, right, rows),
             "",
+            paper_note(paper),
+            "",
         ]
     return "\n".join(lines).rstrip("\n") + "\n"
 
@@ -58,7 +63,13 @@ def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str)
     content = {
         "sorted_by": sort,
         "groups": [
-            {**asdict(group.key), "dataset": group.dataset_name, "rows": [_row(row) for row in group.rows]}
+            {
+                **asdict(group.key),
+                "title": group.key.title,
+                "legacy": group.key.is_legacy,
+                "dataset": group.dataset_name,
+                "rows": [_row(row) for row in group.rows],
+            }
             for group in groups
         ],
         "reported_by_the_paper": [asdict(paper) for paper in papers],
@@ -70,8 +81,10 @@ def _row(row: Ranked) -> dict[str, Any]:
     result = row.entry.result
     submission = result.submission
     return {
-        "rank": row.rank,
+        "best_rank": row.best_rank,
+        "worst_rank": row.worst_rank,
         "name": submission.name,
+        "short_name": row.short_name,
         "method": submission.method,
         "provenance": row.entry.provenance,
         "metrics": result.metrics.model_dump(mode="json"),
@@ -82,6 +95,7 @@ def _row(row: Ranked) -> dict[str, Any]:
         "timing": None if result.timing is None else result.timing.model_dump(mode="json"),
         "phase_reliance": None if result.reliance is None else result.reliance.model_dump(mode="json"),
         "timed_on": device(row.entry),
+        "assumes": assumption_sentences(result),
         "frames_used": row.entry.frames,
         "samples": result.dataset.samples,
         "created": result.created,

@@ -11,43 +11,43 @@
       const text = state.toString();
       history.replaceState(null, "", text ? "#" + text : location.pathname + location.search);
     } catch {
-      // A frame without an address of its own: the view works, it just can't be linked to.
+      // A frame without its own address: the view works, but it can't be linked to.
     }
   }
 
-  // Sorting: a number where both have one, else text; what has no value comes last in either direction.
+  // Sorting: as numbers where all rows have one, else as text; rows without a value come last in both directions.
   function sort(table, key, direction) {
     const heads = all("thead th", table);
-    const place = heads.findIndex((head) => head.querySelector("button")?.dataset.key === key);
-    if (place < 0) return false;
+    const column = heads.findIndex((head) => head.querySelector("button")?.dataset.key === key);
+    if (column < 0) return false;
     const sign = direction === "descending" ? -1 : 1;
-    const value = (row) => row.cells[place].dataset.v;
+    const value = (row) => row.cells[column].dataset.v;
     const rows = all("tbody tr", table);
     const numeric = rows.every((row) => value(row) === undefined || !Number.isNaN(Number(value(row))));
     rows.map((row, index) => ({ row, index })).sort((a, b) => {
-      const [one, other] = [value(a.row), value(b.row)];
-      if (one === undefined || other === undefined) return (one === undefined) - (other === undefined);
-      const order = numeric ? Number(one) - Number(other) : one.localeCompare(other, "en");
+      const [first, second] = [value(a.row), value(b.row)];
+      if (first === undefined || second === undefined) return (first === undefined) - (second === undefined);
+      const order = numeric ? Number(first) - Number(second) : first.localeCompare(second, "en");
       return sign * order || a.index - b.index;
     }).forEach(({ row }) => table.tBodies[0].append(row));
     heads.forEach((head) => head.removeAttribute("aria-sort"));
-    heads[place].setAttribute("aria-sort", direction);
+    heads[column].setAttribute("aria-sort", direction);
     return true;
   }
 
   tables.forEach((table) => table.tHead.addEventListener("click", (event) => {
     const key = event.target.closest("button")?.dataset.key;
     if (!key) return;
-    const now = event.target.closest("th").getAttribute("aria-sort");
-    const direction = now === "ascending" ? "descending" : "ascending";
+    const current = event.target.closest("th").getAttribute("aria-sort");
+    const direction = current === "ascending" ? "descending" : "ascending";
     sort(table, key, direction);
     state.set(table.id, key + "." + direction);
     remember();
   }));
 
   function filter() {
-    const wanted = document.getElementById("q").value.trim().toLowerCase();
-    const most = Number(document.getElementById("frames").value) || Infinity;
+    const search = document.getElementById("q").value.trim().toLowerCase();
+    const maxFrames = Number(document.getElementById("frames").value) || Infinity;
     const boxes = all("input[name=provenance]", form);
     const allowed = new Set(boxes.filter((box) => box.checked).map((box) => box.value));
     const shown = new Set();
@@ -55,17 +55,17 @@
       const rows = all("tbody tr", table);
       rows.forEach((row) => {
         const data = row.dataset;
-        const keep = data.search.includes(wanted) && Number(data.frames) <= most && allowed.has(data.provenance);
-        row.hidden = !keep;
-        if (keep) shown.add(row.id);
+        const visible = data.search.includes(search) && Number(data.frames) <= maxFrames && allowed.has(data.provenance);
+        row.hidden = !visible;
+        if (visible) shown.add(row.id);
       });
       const count = rows.filter((row) => !row.hidden).length;
-      const said = count === rows.length ? "" : count + " of " + rows.length + " rows shown";
-      document.getElementById("c" + number).textContent = said;
+      const message = count === rows.length ? "" : count + " of " + rows.length + " rows shown";
+      document.getElementById("c" + number).textContent = message;
     });
     all("[data-row]").forEach((part) => { part.style.display = shown.has(part.dataset.row) ? "" : "none"; });
     all("[data-of]").forEach((row) => { row.hidden = !shown.has(row.dataset.of); });
-    const entries = { q: wanted, frames: most === Infinity ? "" : String(most) };
+    const entries = { q: search, frames: maxFrames === Infinity ? "" : String(maxFrames) };
     entries.hide = boxes.filter((box) => !box.checked).map((box) => box.value).join(",");
     for (const [key, value] of Object.entries(entries)) value ? state.set(key, value) : state.delete(key);
   }
@@ -96,7 +96,7 @@
     form.addEventListener("reset", () => setTimeout(changed));
   }
 
-  // A row and its mark in the picture point at each other.
+  // Highlight a row's mark under the mouse, and a mark's row.
   const near = (id, on) => {
     document.getElementById(id)?.classList.toggle("near", on);
     all(".point").filter((part) => part.dataset.row === id).forEach((part) => part.classList.toggle("near", on));

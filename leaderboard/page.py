@@ -1,11 +1,12 @@
 """The leaderboard as a static page: ``index.html``, ``data.json``, and a page for each submission.
 
-It works from disk and from any web server, loads nothing from anywhere, and the same rows give the same bytes.
+The page works from disk and from any web server and loads no other file. The same rows give the same bytes.
 """
 
 import hashlib
 import re
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
@@ -13,27 +14,22 @@ from fpp_ml_bench.evaluation.report_html import escaped, page
 from fpp_ml_bench.evaluation.result_io import result_json
 from fpp_ml_bench.evaluation.text import printable
 from fpp_ml_bench.leaderboard.export import table_json
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group
 from fpp_ml_bench.leaderboard.page_objects import objects_table
-from fpp_ml_bench.leaderboard.page_scatter import front_rows, scatter_svg
+from fpp_ml_bench.leaderboard.page_scatter import front_rows, scatter_html
 from fpp_ml_bench.leaderboard.page_submission import submission_page
-from fpp_ml_bench.leaderboard.page_table import badge, ranking_table
+from fpp_ml_bench.leaderboard.page_table import badge, machines, ranking_table
 from fpp_ml_bench.leaderboard.page_text import INTRODUCTION, SCATTER_KEY, paper_section, reading_section
 from fpp_ml_bench.leaderboard.page_tradeoff import tradeoff_section
 from fpp_ml_bench.leaderboard.paper import PaperTable
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, Group
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
 from fpp_ml_bench.leaderboard.tradeoff_points import Tradeoff
 from fpp_ml_bench.loaders.manifest import write_atomically
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
 _HERE = Path(__file__).resolve().parent
-_OURS = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
-GIVEN = {
-    "metric": "",
-    "oracle mask": "the object mask",
-    "oracle range": "the depth range",
-    "oracle range + mask": "the depth range and the object mask",
-}
+_OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
 _FRAME_LIMITS = (1, 2, 12, 25)
 
 
@@ -42,7 +38,7 @@ def write_page(
 ) -> list[Path]:
     """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``.
 
-    Returns the files written. Pages of submissions that are no longer in it are removed, nothing else is. Raises
+    Returns the files written. Removes pages of submissions that are no longer ranked, and nothing else. Raises
     SubmissionError where a file can't be written.
     """
     files = page_files(groups, papers, tradeoff)
@@ -51,7 +47,7 @@ def write_page(
         for name, content in files.items():
             write_atomically(out / name, content)
         for path in (out / SUBMISSIONS).iterdir():
-            if _OURS.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
+            if _OWN_PAGES.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
                 path.unlink()
     except OSError as error:
         raise SubmissionError(f"{printable(str(out), 500)} can't be written: {error.strerror}") from None
@@ -68,7 +64,7 @@ def page_files(
     body = _header(groups, bool(settings)) + '<main id="main">\n' + _filters(groups)
     body += "".join(_group_section(group, slugs, number) for number, group in enumerate(groups))
     if not groups:
-        body += "<section><h2>No submission yet</h2><p>The first one is one JSON file away: see below.</p></section>\n"
+        body += "<section><h2>No submission yet</h2><p>A row is one JSON file: see below how to add it.</p></section>\n"
     body += settings + paper_section(papers) + reading_section() + "</main>\n"
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
@@ -80,34 +76,46 @@ def page_files(
 
 
 def slug(entry: Entry) -> str:
-    """Name of an entry's page: its own name as far as it is harmless, and the start of its content's SHA-256."""
+    """Name of an entry's page: letters and digits of its own name, and the start of its content's SHA-256."""
     plain = re.sub(r"[^a-z0-9]+", "-", entry.name[:60].casefold()).strip("-") or "submission"
     return f"{plain}-{hashlib.sha256(result_json(entry.result)).hexdigest()[:12]}"
 
 
 def _header(groups: Sequence[Group], tradeoff: bool) -> str:
-    links = [(f"#s{number}", _heading(group)) for number, group in enumerate(groups)]
-    links += [("#tradeoff", "Every setting against time")] if tradeoff else []
-    links += [("#paper", "Reported by the paper"), ("#reading", "How to read this"), (DATA, "All figures as JSON")]
-    items = "".join(f'<li><a href="{address}">{escaped(text)}</a></li>' for address, text in links)
+    """Title and links: a line for each dataset with its rankings and their number of rows, and a line for the rest."""
+    lines = []
+    numbered = list(enumerate(groups))
+    for data, members in groupby(numbered, key=lambda pair: pair[1].key.data_title):
+        of_data = list(members)
+        targets = {group.key.against for _, group in of_data}
+        links = []
+        for number, group in of_data:
+            target = f", {group.key.against}" if len(targets) > 1 else ""
+            split = f", {group.key.split} split" if group.key.split != "test" else ""
+            links.append(_link(f"#s{number}", f"{group.key.track}{target}{split}", len(group.rows)))
+        lines.append(f"<b>{escaped(data)}:</b> {' · '.join(links)}")
+    rest = [("#tradeoff", "all settings against time")] if tradeoff else []
+    rest += [("#paper", "paper's tables"), ("#reading", "how to read this"), (DATA, "JSON")]
+    lines.append("<b>More:</b> " + " · ".join(_link(address, text) for address, text in rest))
+    items = "".join(f"<li>{line}</li>" for line in lines)
     return f'<header>{INTRODUCTION}<nav aria-label="Sections"><ul class="links">{items}</ul></nav></header>\n'
 
 
-def _heading(group: Group) -> str:
-    height, width = group.key.size
-    track = group.key.track[0].upper() + group.key.track[1:]
-    against = "exact depth" if group.key.target == "depth_exact" else "decoded depth"
-    return f"{track} track: {group.key.split} split, {width} x {height} px, against {against}"
+def _link(address: str, text: str, rows: int | None = None) -> str:
+    count = "" if rows is None else f" ({rows})"
+    return f'<span><a href="{address}">{escaped(text)}</a>{count}</span>'
 
 
 def _filters(groups: Sequence[Group]) -> str:
-    """One set of filters for every table; shown by the script only, for without it they would do nothing."""
+    """Filters for all tables. The script shows them: without it they would do nothing."""
     if not groups:
         return ""
-    present = [p for p in MEANING if any(row.entry.provenance == p for group in groups for row in group.rows)]
+    present = {row.entry.provenance for group in groups for row in group.rows}
     boxes = "".join(
-        f'<label><input type="checkbox" name="provenance" value="{escaped(p)}" checked> {badge(p)}</label>'
-        for p in present
+        f'<label><input type="checkbox" name="provenance" value="{escaped(provenance)}" checked> '
+        f"{badge(provenance)}</label>"
+        for provenance in MEANING
+        if provenance in present
     )
     frames = "".join(
         f'<option value="{limit}">{"1, single shot" if limit == 1 else f"at most {limit}"}</option>'
@@ -123,19 +131,21 @@ def _filters(groups: Sequence[Group]) -> str:
 
 
 def _group_section(group: Group, slugs: dict[int, str], number: int) -> str:
-    data = f"{group.dataset_name} ({group.key.fingerprint[:8]}), protocol {group.key.protocol_version}"
+    key = group.key
     objects = {part.object for row in group.rows for part in row.entry.result.per_object}
-    given = GIVEN[group.key.track]
-    oracle = f"<p>These methods were given {given} of the very samples they are scored on.</p>" if given else ""
-    mode = "" if group.key.mode == "standard" else f"; mode {group.key.mode}"
     samples = group.rows[0].entry.result.dataset.samples
-    front = ", ".join(escaped(row.entry.name, 80) for row in front_rows(group)) or "nobody yet"
+    timed = f"; timed on {' and '.join(machines(group))}" if machines(group) else ""
+    about = (
+        f"Dataset {group.dataset_name} ({key.fingerprint[:8]}), {samples} samples of {len(objects)} objects; protocol "
+        f"{key.protocol_version}, edge band {key.edge_band_px} px{timed}"
+    )
+    told = f"<p>These methods were told {TOLD[key.track]}.</p>" if TOLD[key.track] else ""
+    legacy = f'<p class="small">{LEGACY_NOTE}</p>' if key.is_legacy else ""
+    front = ", ".join(escaped(row.short_name) for row in front_rows(group)) or "no row yet"
+    pictures = scatter_html(group, slugs, 860, 430, "wide") + scatter_html(group, slugs, 360, 380, "narrow")
     return (
-        f'<section id="s{number}"><h2 id="g{number}">{escaped(_heading(group))}</h2>'
-        f'<p class="soft small">{escaped(data, 300)}{escaped(mode)}; {samples} samples of {len(objects)} objects; '
-        f"edge band {group.key.edge_band_px} px</p>{oracle}"
-        f"{ranking_table(group, slugs, number)}"
-        f"<figure>{scatter_svg(group, slugs, 860, 430, 'wide')}{scatter_svg(group, slugs, 360, 380, 'narrow')}"
-        f"<figcaption>{SCATTER_KEY} On the front: {front}.</figcaption></figure>"
+        f'<section id="s{number}"><h2 id="g{number}">{escaped(key.title)}</h2>'
+        f'<p class="soft small">{escaped(about, 500)}</p>{told}{legacy}{ranking_table(group, slugs, number)}'
+        f"<figure>{pictures}<figcaption>{SCATTER_KEY} On the front: {front}.</figcaption></figure>"
         f"{objects_table(group, slugs)}</section>\n"
     )

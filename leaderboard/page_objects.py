@@ -4,8 +4,8 @@ import math
 
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.report_html import escaped
+from fpp_ml_bench.leaderboard.groups import Group
 from fpp_ml_bench.leaderboard.page_scatter import ERROR
-from fpp_ml_bench.leaderboard.ranking import Group
 
 _SHADES = 6
 
@@ -18,13 +18,13 @@ def objects_table(group: Group, slugs: dict[int, str]) -> str:
         for row in group.rows
         for part in row.entry.result.per_object
     }
-    known = [value for value in values.values() if value]
+    errors = [value for value in values.values() if value]
     head = "".join(f'<th scope="col">{escaped(name.replace("_", " "), 60)}</th>' for name in objects)
     lines = []
     for row in group.rows:
-        cells = "".join(_cell(values.get((id(row.entry), name)), known) for name in objects)
+        cells = "".join(_cell(values.get((id(row.entry), name)), errors) for name in objects)
         lines.append(
-            f'<tr data-of="{slugs[id(row.entry)]}"><th scope="row">{escaped(row.entry.name, 80)}</th>{cells}</tr>\n'
+            f'<tr data-of="{slugs[id(row.entry)]}"><th scope="row">{escaped(row.short_name)}</th>{cells}</tr>\n'
         )
     return (
         '<details><summary>Object by object</summary><div class="scroll" tabindex="0" role="region" '
@@ -35,9 +35,10 @@ def objects_table(group: Group, slugs: dict[int, str]) -> str:
     )
 
 
-def _cell(value: float | None, known: list[float]) -> str:
-    if value is None or not known:
+def _cell(value: float | None, errors: list[float]) -> str:
+    """``errors``: all errors above 0 of the table, for the shade."""
+    if value is None or not errors:
         return f"<td>{millimetres(value)}</td>"
-    low, high = math.log(min(known)), math.log(max(known))
+    low, high = math.log(min(errors)), math.log(max(errors))
     share = 0.0 if value == 0 or high == low else (math.log(value) - low) / (high - low)
     return f'<td class="shade{min(_SHADES - 1, int(share * _SHADES))}">{millimetres(value)}</td>'

@@ -1,4 +1,4 @@
-"""The ranking as an HTML table: real headers with a button each, sortable values beside what is shown."""
+"""The ranking as an HTML table: a button in each header, and sortable values beside the text of the cells."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,25 +6,28 @@ from dataclasses import dataclass
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.report_html import escaped
 from fpp_ml_bench.evaluation.report_scores import interval_text
-from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, NOT_MEASURED, device, reliance, reliance_interval
+from fpp_ml_bench.leaderboard.assumptions import assumption
+from fpp_ml_bench.leaderboard.columns import NOT_MEASURED, RANK_NOTE, device, reliance, reliance_interval
+from fpp_ml_bench.leaderboard.groups import Group, Ranked
 from fpp_ml_bench.leaderboard.page_scatter import ERROR, provenance_class
-from fpp_ml_bench.leaderboard.ranking import Group, Ranked
 
 _PLOT_WIDTH, _PLOT_HEIGHT = 150, 18
-LONGEST_NAME = 200
 
 
 @dataclass(frozen=True)
 class _Column:
-    """``cell`` makes its HTML, ``value`` what it sorts by (text or a number; None comes last either way)."""
+    """``cell`` makes its HTML, ``value`` what it sorts by (text or a number; None comes last in both directions)."""
 
     key: str
     title: str
     cell: Callable[[Ranked], str]
     value: Callable[[Ranked], str | float | None]
     text: bool = False
-    secondary: bool = False
     sortable: bool = True
+
+    @property
+    def css(self) -> str:
+        return ' class="text"' if self.text else ""
 
 
 def milliseconds(value: float | None) -> str:
@@ -34,10 +37,8 @@ def milliseconds(value: float | None) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _metric(key: str, title: str, secondary: bool = False) -> _Column:
-    return _Column(
-        key, title, lambda row: millimetres(row.entry.value(key)), lambda row: row.entry.value(key), secondary=secondary
-    )
+def _metric(key: str, title: str) -> _Column:
+    return _Column(key, title, lambda row: millimetres(row.entry.value(key)), lambda row: row.entry.value(key))
 
 
 def _time(row: Ranked) -> str:
@@ -49,6 +50,11 @@ def _time(row: Ranked) -> str:
         spread = f"<small>{milliseconds(timing.latency_p5_ms)} to {milliseconds(timing.latency_p95_ms)}</small>"
     mark = "" if entry.time_measured else '<small class="p-self-reported">self-reported</small>'
     return f"{milliseconds(entry.latency_ms)}{spread}{mark}"
+
+
+def machines(group: Group) -> list[str]:
+    """What the times of ``group`` were taken on, sorted."""
+    return sorted({device(row.entry) for row in group.rows if row.entry.latency_ms is not None})
 
 
 def _reliance(row: Ranked) -> str:
@@ -63,21 +69,24 @@ def badge(provenance: str) -> str:
     return f'<span class="badge {provenance_class(provenance)}">{escaped(provenance)}</span>'
 
 
-def _columns(slugs: dict[int, str], plot: Callable[[Ranked], str]) -> list[_Column]:
+def _columns(slugs: dict[int, str], plot: Callable[[Ranked], str], several_machines: bool) -> list[_Column]:
     def method(row: Ranked) -> str:
-        shown = escaped(row.entry.name, LONGEST_NAME)
-        return (
-            f'<a href="submissions/{slugs[id(row.entry)]}.html">{shown}</a><small>{escaped(device(row.entry))}</small>'
-        )
+        link = f"submissions/{slugs[id(row.entry)]}.html"
+        words = assumption(row.entry.result)
+        below = f"<small>{escaped(words)}</small>" if words else ""
+        return f'<a href="{link}" title="{escaped(row.entry.name)}">{escaped(row.short_name)}</a>{below}'
+
+    def time(row: Ranked) -> str:
+        return _time(row) + (f"<small>{escaped(device(row.entry))}</small>" if several_machines else "")
 
     return [
-        _Column("rank", "Rank", lambda row: str(row.rank), lambda row: float(row.rank)),
-        _Column("name", "Method", method, lambda row: row.entry.name[:NAME_WIDTH].casefold(), text=True),
+        _Column("rank", "Rank", lambda row: row.ranks, lambda row: row.best_rank + row.worst_rank / 10_000),
+        _Column("name", "Method", method, lambda row: row.short_name.casefold(), text=True),
         _metric(ERROR, "Object MAE, mm"),
         _Column("interval", "95% interval, mm", plot, lambda row: None, text=True, sortable=False),
-        _metric("object_rmse_mm", "Object RMSE, mm", secondary=True),
-        _metric("overall_mae_mm", "Overall MAE, mm", secondary=True),
-        _Column("ms", "Time, ms", _time, lambda row: row.entry.latency_ms),
+        _metric("object_rmse_mm", "Object RMSE, mm"),
+        _metric("overall_mae_mm", "Overall MAE, mm"),
+        _Column("ms", "Time, ms", time, lambda row: row.entry.latency_ms),
         _Column("frames", "Frames", lambda row: str(row.entry.frames), lambda row: float(row.entry.frames)),
         _Column(
             "reliance", "Phase reliance", _reliance,
@@ -91,8 +100,9 @@ def _columns(slugs: dict[int, str], plot: Callable[[Ranked], str]) -> list[_Colu
 
 
 def ranking_table(group: Group, slugs: dict[int, str], number: int) -> str:
-    """The table of ``group``, its rows in ranking order; ``number`` tells the page's tables apart."""
-    columns = _columns(slugs, _interval_plot(group))
+    """The table of ``group``, its rows in ranking order, and below it what a rank is. ``number``: of the table on the
+    page."""
+    columns = _columns(slugs, _interval_plot(group), len(machines(group)) > 1)
     head = "".join(_header(column) for column in columns)
     body = "".join(_row(row, columns, slugs) for row in group.rows)
     caption = "Best first; select a column's title to sort by it"
@@ -100,17 +110,17 @@ def ranking_table(group: Group, slugs: dict[int, str], number: int) -> str:
         f'<div class="scroll" tabindex="0" role="region" aria-labelledby="g{number}">'
         f'<table class="ranking" id="t{number}"><caption>{caption}</caption>'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n"
+        f'<p class="soft small">{RANK_NOTE}</p>'
         f'<p class="soft small count" role="status" id="c{number}"></p>'
     )
 
 
 def _header(column: _Column) -> str:
-    classes = " ".join(name for name, on in (("text", column.text), ("secondary", column.secondary)) if on)
-    marked = f' class="{classes}"' if classes else ""
     if not column.sortable:
-        return f'<th scope="col"{marked}>{column.title}</th>'
-    order = ' aria-sort="ascending"' if column.key == "rank" else ""
-    return f'<th scope="col"{marked}{order}><button type="button" data-key="{column.key}">{column.title}</button></th>'
+        return f'<th scope="col"{column.css}>{column.title}</th>'
+    order = ' aria-sort="ascending"' if column.key == ERROR else ""
+    button = f'<button type="button" data-key="{column.key}">{column.title}</button>'
+    return f'<th scope="col"{column.css}{order}>{button}</th>'
 
 
 def _row(row: Ranked, columns: list[_Column], slugs: dict[int, str]) -> str:
@@ -118,15 +128,13 @@ def _row(row: Ranked, columns: list[_Column], slugs: dict[int, str]) -> str:
     for column in columns:
         value = column.value(row)
         data = f' data-v="{escaped(value if isinstance(value, str) else repr(value))}"' if value is not None else ""
-        classes = " ".join(name for name, on in (("text", column.text), ("secondary", column.secondary)) if on)
-        marked = f' class="{classes}"' if classes else ""
         kind, scope = ("th", ' scope="row"') if column.key == "name" else ("td", "")
-        cells.append(f"<{kind}{scope}{marked}{data}>{column.cell(row)}</{kind}>")
+        cells.append(f"<{kind}{scope}{column.css}{data}>{column.cell(row)}</{kind}>")
     entry = row.entry
-    search = escaped(f"{entry.name} {entry.result.submission.method} {device(entry)}".casefold(), 500)
+    words = f"{entry.name} {row.short_name} {entry.result.submission.method} {device(entry)}"
     return (
-        f'<tr id="{slugs[id(entry)]}" data-search="{search}" data-provenance="{escaped(entry.provenance)}" '
-        f'data-frames="{entry.frames}">{"".join(cells)}</tr>\n'
+        f'<tr id="{slugs[id(entry)]}" data-search="{escaped(words.casefold(), 700)}" '
+        f'data-provenance="{escaped(entry.provenance)}" data-frames="{entry.frames}">{"".join(cells)}</tr>\n'
     )
 
 

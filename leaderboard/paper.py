@@ -1,5 +1,5 @@
-"""The paper's own rows, as reported there. They were never measured by this package and are never ranked with rows
-that were; ``paper_rows.json`` holds them as typed in from its tables."""
+"""The rows that the paper reports. This package did not measure them, and they are never ranked with measured rows;
+``paper_rows.json`` holds them as typed in from the paper's tables."""
 
 import json
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.text import printable
 
 PAPER_FILE = Path(__file__).resolve().parent / "paper_rows.json"
-PAPER_HEADING = "reported by the paper (not measured here)"
+PAPER_HEADING = "reported by the paper on other data (not measured here)"
 PAPER_TABLES = TABLES
 SHOWN_BY_DEFAULT = ("architecture", "normalization")
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One row of a table: errors in mm by the keys of `HEADLINE`, on ``test_samples`` (view, frame) pairs."""
+    """A row of a table: errors in mm by the keys of `HEADLINE`, on ``test_samples`` (view, frame) pairs."""
 
     row: str
     label: str
@@ -30,7 +30,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper, its rows in the paper's order."""
+    """A table of the paper, its rows in the paper's order."""
 
     name: str
     title: str

@@ -1,4 +1,4 @@
-"""The front of error against run time: who is beaten by nobody in both."""
+"""The Pareto front of error against run time."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Indices of the ``points`` (time, error) that no other point beats: none is as good in both and better in one.
 
-    Smaller is better. Sorted by time; points that are equal in both are all on the front or all off it.
+    Smaller is better. Sorted by time. Points that are equal in both are all on the front or all off it.
     """
     front: list[int] = []
     best = float("inf")

@@ -1,7 +1,7 @@
-"""What publishing would change: a folder of staged files against the files that a repository on the Hub has.
+"""What publishing would change: a folder of staged files compared with the files of a repository on the Hub.
 
-No network here. Files are compared by the hashes the Hub itself keeps (SHA-256 of a large file, git's own hash of a
-small one), so whatever is already there is never sent again, whoever put it there.
+This module uses no network. Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash
+of a small file), so a file that the repository already has is never sent again.
 """
 
 import json
@@ -19,18 +19,18 @@ Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
-"""File that says a repository is published by this command, and what of: the next run may replace what it finds."""
+"""File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
 _HUB_OWN = frozenset({".gitattributes", "README.md"})
-"""What a repository that was just made on the Hub's web page holds."""
+"""Files of a repository that was just made on the Hub's web page."""
 _CHUNK = 1 << 24
 
 
 @dataclass(frozen=True)
 class Publication:
-    """Files staged for one repository; every file below ``folder`` is part of it, hidden ones included.
+    """Files staged for a repository; every file below ``folder`` is part of it, hidden files included.
 
-    ``owned`` are folders (ending in ``/``) that this publication fills alone: what else is found there is deleted.
-    ``message`` becomes the commit's. ``must_exist`` keeps it from making a repository.
+    ``owned`` are folders (ending in ``/``) that only this publication fills: any other file in them is deleted.
+    ``message`` is the commit message. With ``must_exist`` no repository is made.
     """
 
     kind: Kind
@@ -53,7 +53,7 @@ class RemoteFile:
 
 @dataclass(frozen=True)
 class Remote:
-    """A repository as it stands: ``commit`` is None where there is none yet (or none that this token may see)."""
+    """The current state of a repository: ``commit`` is None where it does not exist, or this token may not see it."""
 
     commit: str | None
     private: bool = False
@@ -66,7 +66,7 @@ class Remote:
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of one file; ``bytes`` is its size after the change, or before it where it is deleted."""
+    """The change of a file; ``bytes`` is its size after the change, or before it where the file is deleted."""
 
     status: Status
     path: str
@@ -81,30 +81,30 @@ def mark_bytes(publishes: str, **about: Any) -> bytes:
 
 def staged_files(folder: Path) -> dict[str, Path]:
     """Every file below a staged folder by its path in the repository, sorted. Raises `PublishError` for a link."""
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.is_symlink():
             raise PublishError(f"{path}: is a symbolic link; put the file itself there")
         if path.is_file():
-            found[path.relative_to(folder).as_posix()] = path
-    return found
+            files[path.relative_to(folder).as_posix()] = path
+    return files
 
 
 def changes(publication: Publication, remote: Remote) -> list[Change]:
     """What publishing does to each file of ``publication``, sorted by path, and what it deletes.
 
-    Reads every staged file once. Files of the repository outside ``owned`` that aren't part of it stay as they are.
+    Reads every staged file once. Other files of the repository outside ``owned`` stay as they are.
     """
     files = dict(remote.files)
     planned = []
     staged = staged_files(publication.folder)
     for name, path in staged.items():
-        there = files.get(name)
+        remote_file = files.get(name)
         size = path.stat().st_size
-        if there is None:
+        if remote_file is None:
             planned.append(Change("new", name, size))
         else:
-            planned.append(Change("unchanged" if _same(path, size, there) else "changed", name, size))
+            planned.append(Change("unchanged" if _same(path, size, remote_file) else "changed", name, size))
     planned += [
         Change("deleted", name, file.bytes)
         for name, file in files.items()
@@ -113,25 +113,25 @@ def changes(publication: Publication, remote: Remote) -> list[Change]:
     return sorted(planned, key=lambda change: change.path)
 
 
-def _same(path: Path, size: int, there: RemoteFile) -> bool:
-    if there.bytes != size:
+def _same(path: Path, size: int, remote_file: RemoteFile) -> bool:
+    if remote_file.bytes != size:
         return False
-    digest = sha256() if there.sha256 is not None else sha1(f"blob {size}\0".encode(), usedforsecurity=False)
+    digest = sha256() if remote_file.sha256 is not None else sha1(f"blob {size}\0".encode(), usedforsecurity=False)
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
-    return digest.hexdigest() == (there.sha256 if there.sha256 is not None else there.git_sha1)
+    return digest.hexdigest() == (remote_file.sha256 if remote_file.sha256 is not None else remote_file.git_sha1)
 
 
 def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> None:
-    """Refuse, with `PublishError`, to write into a repository that someone filled in another way, unless ``adopt``."""
+    """Refuse, with `PublishError`, to write into a repository that this command did not fill, unless ``adopt``."""
     if adopt or publication.kind == "model" or not remote.exists:
         return
     foreign = sorted(set(remote.files) - _HUB_OWN)
     if foreign and MARK not in remote.files:
-        shown = ", ".join(printable(name, 80) for name in foreign[:3])
+        named = ", ".join(printable(name, 80) for name in foreign[:3])
         raise PublishError(
             f"{publication.repo}: this {publication.kind} holds {len(foreign)} files that fpp-bench did not publish "
-            f"({shown}, ...); give the name of a new one, or --adopt to publish into it (nothing is deleted outside "
+            f"({named}, ...); give the name of a new one, or --adopt to publish into it (nothing is deleted outside "
             f"{', '.join(publication.owned) or 'its own files'})"
         )

@@ -24,7 +24,7 @@ _BODY = """\
 # FPP-ML-Bench: single-shot fringe projection profilometry
 
 {rows} samples of {height} x {width} px ({origin} data): what a structured-light camera sees of an object under
-projected fringes, and the depth of every pixel. Objects never stand in two splits.
+projected fringes, and the depth of every pixel. No object is in two splits.
 
 | split | samples | objects |
 | --- | ---: | --- |
@@ -56,13 +56,14 @@ Fingerprint of the dataset: `{fingerprint}`. Written by fpp-ml-bench {package}.
 """
 
 
-def dataset_licence(dataset: DatasetFolder, given: str | None) -> str:
-    """Licence identifier for the card: ``given``, or MIT for generated data. `PublishError` where nobody knows it."""
-    if given is None and dataset.manifest.origin != "generated":
+def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
+    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data without
+    it."""
+    if license_id is None and dataset.manifest.origin != "generated":
         raise PublishError(
             f"{dataset.path}: {dataset.manifest.origin} data; say under which --license it may be shared"
         )
-    licence = given or "mit"
+    licence = license_id or "mit"
     if not _LICENCE.fullmatch(licence):
         raise PublishError(f"--license: expected an identifier like mit or cc-by-4.0, got {licence!r}")
     return licence
@@ -74,15 +75,15 @@ def stage_dataset(
 ) -> Publication:  # fmt: skip
     """Write everything that is published of ``dataset`` into ``folder``; the same dataset gives the same bytes.
 
-    Parquet files that are there already are taken as they are: see `publish_staging` for whose they are. Raises
-    `DatasetError` for a damaged dataset, ``OSError`` when the disk refuses.
+    Parquet files that are already there are kept; see `publish_staging` for when they are. Raises
+    `DatasetError` for a damaged dataset, ``OSError`` when a file can't be written.
     """
     for name, shard in data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
             write_shard(dataset, shard, folder / name, threads, row_done)
-    for mesh in (other for other in dataset.manifest.others if other.path.startswith(f"{MESH_FOLDER}/")):
+    for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
         source = dataset.path / mesh.path
         if not source.is_file() or file_hash(source) != mesh.xxh3_128:
             raise DatasetError(f"{source}: missing or damaged, it isn't published; build the dataset again")

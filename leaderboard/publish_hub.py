@@ -1,7 +1,7 @@
 """The Hugging Face Hub through its own client: reading a repository's state, and sending what changed.
 
-Whatever the client raises (no token, no network, 401, 403, 404, 5xx) becomes a `PublishError` that says what to do.
-The client obeys ``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
+Every error of the client (no token, no network, 401, 403, 404, 5xx) becomes a `PublishError` that says what to do.
+The client reads ``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
 """
 
 import json
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from huggingface_hub import CommitOperationAdd
 
 _BATCH_BYTES, _BATCH_FILES = 1 << 26, 64
-"""Files are sent ahead of the commit in batches of about this size: what has arrived is never sent again."""
+"""Files are sent before the commit in batches of about this size; a file that arrived is never sent again."""
 _REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
 _URL_PREFIX: dict[Kind, str] = {"dataset": "datasets/", "space": "spaces/", "model": ""}
 
@@ -36,7 +36,7 @@ def check_repo_name(repo: str) -> str:
 
 
 class Hub:
-    """One connection to the Hub. Making one touches no network."""
+    """A connection to the Hub. Its constructor uses no network."""
 
     def __init__(self) -> None:
         from huggingface_hub import HfApi
@@ -65,14 +65,14 @@ class Hub:
         return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
 
     def check_may_create(self, repo: str, names: set[str]) -> None:
-        """`PublishError` where the owner of a new repository is nobody the token may publish for."""
+        """`PublishError` where the token may not make repositories for the owner of ``repo``."""
         owner = repo.split("/")[0]
         if owner.lower() not in {name.lower() for name in names}:
-            shown = ", ".join(printable(name, 60) for name in sorted(names))
-            raise PublishError(f"{repo}: does not exist, and this token may make repositories of {shown} only")
+            owners = ", ".join(printable(name, 60) for name in sorted(names))
+            raise PublishError(f"{repo}: does not exist, and this token may make repositories of {owners} only")
 
     def state(self, kind: Kind, repo: str) -> Remote:
-        """A repository's commit, visibility and files; `Remote` without a commit where there is none to be seen."""
+        """A repository's commit, visibility and files; a `Remote` without a commit where no repository is visible."""
         from huggingface_hub import get_token
         from huggingface_hub.errors import RepositoryNotFoundError
         from huggingface_hub.hf_api import RepoFile
@@ -81,7 +81,7 @@ class Hub:
             try:
                 info = self._api.repo_info(repo, repo_type=kind)
             except RepositoryNotFoundError as error:
-                # The Hub answers 401, not 404, where a nameless caller asks for what is private or missing.
+                # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
@@ -95,7 +95,7 @@ class Hub:
         return Remote(info.sha or "", bool(info.private), files)
 
     def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
-        """What `MARK` of a repository says; `PublishError` where it has none or a damaged one."""
+        """Content of `MARK` in a repository; `PublishError` where the file is missing or damaged."""
         if not remote.exists:
             raise PublishError(
                 f"{repo}: no such {kind} on {self.endpoint}, or this token may not see it; check the name, or publish "
@@ -118,9 +118,9 @@ class Hub:
     ) -> str:  # fmt: skip
         """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
 
-        Nobody sees half of it: files travel ahead, one commit makes them visible. A run that was cut off sends only
-        what is still missing. ``sent`` is told the bytes. Raises `PublishError`, also when someone else committed
-        meanwhile.
+        All files become visible together, with the commit. An interrupted run, started again, sends only what is
+        missing. ``sent`` is called with the bytes of each batch. Raises `PublishError`, also after a commit by someone
+        else meanwhile.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
@@ -155,7 +155,9 @@ class Hub:
         except LocalTokenNotFoundError as error:
             raise PublishError(f"{doing}: no token; run 'hf auth login' or set HF_TOKEN") from error
         except HfHubHTTPError as error:
-            raise PublishError(f"{doing}: {_answer(error.response.status_code)}{_said(error)}") from error
+            raise PublishError(
+                f"{doing}: {_status_words(error.response.status_code)}{_server_message(error)}"
+            ) from error
         except HTTPError as error:
             raise PublishError(
                 f"{doing}: {self.endpoint} can't be reached ({printable(str(error)) or type(error).__name__}); check "
@@ -167,22 +169,22 @@ class Hub:
             raise PublishError(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
 
 
-def _answer(status: int) -> str:
-    known = {
+def _status_words(status: int) -> str:
+    answers = {
         401: "the Hub does not accept the token (401); run 'hf auth login' again or set another HF_TOKEN",
         403: "the token may not do that (403); it needs write access to this owner and repository",
         404: "no such repository, or this token may not see it (404); check the name",
         409: "somebody else is changing it (409); run the same command again",
-        412: "somebody else committed meanwhile (412); run the same command again, it looks anew",
+        412: "somebody else committed meanwhile (412); run the same command again",
         413: "too large for the Hub (413)",
         429: "too many requests (429); wait some minutes, then run the same command again",
     }
     if status >= 500:
         return f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
-    return known.get(status, f"the Hub refused ({status})")
+    return answers.get(status, f"the Hub refused ({status})")
 
 
-def _said(error: Any) -> str:
+def _server_message(error: Any) -> str:
     return f". The Hub says: {printable(' '.join(error.server_message.split()))}" if error.server_message else ""
 
 
@@ -190,7 +192,7 @@ def _batches(additions: "list[CommitOperationAdd]") -> "Iterator[list[CommitOper
     batch: list[CommitOperationAdd] = []
     for addition in additions:
         batch.append(addition)
-        if len(batch) == _BATCH_FILES or sum(one.upload_info.size for one in batch) >= _BATCH_BYTES:
+        if len(batch) == _BATCH_FILES or sum(queued.upload_info.size for queued in batch) >= _BATCH_BYTES:
             yield batch
             batch = []
     if batch:

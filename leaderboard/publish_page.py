@@ -1,4 +1,4 @@
-"""Staging the leaderboard's page as a static Space: its own files as they are, and the README that makes it a Space."""
+"""Staging the leaderboard's page as a static Space: the page's files, and the README that makes it a Space."""
 
 import shutil
 from collections.abc import Sequence
@@ -49,8 +49,8 @@ def write_page_of(results: Sequence[Path], folder: Path) -> None:
 def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
     """Copy the page in folder ``page`` to ``folder`` and add the Space's README; ``dataset_repo`` is linked from it.
 
-    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space shows
-    everything it holds to everybody.
+    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space
+    publishes every file.
     """
     if not (page / INDEX).is_file():
         raise PublishError(f"{page}: expected a page with {INDEX}; write one with: fpp-bench leaderboard --page {page}")
@@ -60,7 +60,7 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
         if hidden or path.suffix.lower() not in _SUFFIXES or name in (_README, MARK):
             raise PublishError(
                 f"{printable(str(path), 300)}: is no part of a page (expected {', '.join(sorted(_SUFFIXES))}); a Space "
-                "shows every file to everybody, so move it out"
+                "publishes every file, so move it out"
             )
     total = sum(path.stat().st_size for path in files.values())
     if total > _LARGEST_BYTES:

@@ -1,8 +1,8 @@
 """Dataset shards as Parquet that the Hub's viewer shows: frames as ``Image`` columns, depth in exact float32.
 
-A frame is a PNG, which loses nothing and which every viewer knows. Depth stays an Array2D of float32, so that
-``load_dataset`` gives back the very bits; beside it ``depth_preview`` is a small picture of it for people. One row
-group is in memory at a time.
+A frame is a PNG, which is lossless and shown by every viewer. Depth stays an Array2D of float32, so that
+``load_dataset`` returns the same bits; ``depth_preview`` is a small picture of it for people. Only one row group is in
+memory at a time.
 """
 
 import json
@@ -70,7 +70,7 @@ def write_shard(
 ) -> None:
     """Write the rows of one data shard, all columns, to ``path``; the file appears complete or not at all.
 
-    Raises `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` when the disk refuses.
+    Raises `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -105,7 +105,7 @@ def write_shard(
     finally:
         temporary.unlink(missing_ok=True)
         for part in parts:
-            dataset.forget(part)  # or the maps of all shards would add up
+            dataset.forget(part)  # else the memory maps of all shards would stay open
 
 
 def _is_image(name: str) -> bool:
@@ -148,7 +148,7 @@ def _rows_per_group(dataset: DatasetFolder) -> int:
 
 
 def _stored(dataset: DatasetFolder, shard: ShardFile, names: list[str]) -> "dict[str, pa.ChunkedArray]":
-    """Columns of a data shard as they lie on disk, memory-mapped: what is published of them is the same bits."""
+    """Columns of a data shard, memory-mapped from disk: the published values are the same bits."""
     import pyarrow as pa
 
     batches = dataset.record_batches(shard)
@@ -168,7 +168,7 @@ def _pictures(dataset: DatasetFolder, samples: list[str], field: "pa.Field", poo
 
 
 def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
-    """A frame, or the preview (None), as PNG. Noisy fringes hold no repetition worth searching for: with Huffman coding
+    """A frame, or the preview (None), as PNG. Noisy fringes have no repetition to search for: with Huffman coding
     alone the files are 22% smaller than at OpenCV's level 1, and decode 1.7 times as fast (measured)."""
     import cv2
 

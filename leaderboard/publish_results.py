@@ -1,6 +1,6 @@
 """Staging results as ``.eval_results/*.yaml`` of a model's repository, from which the Hub fills its benchmark table.
 
-Only numbers and fixed words leave a result: no text that its author wrote.
+Only numbers and fixed words of a result are published, no text that its author wrote.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,10 @@ def stage_results(
     paths: Sequence[Path], repo: str, dataset_repo: str, published: Mapping[str, Any], revision: str, folder: Path,
     source_url: str | None = None,
 ) -> Publication:  # fmt: skip
-    """Write one file per result into ``folder``; a result of the same task takes the place of an earlier one.
+    """Write a file for each result into ``folder``; it replaces an earlier result of the same task.
 
-    ``published`` is what the dataset's mark file says at ``revision``: a result scored on other data is refused, like
-    one of another split or target, or without an object score (`PublishError`).
+    ``published`` is what the dataset's mark file says at ``revision``: a result scored on other data is refused, as is
+    a result of another split or target, or without an object score (`PublishError`).
     """
     from huggingface_hub import eval_result_entries_to_yaml
 
@@ -35,21 +35,24 @@ def stage_results(
     named: dict[str, Path] = {}
     (folder / FOLDER).mkdir()
     for path in paths:
-        result, shown = read_entry(path).result, printable(str(path), 300)
+        result, file = read_entry(path).result, printable(str(path), 300)
         if result.dataset.fingerprint != published.get("fingerprint"):
-            ours, theirs = result.dataset.fingerprint[:12], printable(published.get("fingerprint"), 12)
-            raise PublishError(
-                f"{shown}: was scored on other data (fingerprint {ours}) than {dataset_repo} holds ({theirs}); score "
-                "the predictions on that dataset, or publish this one"
+            fingerprint, published_fingerprint = (
+                result.dataset.fingerprint[:12],
+                printable(published.get("fingerprint"), 12),
             )
-        task = task_of(result, shown)
+            raise PublishError(
+                f"{file}: was scored on other data (fingerprint {fingerprint}) than {dataset_repo} holds "
+                f"({published_fingerprint}); score the predictions on that dataset, or publish this one"
+            )
+        task = task_of(result, file)
         if task.id in named:
             raise PublishError(
-                f"{printable(str(named[task.id]), 300)} and {shown} are both results of {task.id}; a model has one of "
+                f"{printable(str(named[task.id]), 300)} and {file} are both results of {task.id}; a model has one of "
                 "each, publish the other with its own model repository"
             )
         named[task.id] = path
-        entry = _entry(result, shown, task.id, dataset_repo, revision, source_url)
+        entry = _entry(result, file, task.id, dataset_repo, revision, source_url)
         name = f"{task.id}--{dataset_repo.replace('/', '--')}.yaml"
         (folder / FOLDER / name).write_bytes(_yaml(eval_result_entries_to_yaml([entry])).encode())
     return Publication("model", repo, folder, f"{BENCHMARK} results: {', '.join(named)}", must_exist=True)
@@ -62,12 +65,12 @@ def _yaml(content: Any) -> str:
     return text
 
 
-def _entry(result: Result, shown: str, task: str, dataset_repo: str, revision: str, source_url: str | None) -> Any:
+def _entry(result: Result, file: str, task: str, dataset_repo: str, revision: str, source_url: str | None) -> Any:
     from huggingface_hub import EvalResultEntry
 
     error_mm = result.metrics.object_mae_mm
     if error_mm is None:
-        raise PublishError(f"{shown}: has no object score (no sample shows an object), so there is nothing to rank by")
+        raise PublishError(f"{file}: has no object score (no sample shows an object), so there is nothing to rank by")
     return EvalResultEntry(
         dataset_id=dataset_repo,
         task_id=task,
@@ -87,7 +90,7 @@ def _notes(result: Result) -> str:
     frames = len(submission.frames_used)
     time = ""
     if submission.seconds_per_sample is not None:
-        time = f"; {submission.seconds_per_sample:.4g} s a sample, {submission.seconds_source}"
+        time = f"; {submission.seconds_per_sample:.4g} s per sample, {submission.seconds_source}"
     missing = percent(metrics.object_missing_share)
     return (
         f"{SCORE_TEXT}. Object MAE {millimetres(metrics.object_mae_mm)} mm{interval}, RMSE "

@@ -1,4 +1,4 @@
-"""The folder in which a publication is put together: a temporary one, or one that is kept and continued."""
+"""The folder in which a publication is put together: temporary, or kept and continued by the next run."""
 
 import shutil
 import tempfile
@@ -15,29 +15,28 @@ _IDENTITY, _FILES = "staged.sha256", "files"
 
 
 @contextmanager
-def staging_folder(kept: Path | None, identity: str) -> Iterator[Path]:
-    """Yield the folder for staged files: a temporary one, or ``files/`` in ``kept``.
+def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
+    """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``.
 
-    ``identity`` says what is staged there. What an earlier run left in ``kept`` for the same identity is continued; for
-    another one it is cleared away. Raises `PublishError` for a folder that holds anything else, ``OSError`` when the
-    disk refuses.
+    ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are kept for the same identity and
+    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write.
     """
-    if kept is None:
+    if chosen is None:
         with tempfile.TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
             yield Path(folder)
         return
-    mark = kept / _IDENTITY
-    wanted = sha256(f"{identity}\n{_writers()}".encode()).hexdigest()
-    if kept.exists() and not kept.is_dir():
-        raise PublishError(f"--staging {kept}: is a file; give a folder")
-    kept.mkdir(parents=True, exist_ok=True)
-    if not mark.is_file() and any(kept.iterdir()):
-        raise PublishError(f"--staging {kept}: holds files that this command did not put there; give a new folder")
-    files = kept / _FILES
-    if not mark.is_file() or mark.read_text(encoding="ascii", errors="replace").strip() != wanted:
+    mark = chosen / _IDENTITY
+    expected = sha256(f"{identity}\n{_writers()}".encode()).hexdigest()
+    if chosen.exists() and not chosen.is_dir():
+        raise PublishError(f"--staging {chosen}: is a file; give a folder")
+    chosen.mkdir(parents=True, exist_ok=True)
+    if not mark.is_file() and any(chosen.iterdir()):
+        raise PublishError(f"--staging {chosen}: holds files that this command did not put there; give a new folder")
+    files = chosen / _FILES
+    if not mark.is_file() or mark.read_text(encoding="ascii", errors="replace").strip() != expected:
         if files.is_dir():
             shutil.rmtree(files)
-        write_atomically(mark, f"{wanted}\n".encode())
+        write_atomically(mark, f"{expected}\n".encode())
     files.mkdir(exist_ok=True)
     for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
         unfinished.unlink()

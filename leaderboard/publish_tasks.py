@@ -1,10 +1,10 @@
-"""What the Hub's benchmark pages are told: which tasks there are, and a score of which more is better.
+"""The tasks of the Hub's benchmark pages, and a score for which higher is better.
 
 The Hub ranks by the greatest value and knows no unit. So an error becomes a score between 0 and 100,
 
     score = 100 / (1 + object MAE / 10 mm),
 
-which falls strictly with the error (0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1); the millimetres stand in the notes.
+which falls strictly with the error (0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1); the millimetres are in the notes.
 Own definition; 10 mm is the widest tolerance that this benchmark counts pixels within.
 """
 
@@ -28,7 +28,7 @@ _SCORE_DIGITS = 6
 
 @dataclass(frozen=True)
 class Task:
-    """One ranking on the Hub: results of other tracks, or with more frames, stand in another."""
+    """A ranking on the Hub: results of other tracks, or with more frames, have their own."""
 
     id: str
     single_shot: bool
@@ -49,7 +49,7 @@ def score(object_mae_mm: float) -> float:
 
 
 def tasks_of(configs: tuple[str, ...]) -> list[dict[str, str]]:
-    """``tasks`` of ``eval.yaml`` for a dataset that serves ``configs``: the widest of them holds the other frames."""
+    """``tasks`` of ``eval.yaml`` for a dataset that serves ``configs``: the widest of them has the other frames."""
     widest = max(configs, key=CONFIGS.index)
     return [
         {"id": task.id, "config": CONFIGS[0] if task.single_shot else widest, "split": SPLIT}

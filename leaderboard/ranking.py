@@ -1,66 +1,24 @@
-"""Result files into ranked groups. What was not scored on the same data by the same rules is never ranked together."""
+"""Result files into ranked groups. Results on different data or by different rules are never ranked together."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS, SIGNED
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.evaluation.uncertainty import ranks_with_ties
+from fpp_ml_bench.evaluation.uncertainty import Interval, ranks_with_ties
 from fpp_ml_bench.leaderboard import rows
+from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
+from fpp_ml_bench.leaderboard.short_names import short_names
 
 DEFAULT_SORT = "object_mae_mm"
 SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
 
 
-@dataclass(frozen=True, order=True)
-class GroupKey:
-    """What two results must share to be compared. ``fingerprint`` stands for the dataset, not its folder's name."""
-
-    track: str
-    mode: str
-    split: str
-    target: str
-    fingerprint: str
-    size: tuple[int, int]
-    edge_band_px: int
-    protocol_version: str
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """An entry and its rank in its group: 1 and the number of entries that are surely better, so that ties share one.
-
-    Where both have an interval, surely better means that the other's ends before this one's begins; see
-    `fpp_ml_bench.evaluation.uncertainty.ranks_with_ties`.
-    """
-
-    rank: int
-    entry: Entry
-
-
-@dataclass(frozen=True)
-class Group:
-    """Entries that may be compared, best first; ``dataset_name`` is what the folder was called, for people only."""
-
-    key: GroupKey
-    dataset_name: str
-    rows: tuple[Ranked, ...]
-
-    @property
-    def title(self) -> str:
-        height, width = self.key.size
-        key, name = self.key, printable(self.dataset_name)
-        data = f"{key.split} split of {name} ({key.fingerprint[:8]}), {width}x{height} px"
-        mode = "" if key.mode == "standard" else f", mode {key.mode}"
-        return f"{data}, against {key.target}, {key.track} track{mode}"
-
-
 def discover(here: Path) -> list[Path]:
-    """Result files where nobody named any: the rows shipped with the package, then ``result*.json`` and
+    """Result files where none are named: the rows shipped with the package, then ``result*.json`` and
     ``results/*.json`` of the folder ``here``."""
     return [
         *shipped_rows(),
@@ -78,12 +36,12 @@ def expand(paths: Iterable[Path]) -> list[Path]:
     """Files as given, folders as the ``*.json`` in them. SubmissionError for an empty folder or a file given twice."""
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob("*.json")) if path.is_dir() else [path]
-        if not found:
+        named = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        if not named:
             raise SubmissionError(
                 f"{printable(str(path), 500)}: expected result files (*.json) in this folder, found none"
             )
-        files += found
+        files += named
     seen: set[Path] = set()
     for path in files:
         if path.resolve() in seen:
@@ -98,16 +56,40 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in a fixed order (metric track first), each ranked by ``sort``, the best value first, unknown last.
+    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last.
 
-    The order of the files changes nothing. Raises SubmissionError where one group holds one name twice.
+    Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group
+    holds a name twice.
     """
     if sort not in SORT_KEYS:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
         members.setdefault(_key(entry.result), []).append(entry)
-    return [_group(key, members[key], sort) for key in sorted(members)]
+    return [_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)]
+
+
+def rank_ranges(values: Sequence[float | None], intervals: Sequence[Interval | None]) -> list[tuple[int, int]]:
+    """Best and worst rank of each entry that the 95% intervals allow; smaller values are better.
+
+    Best: 1 and the number of entries whose whole interval is better. Worst: the number of all entries without those
+    whose whole interval is worse. An entry without interval counts as its bare value; entries without value (None)
+    share the last ranks.
+
+    >>> rank_ranges([1.0, 1.2, 3.0, None], [(0.8, 1.3), (1.1, 1.4), (2.5, 3.5), None])
+    [(1, 2), (1, 2), (3, 3), (4, 4)]
+    """
+    with_value = sum(value is not None for value in values)
+    best = ranks_with_ties(values, intervals)
+    # Worst ranks are best ranks counted from the other end.
+    from_end = ranks_with_ties(
+        [None if value is None else -value for value in values],
+        [None if interval is None else (-interval[1], -interval[0]) for interval in intervals],
+    )
+    return [
+        (with_value + 1, len(values)) if first is None or last is None else (first, with_value + 1 - last)
+        for first, last in zip(best, from_end, strict=True)
+    ]
 
 
 def _key(result: Result) -> GroupKey:
@@ -134,23 +116,24 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
             )
         named[entry.name] = entry
     ordered = sorted(entries, key=lambda entry: (*_sortable(entry.value(sort), sort), entry.name))
-    places = ranks_with_ties(
+    ranges = rank_ranges(
         [_badness(entry.value(sort), sort) for entry in ordered],
         [None if sort in HIGHER_IS_BETTER or sort in SIGNED else entry.interval(sort) for entry in ordered],
     )
+    names = short_names([entry.result.submission for entry in ordered])
     ranked = tuple(
-        Ranked(len(ordered) if place is None else place, entry) for place, entry in zip(places, ordered, strict=True)
+        Ranked(best, worst, entry, name) for (best, worst), entry, name in zip(ranges, ordered, names, strict=True)
     )
     return Group(key, min(entry.result.dataset.name for entry in entries), ranked)
 
 
 def _badness(value: float | None, sort: str) -> float | None:
-    """``value`` such that smaller is better: a tolerance share turned round, a bias without its sign."""
+    """``value`` such that smaller is better: a tolerance share with its sign turned, a bias without its sign."""
     if value is None:
         return None
     return -value if sort in HIGHER_IS_BETTER else abs(value)
 
 
 def _sortable(value: float | None, sort: str) -> tuple[bool, float]:
-    found = _badness(value, sort)
-    return found is None, 0.0 if found is None else found
+    badness = _badness(value, sort)
+    return badness is None, 0.0 if badness is None else badness

@@ -1,4 +1,4 @@
-"""The ranking in README.md, between two markers: made from the rows, never written by hand."""
+"""The ranking in README.md, between two markers: generated from the rows, not edited by hand."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,41 +6,48 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.columns import NAME_WIDTH, SELF_REPORTED, device, reliance
+from fpp_ml_bench.leaderboard.assumptions import assumption
+from fpp_ml_bench.leaderboard.columns import RANK_NOTE, SELF_REPORTED, device, reliance
 from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, Group, Ranked
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked
+from fpp_ml_bench.leaderboard.paper import paper_tables
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.loaders.manifest import write_atomically
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
-_TITLES = ("Rank", "Method", "Object MAE, mm", "95% interval", "Time, ms", "Frames", "Phase reliance", "Provenance")
-_RIGHT = (True, False, True, True, True, True, True, False)
+_TITLES = (
+    "Rank", "Method", "Object MAE, mm", "95% interval", "Object RMSE", "Overall MAE", "Time, ms", "Frames",
+    "Phase reliance", "Provenance",
+)  # fmt: skip
+_RIGHT = tuple(title not in ("Method", "Provenance") for title in _TITLES)
 _MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in `leaderboard/rows/`."
 _NOTE = (
-    f"{_MADE_BY} Rank: 1 and the number of methods whose whole interval is better (95%, bootstrap over objects). Time: "
-    f"median latency of one image. \\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and "
-    "nothing else, 0 does not follow it (docs/reliance.md)."
+    f"{_MADE_BY} Errors in mm. {RANK_NOTE} Intervals: bootstrap over objects. Time: median latency of one image. "
+    f"\\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 does not "
+    "follow it (docs/reliance.md)."
 )
 SHOWN = 5
 """Rows of a group that README shows; the page shows them all."""
-_NOBODY = f"No row yet. {_MADE_BY}"
+_NO_ROWS = f"No row yet. {_MADE_BY}"
+_PAPER_TABLE = "architecture"
+_PAPER_KEYS = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm")
+_PAPER_TITLES = ("Method", "Object MAE, mm", "Object RMSE", "Overall MAE", "Note")
 
 
 def readme_block(groups: Sequence[Group]) -> str:
-    """What stands between the markers: the best of each group (`SHOWN`); the same rows give the same bytes."""
+    """What is between the markers: the best `SHOWN` rows of each group; the same rows give the same bytes."""
+    if not groups:
+        return f"{_NO_ROWS}\n"
     lines: list[str] = []
     for group in groups:
-        height, width = group.key.size
-        against = "exact depth" if group.key.target == "depth_exact" else "decoded depth"
-        mode = "" if group.key.mode == "standard" else f", mode {group.key.mode}"
-        title = f"{group.key.track} track, {group.key.split} split, {width} x {height} px, against {against}{mode}"
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
-        title = f"{title[0].upper()}{title[1:]} ({group.key.fingerprint[:8]}){timed}"
         rows = [[markdown_text(cell) for cell in _cells(row)] for row in group.rows[:SHOWN]]
-        lines += [f"**{markdown_text(title)}**", "", *markdown_rows(_TITLES, _RIGHT, rows), ""]
+        lines += [f"**{markdown_text(group.key.title + timed)}**", "", *markdown_rows(_TITLES, _RIGHT, rows), ""]
         more = len(group.rows) - SHOWN
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
-    return "\n".join([*lines, _NOTE if groups else _NOBODY]) + "\n"
+    notes = [_NOTE, *_assumptions(groups), *([LEGACY_NOTE] if any(group.key.is_legacy for group in groups) else [])]
+    return "\n".join([*lines, *_paper_lines(), " ".join(notes)]) + "\n"
 
 
 def _cells(row: Ranked) -> list[str]:
@@ -48,10 +55,12 @@ def _cells(row: Ranked) -> list[str]:
     interval = entry.interval(DEFAULT_SORT)
     time = "-" if entry.latency_ms is None else f"{entry.latency_ms:.3g}{'' if entry.time_measured else SELF_REPORTED}"
     return [
-        str(row.rank),
-        printable(entry.name, NAME_WIDTH),
+        row.ranks,
+        printable(row.short_name),
         millimetres(entry.value(DEFAULT_SORT)),
         "-" if interval is None else f"{millimetres(interval[0])} - {millimetres(interval[1])}",
+        millimetres(entry.value("object_rmse_mm")),
+        millimetres(entry.value("overall_mae_mm")),
         time,
         str(entry.frames),
         reliance(entry),
@@ -59,9 +68,29 @@ def _cells(row: Ranked) -> list[str]:
     ]
 
 
+def _assumptions(groups: Sequence[Group]) -> list[str]:
+    """A sentence for each assumption in ``groups``, with the methods that make it."""
+    methods: dict[str, set[str]] = {}
+    for row in (row for group in groups for row in group.rows):
+        if words := assumption(row.entry.result):
+            methods.setdefault(words, set()).add(row.entry.result.submission.method)
+    return [f"{' and '.join(sorted(names))} assume {words}." for words, names in sorted(methods.items())]
+
+
+def _paper_lines() -> list[str]:
+    """The paper's architectures as reported, on other data."""
+    cells = [
+        [row.label, *(f"{row.errors_mm[key]:.2f}" for key in _PAPER_KEYS), f"told {TOLD[row.track]}"]
+        for row in paper_tables()[_PAPER_TABLE].rows
+    ]
+    rows = [[markdown_text(cell) for cell in row] for row in cells]
+    heading = "**Reported by the paper on other data, not measured here and not ranked with the rows above**"
+    return [heading, "", *markdown_rows(_PAPER_TITLES, (False, True, True, True, False), rows), ""]
+
+
 def with_block(text: str, block: str, path: Path) -> str:
-    """``text`` of the file ``path`` with ``block`` between the markers. SubmissionError unless each stands there once,
-    in order."""
+    """``text`` of the file ``path`` with ``block`` between the markers. SubmissionError unless it holds each marker
+    once, in order."""
     begin, end = text.find(BEGIN), text.find(END)
     if text.count(BEGIN) != 1 or text.count(END) != 1 or end < begin:
         raise SubmissionError(
@@ -72,14 +101,14 @@ def with_block(text: str, block: str, path: Path) -> str:
 
 
 def update_readme(path: Path, groups: Sequence[Group], check: bool) -> bool:
-    """Whether ``path`` holds the block of ``groups`` already; if not, write it, unless ``check`` only asks."""
+    """Whether ``path`` holds the block of ``groups`` already; if not, write it, except with ``check``."""
     try:
         text = path.read_bytes().decode("utf-8")
-        wanted = with_block(text, readme_block(groups), path)
-        if wanted == text:
+        updated = with_block(text, readme_block(groups), path)
+        if updated == text:
             return True
         if not check:
-            write_atomically(path, wanted.encode("utf-8"))
+            write_atomically(path, updated.encode("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = "is no UTF-8 text" if isinstance(error, UnicodeDecodeError) else f"failed: {error.strerror}"
         raise SubmissionError(f"{printable(str(path), 500)} {reason}") from None

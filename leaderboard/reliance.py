@@ -1,4 +1,4 @@
-"""Writing a measured phase reliance into a result file or a row, and into no other method's."""
+"""Writing a measured phase reliance into the result file or row of the same method."""
 
 from typing import TYPE_CHECKING
 
@@ -27,16 +27,17 @@ def check_same_method(entry: Entry, method: "Method") -> None:
     for key, value in method.settings.items():
         if key in about.settings and key not in _OF_THE_MACHINE:
             pairs[f"settings.{key}"] = about.settings[key], value
-    for key, (found, asked) in pairs.items():
-        if found != asked:
+    for key, (of_row, of_method) in pairs.items():
+        if of_row != of_method:
             raise SubmissionError(
-                f"{printable(str(entry.path), 500)}: {key} is {printable(str(found))}, but {printable(str(asked))} is "
-                "what would be asked; phase reliance belongs to the very method that was scored: give the same options"
+                f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
+                f"{printable(str(of_method))} for the method to measure; phase reliance belongs to the very "
+                "method that was scored: give the same options"
             )
 
 
 def write_reliance(entry: Entry, reliance: Reliance) -> None:
-    """Put ``reliance`` into the file of ``entry``, in place of an earlier one; row files keep their provenance.
+    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; row files keep their provenance.
 
     Raises SubmissionError for a block that contradicts the result (other weights, other units).
     """

@@ -1,6 +1,6 @@
 """Regenerating the paper's tables: train, predict, time, score, write rows and a Markdown table; skip what is done.
 
-Trainings are never thrown away: a finished one is used, a stopped one taken up, one of another recipe refused.
+No training is ever deleted: a finished training is used, a stopped one continued, one of another recipe refused.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.model import Model, load
 from fpp_ml_bench.baselines.training.engine import TrainingRun, train
 from fpp_ml_bench.baselines.training.validation import SCORING
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
-from fpp_ml_bench.leaderboard.reproduce_data import the_dataset
+from fpp_ml_bench.leaderboard.reproduce_data import open_dataset
 from fpp_ml_bench.leaderboard.reproduce_frames import all_frames_that_hold, score_all_frames, write_all_frames
 from fpp_ml_bench.leaderboard.reproduce_lines import MAIN_KEY, table_lines
 from fpp_ml_bench.leaderboard.reproduce_method import named_method
@@ -32,14 +32,15 @@ from fpp_ml_bench.loaders.folder_lock import exclusive
 from fpp_ml_bench.loaders.manifest import write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
 
-Say = Callable[[str], object]
+Report = Callable[[str], object]
 REASON_LENGTH = 400
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What was asked for. ``minutes`` bounds the whole run; ``command`` is what goes on with it; ``anyway`` trains the
-    paper's preset without a GPU; ``only_missing`` keeps rows that hold; ``show`` is the engine's progress on stderr."""
+class ReproduceSettings:
+    """Settings of a run. ``minutes`` limits the whole run; ``command`` continues it; ``anyway`` trains the paper's
+    preset without a GPU; ``only_missing`` keeps rows that are up to date; ``show``: the engine's progress on stderr;
+    ``report`` takes a line of progress."""
 
     tables: Sequence[str]
     folders: Folders
@@ -49,7 +50,7 @@ class Wish:
     minutes: float | None = None
     anyway: bool = False
     show: bool = True
-    say: Say = print
+    report: Report = print
 
 
 @dataclass
@@ -63,8 +64,8 @@ class Outcome:
     failed: dict[str, str] = field(default_factory=dict)
 
 
-def reproduce(wish: Wish) -> Outcome:
-    """Do what is missing of the tables, and write them. Interrupted at any time, the same call goes on.
+def reproduce(settings: ReproduceSettings) -> Outcome:
+    """Do what the tables lack, and write them. After an interruption the same call continues.
 
     A training that diverges, or whose predictions can't be scored, does not keep the others from running
     (`Outcome.failed`).
@@ -72,80 +73,89 @@ def reproduce(wish: Wish) -> Outcome:
     a dataset of another size or fingerprint; BuildError when another process works in the same folder; and what
     predicting and scoring raise.
     """
-    folders = wish.folders
-    jobs = planned(wish.tables, folders.preset)
+    folders = settings.folders
+    jobs = planned(settings.tables, folders.preset)
     check_run_folders(jobs, folders)
-    check_machine(jobs, folders, wish.anyway, wish.command)
+    check_machine(jobs, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
-        opened = the_dataset(wish.data, jobs, folders, wish.say)
+        opened = open_dataset(settings.data, jobs, folders, settings.report)
         outcome = Outcome(opened, jobs)
         try:
-            _work(wish, outcome)
+            _work(settings, outcome)
         finally:
-            for table in wish.tables:
-                outcome.tables.append(_write_table(table, wish, outcome))
+            for table in settings.tables:
+                outcome.tables.append(_write_table(table, settings, outcome))
     return outcome
 
 
-def _work(wish: Wish, outcome: Outcome) -> None:
+def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
     """Every job in turn, until the minutes run out."""
-    jobs, folders = outcome.jobs, wish.folders
+    jobs, folders = outcome.jobs, settings.folders
     started = perf_counter()
-    taken: list[float] = []
+    training_seconds: list[float] = []
     for number, job in enumerate(jobs, 1):
-        left = None if wish.minutes is None else wish.minutes - (perf_counter() - started) / 60
+        minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
         trained = is_trained(folders.training(job.recipe))
-        if left is not None and left <= 0:
+        if minutes_left is not None and minutes_left <= 0:
             outcome.stopped = job.recipe.name
             return
         rows = ", ".join(place.recipe_name for place in job.places)
-        wish.say(f"[{number}/{len(jobs)}] {job.recipe.name} ({rows}){_time_left(taken, jobs[number - 1 :], folders)}")
+        settings.report(
+            f"[{number}/{len(jobs)}] {job.recipe.name} ({rows})"
+            f"{_time_left(training_seconds, jobs[number - 1 :], folders)}"
+        )
         began = perf_counter()
         try:
-            run = train(job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=left, show=wish.show)
+            run = train(
+                job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=minutes_left, show=settings.show
+            )
             if not run.finished:
                 outcome.stopped = job.recipe.name
                 return
-            _score(job, run, wish, outcome.opened)
+            _score(job, run, settings, outcome.opened)
         except (TrainingError, PredictionError, WeightsError) as error:
-            # What is wrong with one training need not be wrong with the others, and they take hours.
+            # The other trainings, which take hours, may still succeed.
             outcome.failed[job.recipe.name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
-            wish.say(f"  failed, its rows stay as they are: {error}")
+            settings.report(f"  failed, its rows stay as they are: {error}")
         if not trained:
-            taken.append(perf_counter() - began)
+            training_seconds.append(perf_counter() - began)
 
 
-def _time_left(taken: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
-    """From the mean of the trainings done in this call."""
+def _time_left(training_seconds: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
+    """Words on the time that is left, estimated from the mean of the trainings of this call."""
     untrained = sum(not is_trained(folders.training(job.recipe)) for job in jobs)
-    if not taken or not untrained:
+    if not training_seconds or not untrained:
         return ""
-    return f", about {untrained * sum(taken) / len(taken) / 60:.0f} min left for {untrained} trainings"
+    minutes = untrained * sum(training_seconds) / len(training_seconds) / 60
+    return f", about {minutes:.0f} min left for {untrained} trainings"
 
 
-def _score(job: Job, run: TrainingRun, wish: Wish, opened: DatasetFolder) -> None:
-    """Weights with heads, rows and scores on all frames of one training; what holds is kept if so wished."""
-    folders, recipe = wish.folders, job.recipe
-    model = load(finished_weights(job, run, opened, folders, wish.only_missing))
+def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: DatasetFolder) -> None:
+    """Weights with range heads, rows, and scores on all frames of a training; up-to-date rows are kept with
+    ``only_missing``."""
+    folders, recipe = settings.folders, job.recipe
+    model = load(finished_weights(job, run, opened, folders, settings.only_missing))
     if job.all_frames:
-        _score_all_frames(job, model, wish, opened)
+        _score_all_frames(job, model, settings, opened)
     for variant in variants(recipe):
         name = folders.row_name(recipe, variant)
-        if wish.only_missing and row_that_holds(folders.row(recipe, variant), opened, model.sha256) is not None:
-            wish.say(f"  {name}: holds, kept")
+        if settings.only_missing and row_that_holds(folders.row(recipe, variant), opened, model.sha256) is not None:
+            settings.report(f"  {name}: holds, kept")
             continue
-        with _threads_kept():
+        with _restored_threads():
             entry = make_row(opened, named_method(job, variant, model, run), name, folders)
         value = entry.value(MAIN_KEY)
-        wish.say(f"  {name}: object MAE {'-' if value is None else f'{value:.2f} mm'}, {entry.result.track} track")
+        settings.report(
+            f"  {name}: object MAE {'-' if value is None else f'{value:.2f} mm'}, {entry.result.track} track"
+        )
 
 
-def _score_all_frames(job: Job, model: Model, wish: Wish, opened: DatasetFolder) -> None:
+def _score_all_frames(job: Job, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
     """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
-    path = wish.folders.all_frames(job.recipe)
-    if wish.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+    path = settings.folders.all_frames(job.recipe)
+    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    found = score_all_frames(
+    scores = score_all_frames(
         opened,
         lambda frame: model.predict_representation([frame])[0],
         opened.sequence.config(job.recipe.data_config),
@@ -153,27 +163,27 @@ def _score_all_frames(job: Job, model: Model, wish: Wish, opened: DatasetFolder)
         job.recipe.name,
         model.sha256,
     )
-    write_all_frames(found, path)
-    value = found.metrics.object_mae_mm
-    wish.say(f"  {path.stem}: object MAE {'-' if value is None else f'{value:.2f} mm'} on {found.pairs} pairs")
+    write_all_frames(scores, path)
+    value = scores.metrics.object_mae_mm
+    settings.report(f"  {path.stem}: object MAE {'-' if value is None else f'{value:.2f} mm'} on {scores.pairs} pairs")
 
 
 @contextmanager
-def _threads_kept() -> Iterator[None]:
-    """A method of a network sets torch's threads for the whole process; the next training wants them all again."""
+def _restored_threads() -> Iterator[None]:
+    """A network's method sets torch's threads for the whole process; restore them for the next training."""
     import torch
 
-    before = torch.get_num_threads()
+    threads = torch.get_num_threads()
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
 
 
-def _write_table(table: str, wish: Wish, outcome: Outcome) -> Path:
-    path = wish.folders.table(table)
-    lines = table_lines(table, outcome.jobs, wish.folders, outcome.opened)
-    text = table_markdown(table, lines, orderings(lines), wish.folders.preset, wish.command, outcome.failed)
+def _write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
+    path = settings.folders.table(table)
+    lines = table_lines(table, outcome.jobs, settings.folders, outcome.opened)
+    text = table_markdown(table, lines, orderings(lines), settings.folders.preset, settings.command, outcome.failed)
     try:
         write_atomically(path, text.encode("utf-8"))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The dataset that the tables are reproduced on: built where there is none, and the same one for every row of a run."""
+"""The dataset that the tables are reproduced on: built where it is missing, and the same for every row of a run."""
 
 import json
 from collections.abc import Callable
@@ -7,11 +7,11 @@ from pathlib import Path
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.hardware import usable_cores
-from fpp_ml_bench.leaderboard.reproduce_plan import Folders, Job, one_size
+from fpp_ml_bench.leaderboard.reproduce_plan import Folders, Job, common_size
 from fpp_ml_bench.loaders.manifest import MANIFEST, write_atomically
 from fpp_ml_bench.loaders.store import DatasetFolder
 
-Say = Callable[[str], object]
+Report = Callable[[str], object]
 
 
 def default_folder(preset: str, size: int) -> Path:
@@ -19,18 +19,18 @@ def default_folder(preset: str, size: int) -> Path:
     return Path("data") / ("full" if size == FULL_SIZE else f"{preset}{size}")
 
 
-def the_dataset(folder: Path | None, jobs: list[Job], folders: Folders, say: Say) -> DatasetFolder:
+def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
     """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none.
 
-    Every table uses all 50 objects and 52 frames, so that one dataset, and one fingerprint, serves them all.
+    Every table uses all 50 objects and 52 frames, so that all share a dataset and its fingerprint.
 
     Raises DatasetError for a dataset of another image size than the preset's, without a frame that a row needs, or
-    another one than the runs folder holds trainings of; BuildError where it can't be built.
+    another dataset than the trainings in the runs folder; BuildError where it can't be built.
     """
-    size = one_size(jobs)
+    size = common_size(jobs)
     folder = default_folder(folders.preset, size) if folder is None else folder
     if not (folder / MANIFEST).is_file():
-        _build(folder, size, say)
+        _build(folder, size, report)
     opened = DatasetFolder(folder)
     build = f"fpp-bench build DIR --preset full{'' if size == FULL_SIZE else f' --size {size}'}"
     if opened.size != (size, size):
@@ -45,21 +45,21 @@ def the_dataset(folder: Path | None, jobs: list[Job], folders: Folders, say: Say
                 f"{folder}: {job.places[0].recipe_name} needs the frames of {job.recipe.data_config}, stored are "
                 f"those of {', '.join(opened.configs)}; build it with all frames: {build}"
             )
-    _same_as_before(opened, folders)
+    _check_same_dataset(opened, folders)
     return opened
 
 
-def _build(folder: Path, size: int, say: Say) -> None:
+def _build(folder: Path, size: int, report: Report) -> None:
     from fpp_ml_bench.loaders.build import build
     from fpp_ml_bench.loaders.settings import BuildSettings
     from fpp_ml_bench.rig import paper_rig
 
-    say(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
+    report(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
     build(folder, BuildSettings(rig=paper_rig(size), objects=OBJECTS), usable_cores())
 
 
-def _same_as_before(opened: DatasetFolder, folders: Folders) -> None:
-    """Note the dataset in the runs folder, or refuse another one than was noted there."""
+def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
+    """Record the dataset in the runs folder; refuse a dataset other than the recorded one."""
     record = folders.dataset_record
     content = {"fingerprint": opened.fingerprint, "size": list(opened.size), "folder": str(opened.path)}
     try:
@@ -67,14 +67,16 @@ def _same_as_before(opened: DatasetFolder, folders: Folders) -> None:
             folders.runs.mkdir(parents=True, exist_ok=True)
             write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
             return
-        known = json.loads(record.read_text(encoding="utf-8"))
-        before, where = known["fingerprint"], known["folder"]
+        recorded = json.loads(record.read_text(encoding="utf-8"))
+        fingerprint, recorded_folder = recorded["fingerprint"], recorded["folder"]
     except OSError as error:
         raise DatasetError(f"{record}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError):
-        raise DatasetError(f"{record}: damaged; give another --runs, or remove it if --data is what was used") from None
-    if before != opened.fingerprint:
         raise DatasetError(
-            f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but what lies in {folders.runs} was trained on "
-            f"{str(before)[:8]} ({where}); give that one as --data, or another --runs"
+            f"{record}: damaged; give another --runs, or remove it if --data is the dataset that was used"
+        ) from None
+    if fingerprint != opened.fingerprint:
+        raise DatasetError(
+            f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
+            f"{str(fingerprint)[:8]} ({recorded_folder}); give that dataset as --data, or another --runs"
         )

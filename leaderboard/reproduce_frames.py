@@ -1,7 +1,7 @@
 """Scores on every (view, frame) pair of a condition's test set, as in the paper's multi-frame table (Section 5.4).
 
 The paper averages over all pairs. Here each sample's score is the mean over its frames, and the headline the mean over
-samples: the same number, for every sample has the same frames, and the interval can then be taken over objects. The
+samples: the same number, because every sample has the same frames, and the interval can then be taken over objects. The
 rules are the evaluator's own (`scored_pair`, `headline_scores`).
 """
 
@@ -83,16 +83,16 @@ def score_all_frames(
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
             pair = scored_pair(values, target_mm, units, mode, sample)
-            found = headline_scores(*pair)
+            pixel_stats = headline_scores(*pair)
             scores[sample, frame] = {
                 f"{name}_{error}_mm": value
-                for name, stats in zip(PIXEL_SETS, found, strict=True)
+                for name, stats in zip(PIXEL_SETS, pixel_stats, strict=True)
                 for error, value in (("mae", stats.mae_mm), ("rmse", stats.rmse_mm))
             }
     rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends: dict[str, list[float | None]] = {
-        key: [None, None] if e is None else list(e) for key, e in _intervals(rows, objects).items()
+        key: [None, None] if interval is None else list(interval) for key, interval in _intervals(rows, objects).items()
     }
     return AllFrames(
         schema_version="1.0.0",
@@ -116,10 +116,10 @@ def score_all_frames(
     )
 
 
-def write_all_frames(found: AllFrames, path: Path) -> None:
-    """Write as JSON, complete or not at all. SubmissionError where that can't be."""
+def write_all_frames(scores: AllFrames, path: Path) -> None:
+    """Write as JSON, complete or not at all. SubmissionError where the file can't be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(found.model_dump(mode="json"), path)
+    write_json(scores.model_dump(mode="json"), path)
 
 
 def read_all_frames(path: Path) -> AllFrames:
@@ -128,21 +128,21 @@ def read_all_frames(path: Path) -> AllFrames:
 
 
 def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> AllFrames | None:
-    """What ``path`` holds if it is sound and of this dataset, these weights and today's protocol; else None."""
+    """The scores in ``path`` if valid and of this dataset, these weights and the current protocol; else None."""
     if not path.is_file():
         return None
     try:
-        found = read_all_frames(path)
+        scores = read_all_frames(path)
     except SubmissionError:
         return None
     key = (fingerprint, weights_sha256, PROTOCOL_VERSION)
-    return found if (found.fingerprint, found.weights_sha256, found.protocol_version) == key else None
+    return scores if (scores.fingerprint, scores.weights_sha256, scores.protocol_version) == key else None
 
 
 def _mean(rows: Sequence[Scores]) -> Scores:
-    """Plain mean of each headline score over those that have it."""
-    known = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
-    return {key: statistics.fmean(values) if values else None for key, values in known.items()}
+    """Plain mean of each headline score over the rows that have it."""
+    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
+    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
 
 
 def _intervals(rows: Sequence[Scores], objects: Sequence[str]) -> dict[str, tuple[float, float] | None]:

@@ -27,8 +27,8 @@ class Scored:
 
 @dataclass(frozen=True)
 class Line:
-    """One line. ``scored`` and ``entry`` are None where nothing has been measured; ``twins`` maps a twin's suffix to
-    its row. ``paper_mm`` are the paper's errors by the keys of `HEADLINE`, None where it reports none."""
+    """A line of a table. ``scored`` and ``entry`` are None where nothing has been measured; ``twins`` maps a twin's
+    suffix to its row. ``paper_mm`` are the paper's errors by the keys of `HEADLINE`, None where it reports none."""
 
     place: Place
     recipe: Recipe
@@ -40,15 +40,15 @@ class Line:
 
     @property
     def compared(self) -> bool:
-        """Whether it stands beside numbers of the paper."""
+        """Whether the line has both our numbers and the paper's."""
         return self.scored is not None and self.paper_mm is not None
 
 
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order. Rows that don't hold for these weights and this dataset are left empty.
+    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty.
 
-    Where the paper scores every frame (multi-frame), a training's first line does too, and a second one is its row in
-    the leaderboard: the first frame only, beside no number of the paper.
+    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
+    the leaderboard: the first frame only, without a number of the paper.
     """
     owners = {place: job for job in jobs for place in job.places}
     return [line for place in places(table) for line in _lines_of(place, owners[place], folders, opened)]
@@ -59,17 +59,26 @@ def _lines_of(place: Place, job: Job, folders: Folders, opened: DatasetFolder) -
     if weights is None:
         return [Line(place, recipe, place.label, None, None, place.errors_mm)]
     sha256 = file_sha256(weights)
-    main, *others = variants(recipe)
-    found = {variant: row_that_holds(folders.row(recipe, variant), opened, sha256) for variant in (main, *others)}
-    entry = found[main]
-    twins = {twin.suffix: row for twin in (PREDICTED, MEAN) if (row := found.get(twin)) is not None}
+    main, *twin_variants = variants(recipe)
+    entries = {
+        variant: row_that_holds(folders.row(recipe, variant), opened, sha256) for variant in (main, *twin_variants)
+    }
+    entry = entries[main]
+    twins = {twin.suffix: row for twin in (PREDICTED, MEAN) if (row := entries.get(twin)) is not None}
     first = None if entry is None else scored_entry(entry)
     several = len(opened.sequence.config(recipe.data_config)) > 1
     if place.table != "multi_frame" or not several:
         return [Line(place, recipe, place.label, first, entry, place.errors_mm, twins)]
-    every = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+    all_frames = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
     return [
-        Line(place, recipe, place.label, None if every is None else scored_frames(every), entry, place.errors_mm),
+        Line(
+            place,
+            recipe,
+            place.label,
+            None if all_frames is None else scored_frames(all_frames),
+            entry,
+            place.errors_mm,
+        ),
         Line(place, recipe, f"{place.label}, its first frame only", first, entry, None, twins),
     ]
 
@@ -84,10 +93,10 @@ def scored_entry(entry: Entry) -> Scored:
     )
 
 
-def scored_frames(found: AllFrames) -> Scored:
+def scored_frames(all_frames: AllFrames) -> Scored:
     """Scores over all frames."""
     return Scored(
-        {key: getattr(found.metrics, key) for key in HEADLINE},
-        found.intervals.of(MAIN_KEY),
-        {row.sample: (row.object, row.metrics.object_mae_mm) for row in found.per_sample},
+        {key: getattr(all_frames.metrics, key) for key in HEADLINE},
+        all_frames.intervals.of(MAIN_KEY),
+        {row.sample: (row.object, row.metrics.object_mae_mm) for row in all_frames.per_sample},
     )

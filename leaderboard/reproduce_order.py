@@ -1,8 +1,8 @@
 """Which of the paper's orderings hold here: every pair of a table's rows, by object MAE, judged by number.
 
 An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
-where it has the other sign and leaves 0 out, and is *within noise* else. The interval is that of `fpp-eval compare`:
-differences sample by sample, resampled over objects.
+where it has the opposite sign and leaves 0 out, and is *within noise* otherwise. The interval is that of
+`fpp-eval compare`: differences sample by sample, resampled over objects.
 """
 
 import statistics
@@ -22,7 +22,7 @@ class Ordering:
     """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``.
 
     ``gap_mm`` is worse minus better here, the mean over samples, ``interval_mm`` its 95% interval (None with fewer than
-    two objects). ``same_track`` is False where one of the two was given what the other was not.
+    two objects). ``same_track`` is False where the two rows were told different things about the test samples.
     """
 
     better: str
@@ -40,11 +40,10 @@ class Ordering:
 
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
-    """Every pair of lines that both were measured and stand beside different numbers of the paper, the paper's best
-    first."""
-    shown = sorted((line for line in lines if line.compared), key=_reported)
-    found = []
-    for better, worse in combinations(shown, 2):
+    """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
+    compared = sorted((line for line in lines if line.compared), key=_reported)
+    judged = []
+    for better, worse in combinations(compared, 2):
         gap = _reported(worse) - _reported(better)
         if gap == 0 or better.scored is None or worse.scored is None:
             continue
@@ -52,7 +51,7 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
         if not differences:
             continue
         tracks = {line.entry.result.track for line in (better, worse) if line.entry is not None}
-        found.append(
+        judged.append(
             Ordering(
                 better.label,
                 worse.label,
@@ -62,16 +61,16 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
                 len(tracks) == 1,
             )
         )
-    return found
+    return judged
 
 
 def paired(first: Scored, second: Scored) -> tuple[list[float], list[str]]:
     """Second minus first in mm for each sample that both have a score of, and the samples' objects."""
     differences, objects = [], []
-    for sample, (name, one) in first.samples.items():
-        two = second.samples.get(sample, (name, None))[1]
-        if one is not None and two is not None:
-            differences.append(two - one)
+    for sample, (name, first_mm) in first.samples.items():
+        second_mm = second.samples.get(sample, (name, None))[1]
+        if first_mm is not None and second_mm is not None:
+            differences.append(second_mm - first_mm)
             objects.append(name)
     return differences, objects
 

@@ -1,7 +1,7 @@
-"""What there is to do for a table of the paper: which trainings fill which of its rows, and where everything lies.
+"""The work for a table of the paper: which trainings fill which of its rows, and the paths of their files.
 
-Rows that resolve to one recipe (``normalization/individual``, ``loss/rmse`` and ``multi_frame/frame0``) are one
-training and one row of the leaderboard.
+Rows that resolve to one recipe (``normalization/individual``, ``loss/rmse`` and ``multi_frame/frame0``) are a single
+training and a single row of the leaderboard.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,7 @@ _NOT_IN_THE_PAPER = {"hformer": "Hformer"}
 
 @dataclass(frozen=True)
 class Place:
-    """One row of one table; ``errors_mm`` are what the paper reports by the keys of `HEADLINE`, None where nothing."""
+    """A row of a table; ``errors_mm``: the paper's errors by the keys of `HEADLINE`, None where it reports none."""
 
     table: str
     row: str
@@ -34,7 +34,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Job:
-    """One training, and the ``places`` that its scores stand in."""
+    """A training, and the ``places`` in the tables that its scores fill."""
 
     recipe: Recipe
     places: tuple[Place, ...]
@@ -47,7 +47,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to use a trained network: what its row file's name ends in, and the range that makes mm of its output
+    """A way to use a trained network: the end of its row file's name, and the depth range that turns its output into mm
     (see `fpp_ml_bench.baselines.network_method.NetworkMethod`)."""
 
     suffix: str
@@ -68,7 +68,7 @@ def variants(recipe: Recipe) -> tuple[Variant, ...]:
 
 @dataclass(frozen=True)
 class Folders:
-    """Where things lie below ``runs`` (``runs/<preset>``); ``rows`` takes the row files."""
+    """Paths below ``runs`` (``runs/<preset>``); ``rows`` takes the row files."""
 
     preset: str
     runs: Path
@@ -76,7 +76,7 @@ class Folders:
 
     @property
     def dataset_record(self) -> Path:
-        """Which dataset everything here was trained and scored on."""
+        """File that records the dataset of all trainings and scores in this folder."""
         return self.runs / "dataset.json"
 
     def training(self, recipe: Recipe) -> Path:
@@ -109,15 +109,15 @@ class Folders:
 def places(table: str) -> tuple[Place, ...]:
     """Rows of a table in the recipes' order, each with the paper's numbers. RecipeError for an unknown table."""
     reported = {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
-    found = []
+    rows = []
     for name in table_rows(table):
         row = reported.get(name)
-        found.append(
+        rows.append(
             Place(table, name, _NOT_IN_THE_PAPER.get(name, name), None, None)
             if row is None
             else Place(table, name, row.label, row.errors_mm, row.test_samples)
         )
-    return tuple(found)
+    return tuple(rows)
 
 
 def planned(tables: Sequence[str], preset: str) -> list[Job]:
@@ -128,25 +128,25 @@ def planned(tables: Sequence[str], preset: str) -> list[Job]:
     jobs: dict[str, Job] = {}
     for place in (place for table in tables for place in places(table)):
         recipe = load_recipe(place.recipe_name, preset)
-        known = jobs.get(recipe.name)
-        if known is not None and known.recipe.digest != recipe.digest:
+        job = jobs.get(recipe.name)
+        if job is not None and job.recipe.digest != recipe.digest:
             raise RecipeError(
-                f"{known.places[0].recipe_name} and {place.recipe_name} differ in {differing(known.recipe, recipe)}, "
-                f"but both are called {recipe.name}; give one of the recipes what tells them apart"
+                f"{job.places[0].recipe_name} and {place.recipe_name} differ in {differing(job.recipe, recipe)}, "
+                f"but both are called {recipe.name}; give one of them a different name"
             )
-        jobs[recipe.name] = Job(recipe, (*(known.places if known else ()), place))
+        jobs[recipe.name] = Job(recipe, (*(job.places if job else ()), place))
     return list(jobs.values())
 
 
-def differing(one: Recipe, two: Recipe) -> str:
+def differing(first: Recipe, two: Recipe) -> str:
     """The settings in which two recipes differ, with both values."""
-    first, second = one.to_dict(), two.to_dict()
+    first, second = first.to_dict(), two.to_dict()
     keys = [key for key in {**first, **second} if first.get(key) != second.get(key)]
     return ", ".join(f"{key} ({first.get(key)} and {second.get(key)})" for key in keys)
 
 
-def one_size(jobs: Iterable[Job]) -> int:
-    """Image width and height in px that all ``jobs`` train on. RecipeError where they don't agree."""
+def common_size(jobs: Iterable[Job]) -> int:
+    """Image width and height in px that all ``jobs`` train on. RecipeError where they differ."""
     sizes = {job.recipe.size: job.recipe.name for job in jobs}
     if len(sizes) != 1:
         raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")

@@ -1,4 +1,4 @@
-"""One row: predictions, their time, their scores, a row file and its picture; and whether a row still holds."""
+"""Making a row: predictions, their time, their scores, a row file and its picture; and whether a row is up to date."""
 
 import shutil
 from hashlib import sha256
@@ -29,12 +29,12 @@ PROVENANCE = "measured here"
 def make_row(opened: DatasetFolder, method: "NetworkMethod", name: str, folders: Folders) -> Entry:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), write the row.
 
-    Whatever an earlier run left under this name is replaced at the end, not before; an interrupted one leaves nothing
-    that is taken for finished. Raises what predicting, timing and scoring raise, and SubmissionError where the rows
+    Files of an earlier run under this name are replaced at the end; an interrupted run leaves nothing that is taken for
+    finished. Raises what predicting, timing and scoring raise, and SubmissionError where the rows
     folder holds a row of this name on other data.
     """
     path = folders.rows / f"{name}.json"
-    _refuse_other_data(path, opened)
+    _check_row_is_of(path, opened)
     predictions = folders.predictions(name)
     making = predictions.with_name(f"{name}.making")
     shutil.rmtree(making, ignore_errors=True)
@@ -68,17 +68,17 @@ def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> En
     return entry if same else None
 
 
-def _refuse_other_data(path: Path, opened: DatasetFolder) -> None:
+def _check_row_is_of(path: Path, opened: DatasetFolder) -> None:
     if not path.is_file():
         return
     try:
-        before = read_entry(path).result.dataset.fingerprint
+        fingerprint = read_entry(path).result.dataset.fingerprint
     except SubmissionError:
         return  # unreadable: nothing is lost by replacing it
-    if before != opened.fingerprint:
+    if fingerprint != opened.fingerprint:
         raise SubmissionError(
-            f"{path}: is a row on dataset {before[:8]}, and {opened.path} is {opened.fingerprint[:8]}; give another "
-            "--rows, or move the row away if it is out of date"
+            f"{path}: is a row on dataset {fingerprint[:8]}, and {opened.path} is {opened.fingerprint[:8]}; give "
+            "another --rows, or move the row away if it is out of date"
         )
 
 

@@ -1,4 +1,4 @@
-"""The training behind a row: whether it may start here, where it stands, and the weights file that comes out of it."""
+"""The training behind a row: whether it may start on this machine, its state, and the weights file it gives."""
 
 import json
 import shlex
@@ -29,7 +29,7 @@ def state_of(out: Path) -> str:
 
 
 def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
-    """Refuse, before hours of work, a training folder that was made by another recipe. Nothing is ever thrown away.
+    """Refuse, before hours of work, a training folder that was made by another recipe. Nothing is ever deleted.
 
     Raises TrainingError, which names the folder, the settings that differ and the cure.
     """
@@ -38,8 +38,8 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
         if not path.is_file():
             continue
         try:
-            theirs = json.loads(path.read_text(encoding="utf-8"))["recipe"]
-            differs = _differing(job.recipe, theirs)
+            stored = json.loads(path.read_text(encoding="utf-8"))["recipe"]
+            differs = _differing(job.recipe, stored)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
@@ -50,18 +50,18 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
             )
 
 
-def _differing(recipe: Recipe, theirs: dict[str, object]) -> str:
-    ours = recipe.to_dict()
-    keys = [key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)]
-    return ", ".join(f"{key} ({theirs.get(key)} there, {ours.get(key)} in the recipe)" for key in keys)
+def _differing(recipe: Recipe, stored: dict[str, object]) -> str:
+    current = recipe.to_dict()
+    keys = [key for key in {**current, **stored} if current.get(key) != stored.get(key)]
+    return ", ".join(f"{key} ({stored.get(key)} there, {current.get(key)} in the recipe)" for key in keys)
 
 
 def check_machine(jobs: Sequence[Job], folders: Folders, anyway: bool, command: str) -> None:
     """Refuse the paper's preset without a GPU where something is left to train. TrainingError with the command."""
-    left = [job for job in jobs if not is_trained(folders.training(job.recipe))]
-    if folders.preset != PAPER_PRESET or anyway or not left or _gpu():
+    untrained = [job for job in jobs if not is_trained(folders.training(job.recipe))]
+    if folders.preset != PAPER_PRESET or anyway or not untrained or _gpu():
         return
-    size = left[0].recipe.size
+    size = untrained[0].recipe.size
     raise TrainingError(
         f"preset {PAPER_PRESET} trains networks of full width on {size} x {size} px until the rate has reached its "
         f"minimum, and PyTorch sees no CUDA GPU here, where that would take weeks; nothing was started, and no row "
@@ -79,7 +79,7 @@ def _gpu() -> bool:
 def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders: Folders, keep: bool) -> Path:
     """The weights file to score and to ship: the best epoch's, with range heads where a row needs them.
 
-    ``keep``: one that was made from these very weights before is taken as it is.
+    ``keep``: a file that was made from the same weights is used as it is.
     """
     target = folders.weights(job.recipe)
     record = target.with_suffix(".json")
@@ -99,7 +99,7 @@ def finished_weights(job: Job, run: TrainingRun, opened: DatasetFolder, folders:
 
 
 def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
-    """What `finished_weights` made of the training as it is now; None while it is unfinished or not yet taken over."""
+    """The file that `finished_weights` made from the finished training; None while there is none."""
     out, target = folders.training(recipe), folders.weights(recipe)
     if not is_trained(out) or not (out / WEIGHTS).is_file() or not _is_of(recipe, out / RECIPE):
         return None
@@ -115,7 +115,7 @@ def _is_of(recipe: Recipe, record: Path) -> bool:
 
 def _made_from(record: Path, target: Path, source: str) -> bool:
     try:
-        known = json.loads(record.read_text(encoding="utf-8"))
-        return bool(known == {"made_from_sha256": source, "sha256": file_sha256(target)})
+        recorded = json.loads(record.read_text(encoding="utf-8"))
+        return bool(recorded == {"made_from_sha256": source, "sha256": file_sha256(target)})
     except (OSError, ValueError):
         return False

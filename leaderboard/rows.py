@@ -1,8 +1,8 @@
-"""The leaderboard's rows as files: a result of ``fpp-eval``, and who stands for its numbers.
+"""The leaderboard's rows as files: a result of ``fpp-eval``, and who vouches for its numbers.
 
-A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which then counts as
-self-reported, or a row file: that result and a ``provenance``, which the maintainers set when they take it in. A PNG of
-the same name beside it is shown on the submission's page.
+A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which counts as
+self-reported, or a row file: a result and a ``provenance``, which the maintainers set. A PNG of the same name beside it
+is shown on the submission's page.
 """
 
 import json
@@ -24,13 +24,13 @@ ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
 Provenance = Literal["measured here", "verified", "self-reported"]
 PROVENANCES: tuple[str, ...] = get_args(Provenance)
 LOCAL = "local file"
-"""Of a result that lies on this machine and in no leaderboard."""
+"""Of a result on this machine that is in no leaderboard."""
 BY_THE_PAPER = "reported by the paper"
 
 MEANING = {
     "measured here": "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
     "verified": "The author sent the predictions, and fpp-eval verify gave the same scores. Run time is the author's.",
-    "self-reported": "The author ran fpp-eval and sent the result. It agrees with itself; nobody else computed it.",
+    "self-reported": "The author ran fpp-eval and sent the result. Its numbers are consistent; nobody checked them.",
     LOCAL: "A result on this machine that is in no leaderboard.",
     BY_THE_PAPER: "Typed in from the paper's tables, measured by its authors on other data with other code.",
 }
@@ -48,7 +48,7 @@ class _RowFile(StrictModel):
 
 @dataclass(frozen=True)
 class Entry:
-    """One row: a result, and its ``provenance`` (one of `MEANING`)."""
+    """A row: a result, and its ``provenance`` (a key of `MEANING`)."""
 
     path: Path
     result: Result
@@ -60,20 +60,20 @@ class Entry:
 
     @property
     def frames(self) -> int:
-        """Captures that one depth map costs."""
+        """Number of captured frames per depth map."""
         return len(self.result.submission.frames_used)
 
     @property
     def latency_ms(self) -> float | None:
-        """Median time an image in ms; None when unknown."""
+        """Median time per image in ms; None when unknown."""
         if self.result.timing is not None:
             return self.result.timing.latency_median_ms
-        taken = self.result.submission.seconds_per_sample
-        return None if taken is None else 1000 * taken
+        seconds = self.result.submission.seconds_per_sample
+        return None if seconds is None else 1000 * seconds
 
     @property
     def time_measured(self) -> bool:
-        """Whether the time was measured by this package where the row says so: a stranger's word is self-reported."""
+        """Whether this package measured the time and the provenance allows that claim; else it is self-reported."""
         timing, submission = self.result.timing, self.result.submission
         source = timing.provenance if timing is not None else submission.seconds_source
         return source == "measured" and self.provenance in ("measured here", LOCAL)
@@ -84,7 +84,7 @@ class Entry:
         return self.result.reliance
 
     def value(self, key: str) -> float | None:
-        """What ``key`` of the sort keys sorts by; None for an empty pixel set or an unknown time."""
+        """Value of a sort key; None for an empty pixel set or an unknown time."""
         if key == "seconds_per_sample":
             return None if self.latency_ms is None else self.latency_ms / 1000
         if key == "frames_used":
@@ -93,12 +93,12 @@ class Entry:
         return value
 
     def interval(self, key: str) -> tuple[float, float] | None:
-        """The 95% interval of ``key``, None where there is none."""
+        """The 95% interval of ``key``; None where it has none."""
         return self.result.intervals.of(key)
 
 
 def read_entry(path: Path) -> Entry:
-    """A row file or a result file, read strictly. SubmissionError names the file and what is wrong with it."""
+    """Read a row file or a result file strictly. SubmissionError names the file and what is wrong with it."""
     content = read_json(path)
     if isinstance(content, dict) and "row_schema_version" in content:
         if content["row_schema_version"] != ROW_SCHEMA_VERSION:
@@ -114,7 +114,8 @@ def read_entry(path: Path) -> Entry:
 
 
 def write_row(entry: Entry, provenance: str, path: Path) -> None:
-    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or no place."""
+    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or a path
+    that can't be written."""
     if provenance not in PROVENANCES:
         raise SubmissionError(f"expected a provenance out of {', '.join(PROVENANCES)}, got {printable(provenance)!r}")
     content = {
@@ -130,9 +131,9 @@ def write_row(entry: Entry, provenance: str, path: Path) -> None:
 
 
 def picture_of(entry: Entry) -> bytes | None:
-    """The PNG beside a row file, None without one. SubmissionError for what is no PNG of a sensible size.
+    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size.
 
-    Its pixels are never decoded here; a browser shows it as a PNG or not at all.
+    Its pixels are not decoded here; a browser shows it as a PNG or not at all.
     """
     path = entry.path.with_suffix(".png")
     if path.is_symlink() or not path.is_file():

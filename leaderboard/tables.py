@@ -6,9 +6,9 @@ from typing import Literal
 from rich.table import Table
 from rich.text import Text
 
-from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, paper_cells
+from fpp_ml_bench.leaderboard.columns import NOTE, ONLY_IN_FILES, PAPER_TITLES, columns, paper_cells, paper_note
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, Group
 from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperTable
-from fpp_ml_bench.leaderboard.ranking import Group
 
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
@@ -20,27 +20,27 @@ Without arguments, result*.json and results/*.json of the current folder are rea
 
 
 def group_tables(groups: Sequence[Group], sort: str, width: int) -> list[Table | Text]:
-    """One table a group for ``width`` characters, or what to do when there is no group.
+    """A table for each group, for a terminal of ``width`` characters; without groups, how to begin.
 
     Submitted text goes in as `Text`: it is never markup.
     """
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
-    every = columns(sort)
-    shown = [column for column in every if column.from_width <= width]
+    all_columns = columns(sort)
+    shown = [column for column in all_columns if column.from_width <= width]
     for group in groups:
-        table = Table(title=Text(group.title), title_justify="left")
+        table = Table(title=Text(group.key.title), title_justify="left")
         for column in shown:
-            # Titles in two lines leave the width to the names.
+            # Titles in two lines leave more width for the names.
             justify: Literal["right", "left"] = "right" if column.right else "left"
             table.add_column(column.title.replace(" ", "\n", 1), justify=justify, overflow="fold", no_wrap=column.right)
         for row in group.rows:
             table.add_row(*(Text(column.text(row)) for column in shown))
-        parts += [table, Text("")]
-    left_out = [column.title for column in every if column not in shown]
+        parts += [table, Text(f"{LEGACY_NOTE}\n" if group.key.is_legacy else "")]
+    left_out = [column.title for column in all_columns if width < column.from_width < ONLY_IN_FILES]
     hint = f" In a wider terminal, --markdown and --json: {', '.join(left_out)}." if left_out else ""
-    return [*parts[:-1], Text(NOTE + hint + "\n")]
+    return [*parts, Text(NOTE + hint + "\n")]
 
 
 def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
@@ -54,5 +54,5 @@ def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
             table.add_column(title, justify="right" if number > 1 else "left")
         for row in paper.rows:
             table.add_row(*paper_cells(row))
-        parts += [table, Text("")]
-    return parts[:-1]
+        parts += [table, Text(f"{paper_note(paper)}\n")]
+    return parts

@@ -1,8 +1,8 @@
-"""Error against run time and against captures: every setting of every method on one machine, and what each stage costs
-as its input grows.
+"""Error against run time and against captured frames: every setting of every method on one machine, and what each stage
+costs as its input grows.
 
-A setting is measured once and kept; a stopped run goes on. What can't be measured (a frame that is not stored, a
-package that is not installed) says so in its row and keeps nothing else from being measured.
+A setting is measured once and stored; a stopped run continues where it stopped. A setting that can't be measured (a
+frame is not stored, a package is not installed) says why in its row, and the others are measured.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,7 @@ from fpp_ml_bench.evaluation.timing import HardwareInfo
 from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.leaderboard.tradeoff_clock import Clock, Rules
 from fpp_ml_bench.leaderboard.tradeoff_journal import Journal
-from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, climb
+from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, time_ladder
 from fpp_ml_bench.leaderboard.tradeoff_measure import Setting, measured
 from fpp_ml_bench.leaderboard.tradeoff_points import COSTS, GROUPS, Tradeoff
 from fpp_ml_bench.leaderboard.tradeoff_settings import (
@@ -27,7 +27,7 @@ from fpp_ml_bench.leaderboard.tradeoff_settings import (
     precision_settings,
     size_settings,
 )
-from fpp_ml_bench.leaderboard.tradeoff_views import StoredViews, some_views
+from fpp_ml_bench.leaderboard.tradeoff_views import StoredViews, choose_views
 from fpp_ml_bench.loaders.folder_lock import exclusive
 from fpp_ml_bench.loaders.store import DatasetFolder
 
@@ -37,9 +37,9 @@ Progress = Callable[[str], object]
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What was asked for: ``only`` these groups (of `GROUPS` and `COSTS`; empty: all), ``runs`` with more trainings,
-    ``widths`` of untrained UNets (None: the usual), ``views`` of each test object (None: the usual)."""
+class TradeoffSettings:
+    """Settings of a run: ``only`` these groups (of `GROUPS` and `COSTS`; empty: all), ``runs``: a folder with further
+    trainings, ``widths`` of untrained UNets and ``views`` of each test object (None: the defaults)."""
 
     dataset: Path
     out: Path
@@ -53,7 +53,7 @@ class Wish:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups asked for, in their order."""
+        """The groups to measure, in their fixed order."""
         return tuple(group for group in (*GROUPS, COSTS) if not self.only or group in self.only)
 
     @property
@@ -64,7 +64,7 @@ class Wish:
 
 @dataclass(frozen=True)
 class Plan:
-    """What there is to measure."""
+    """The settings and ladders to measure, and the views."""
 
     opened: DatasetFolder
     views: StoredViews
@@ -75,59 +75,59 @@ class Plan:
         return len(self.settings) + len(self.ladders)
 
 
-def planned(wish: Wish) -> Plan:
-    """Everything of ``wish``, nothing measured yet. Raises DatasetError for a folder that is no dataset or has no test
-    split, WeightsError for runs that are none."""
-    opened = DatasetFolder(wish.dataset)
-    views = some_views(opened, wish.views or (QUICK_VIEWS if wish.quick else VIEWS_AN_OBJECT))
-    settings = [setting for group in wish.groups for setting in _settings(group, views, wish)]
-    return Plan(opened, views, settings, list(_ladders(views, wish)))
+def planned(settings: TradeoffSettings) -> Plan:
+    """The plan of a run; nothing is measured yet. Raises DatasetError for a folder that is no dataset or has no test
+    split, WeightsError for a ``runs`` that is no folder."""
+    opened = DatasetFolder(settings.dataset)
+    views = choose_views(opened, settings.views or (QUICK_VIEWS if settings.quick else VIEWS_AN_OBJECT))
+    planned_settings = [setting for group in settings.groups for setting in _settings(group, views, settings)]
+    return Plan(opened, views, planned_settings, list(_ladders(views, settings)))
 
 
-def _settings(group: str, views: StoredViews, wish: Wish) -> Iterator[Setting]:
+def _settings(group: str, views: StoredViews, settings: TradeoffSettings) -> Iterator[Setting]:
     if group == "classical":
-        yield from classical_settings(views, wish.threads, wish.quick)
+        yield from classical_settings(views, settings.threads, settings.quick)
     elif group == "phase":
-        yield from phase_settings(views, wish.quick)
+        yield from phase_settings(views, settings.quick)
     elif group == "precision":
-        yield from precision_settings(views, wish.quick)
+        yield from precision_settings(views, settings.quick)
     elif group == "sizes":
-        yield from size_settings(views.rig, wish.threads, wish.quick)
+        yield from size_settings(views.rig, settings.threads, settings.quick)
     elif group == "networks":
         from fpp_ml_bench.leaderboard.tradeoff_networks import network_settings
 
-        yield from network_settings(views, wish.threads, wish.runs, wish.widths, wish.quick)
+        yield from network_settings(views, settings.threads, settings.runs, settings.widths, settings.quick)
 
 
-def _ladders(views: StoredViews, wish: Wish) -> Iterator[Ladder]:
-    if COSTS in wish.groups:
+def _ladders(views: StoredViews, settings: TradeoffSettings) -> Iterator[Ladder]:
+    if COSTS in settings.groups:
         from fpp_ml_bench.leaderboard.tradeoff_ladders import frame_ladders, pixel_ladders
         from fpp_ml_bench.leaderboard.tradeoff_ladders_rows import row_ladders
 
-        yield from row_ladders(views.rig, wish.quick)
-        yield from frame_ladders(views.rig, wish.quick)
-        yield from pixel_ladders(views.rig, wish.quick)
+        yield from row_ladders(views.rig, settings.quick)
+        yield from frame_ladders(views.rig, settings.quick)
+        yield from pixel_ladders(views.rig, settings.quick)
 
 
-def tradeoff(wish: Wish, plan: Plan, progress: Progress = lambda done: None) -> Tradeoff:
-    """Measure what is missing of ``plan`` into ``wish.out``, calling ``progress`` with the name of each setting and
-    ladder before its turn.
+def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Progress = lambda done: None) -> Tradeoff:
+    """Measure what ``settings.out`` lacks of ``plan``, calling ``progress`` with the key of each setting and ladder
+    before it is measured.
 
     Raises BuildError when another process works in the same folder, SubmissionError for a folder with a run of other
     rules or of another machine.
     """
-    about = _about(wish, plan)
-    _limit_threads(wish.threads)
-    with exclusive(wish.out / ".lock", wish.out, "measuring into this folder"):
-        journal = Journal(wish.out, about)
+    about = _about(settings, plan)
+    _limit_threads(settings.threads)
+    with exclusive(settings.out / ".lock", settings.out, "measuring into this folder"):
+        journal = Journal(settings.out, about)
         for setting in plan.settings:
             progress(setting.key)
             if setting.key not in journal.points:
-                journal.add_point(measured(setting, wish.rules))
+                journal.add_point(measured(setting, settings.rules))
         for ladder in plan.ladders:
             progress(ladder.key)
             if ladder.key not in journal.growth:
-                journal.add_growth(ladder.key, climb(ladder, wish.rules))
+                journal.add_growth(ladder.key, time_ladder(ladder, settings.rules))
     return Tradeoff(
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         dataset=plan.opened.path.resolve().name,
@@ -135,13 +135,13 @@ def tradeoff(wish: Wish, plan: Plan, progress: Progress = lambda done: None) -> 
         image_size=list(plan.opened.size),
         target=plan.views.target,
         views=list(plan.views.names),
-        settings={**asdict(wish.rules), "quick": wish.quick, "views_an_object": _views_an_object(plan)},
+        settings={**asdict(settings.rules), "quick": settings.quick, "views_an_object": _views_an_object(plan)},
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
         software=_software(),
         sittings=journal.sittings,
-        # All that this folder holds, so that a group measured on its own adds to those before.
+        # Everything in this folder, so that a group measured on its own adds to the earlier ones.
         points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
-        growth=[one for found in journal.growth.values() for one in found],
+        growth=[growth for growths in journal.growth.values() for growth in growths],
     )
 
 
@@ -150,32 +150,32 @@ def _views_an_object(plan: Plan) -> int:
     return max(objects.count(name) for name in objects)
 
 
-def _about(wish: Wish, plan: Plan) -> dict[str, Any]:
-    """What two sittings of one run must share. The groups need not be the same: one may be added to another."""
-    machine = describe_hardware()
+def _about(settings: TradeoffSettings, plan: Plan) -> dict[str, Any]:
+    """What two sittings of a run must share. Their groups may differ: a later sitting can add a group."""
+    hardware = describe_hardware()
     return {
         "tradeoff": 1,
         "package": __version__,
         "dataset": plan.opened.fingerprint,
         "views": list(plan.views.names),
-        "rules": asdict(wish.rules),
-        "cpu": machine.cpu,
-        "cores": machine.cores,
+        "rules": asdict(settings.rules),
+        "cpu": hardware.cpu,
+        "cores": hardware.cores,
     }
 
 
 def _limit_threads(threads: int) -> None:
-    """OpenCV's threads, which the phase route's filters would take all of; torch's are set where torch is loaded."""
+    """Limit OpenCV, whose filters in the phase route take all threads by default; torch is limited elsewhere."""
     import cv2
 
     cv2.setNumThreads(threads)
 
 
 def _software() -> dict[str, str]:
-    found = {"fpp_ml_bench": __version__, "python": python_version()}
+    versions = {"fpp_ml_bench": __version__, "python": python_version()}
     for package in ("numpy", "numba", "torch", "onnxruntime"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions

@@ -1,4 +1,4 @@
-"""Timing on a machine that others use too: warm-up, bounded runs, spread, and the machine's own pace beside each."""
+"""Timing on a shared machine: warm-up, bounded runs, spread, and the machine's pace beside each setting."""
 
 import os
 import statistics
@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 PACE_VALUES = 100_000
-"""Numbers that the pace is taken on: about 10 ms of sorting and arctangents, in and out of the cache."""
+"""Numbers that the pace is measured with: about 10 ms of sorting and arctangents, in and out of the cache."""
 PACE_RUNS = 5
 
 Clock = Literal["wall", "processor"]
@@ -19,11 +19,11 @@ CLOCKS: tuple[Clock, ...] = get_args(Clock)
 
 @dataclass(frozen=True)
 class Rules:
-    """``threads`` a method may use; ``runs`` timed ones a setting, fewer (but ``least``) once ``limit_s`` is spent;
-    ``warm_up`` runs before that do not count.
+    """``threads`` that a method may use; timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used
+    up; ``warm_up`` runs, which are not timed, come first.
 
-    ``clock``: the wall's, or the time that processors worked for this process. On one thread that waits for nothing
-    the two are the same on an idle machine, and only the second stays the same on one that others use too.
+    ``clock``: wall-clock time, or the time that processors worked for this process. For a single thread that waits for
+    nothing both agree on an idle machine; on a shared machine only processor time stays the same.
     """
 
     clock: Clock = "wall"
@@ -33,40 +33,40 @@ class Rules:
     limit_s: float = 3.0
     warm_up: int = 2
 
-    def extended(self, taken: list[float], call: Callable[[], object]) -> list[float]:
-        """``taken`` and further runs of ``call``, as many as these rules want; one that takes longer than the limit is
-        not repeated."""
-        taken = list(taken)
-        while len(taken) < self.runs and (len(taken) < self.least or sum(taken) < self.limit_s):
-            if taken and min(taken) > self.limit_s:
+    def extended(self, seconds: list[float], call: Callable[[], object]) -> list[float]:
+        """``seconds`` and those of further runs of ``call``, as many as these rules ask for. A run longer than the
+        limit is not repeated."""
+        seconds = list(seconds)
+        while len(seconds) < self.runs and (len(seconds) < self.least or sum(seconds) < self.limit_s):
+            if seconds and min(seconds) > self.limit_s:
                 break
-            taken.append(self.once(call))
-        return taken
+            seconds.append(self.seconds_of(call))
+        return seconds
 
-    def once(self, call: Callable[[], object]) -> float:
-        """Seconds of one run."""
-        now = perf_counter if self.clock == "wall" else process_time
-        started = now()
+    def seconds_of(self, call: Callable[[], object]) -> float:
+        """Seconds of a single run of ``call``."""
+        clock = perf_counter if self.clock == "wall" else process_time
+        started = clock()
         call()
-        return now() - started
+        return clock() - started
 
 
 def pace_ms(rules: Rules) -> float:
-    """Milliseconds that a fixed piece of work takes right now, the median of a few runs.
+    """Milliseconds that a fixed piece of work takes now, the median of a few runs.
 
-    Two settings are comparable where it is the same beside both: what else the machine does, its clock and its
-    temperature show in it.
+    Times of two settings are comparable where their paces agree: other load, clock frequency and temperature of the
+    machine change the pace.
     """
     values = np.random.Generator(np.random.PCG64(7)).random(PACE_VALUES)
 
     def work() -> None:
         np.arctan2(np.sort(values), values)
 
-    return 1000 * statistics.median(rules.once(work) for _ in range(PACE_RUNS))
+    return 1000 * statistics.median(rules.seconds_of(work) for _ in range(PACE_RUNS))
 
 
 def load() -> float | None:
-    """The system's load average over the last minute; None where it does not tell."""
+    """The system's load average over the last minute; None where the system does not provide it."""
     try:
         return round(os.getloadavg()[0], 2)
     except OSError:

@@ -1,4 +1,4 @@
-"""The pictures of a trade-off: error against seconds and frames, error over image size, seconds over what grows."""
+"""The pictures of a trade-off: error against seconds and frames, error over image size, seconds over growing input."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ERRORS: dict[ErrorKey, str] = {
-    "object_mae_mm": "object MAE (mm); not measured counts whole",
+    "object_mae_mm": "object MAE (mm); a missing pixel costs its whole depth",
     "measured_mae_mm": "MAE over measured object pixels (mm)",
 }
 _FAMILIES = (
@@ -23,43 +23,43 @@ _FAMILIES = (
     ("phase", "phase route, one or few frames", "tab:orange", "s"),
     ("network", "networks", "tab:purple", "^"),
 )
-"""Start of the keys, name, colour and mark of each family; a point belongs to the first that fits."""
+"""Start of the keys, name, colour and mark of each family; a point belongs to the first family that fits."""
 _PLACES = ((5, 4), (5, -9), (-5, 4), (-5, -9), (0, 8), (0, -13), (9, 12), (9, -17), (-9, 12), (-9, -17))
 """Offsets of a label from its mark in points, the best first."""
 
 
-def draw_tradeoff(found: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm") -> bool:
+def draw_tradeoff(tradeoff: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm") -> bool:
     """Two panels on log axes with the front of each; False where no point can be drawn."""
-    points = [point for point in found.points if point.group != "sizes" and point.seconds and getattr(point, error)]
+    points = [point for point in tradeoff.points if point.group != "sizes" and point.seconds and getattr(point, error)]
     if not points:
         return False
     figure = _figure(13, 6.2)
     by_time, by_frames = figure.subplots(1, 2, sharey=True)
     panels: tuple[tuple[Axes, Cost, float], ...] = ((by_time, "seconds", 1000), (by_frames, "frames", 1))
     for axes, cost, scale in panels:
-        front = found.front(cost, error)
+        front = tradeoff.front(cost, error)
         _families(axes, points, cost, error, scale)
         x = [scale * getattr(point, cost) for point in front]
         axes.step(x, [getattr(point, error) for point in front], where="post", color="black", lw=1.2, ls="--", zorder=1)
         _log(axes)
     by_time.set_ylabel(ERRORS[error])
-    by_time.set_xlabel(f"milliseconds a view ({_clock(found)})")
+    by_time.set_xlabel(f"milliseconds per view ({_clock(tradeoff)})")
     by_frames.set_xlabel("frames captured")
-    height, width = found.image_size
-    threads = found.settings.get("threads")
+    height, width = tradeoff.image_size
+    threads = tradeoff.settings.get("threads")
     figure.suptitle(
-        f"{found.dataset}, {width}x{height} px, {len(found.views)} test views, against {found.target}; "
-        f"{threads} thread(s) of {found.hardware.cpu}\n"
+        f"{tradeoff.dataset}, {width}x{height} px, {len(tradeoff.views)} test views, against {tradeoff.target}; "
+        f"{threads} thread(s) of {tradeoff.hardware.cpu}\n"
         "dashed: the front. Hollow: told the view's own depth range or mask, on no front",
         fontsize=9,
     )
     by_time.legend(fontsize=7.5, loc="best", framealpha=0.85)
     for axes, cost, scale in panels:
-        front = found.front(cost, error)
-        others = [point for point in points if point not in front and _worth_a_name(point)]
-        # A network's other precisions differ from its float32 in time: named there, after all others.
-        precisions = [point for point in others if point.group == "networks" and not _is_float32(point)]
-        named = [*front, *(point for point in others if point not in precisions)]
+        front = tradeoff.front(cost, error)
+        off_front = [point for point in points if point not in front and _named_off_front(point)]
+        # A network's other precisions differ from its float32 in time: they are named in that panel, last.
+        precisions = [point for point in off_front if point.group == "networks" and not _is_float32(point)]
+        named = [*front, *(point for point in off_front if point not in precisions)]
         named += precisions if cost == "seconds" else []
         _label(
             axes, [(scale * getattr(p, cost), getattr(p, error), _short(p), p in front) for p in named],
@@ -69,9 +69,9 @@ def draw_tradeoff(found: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm"
     return True
 
 
-def draw_sizes(found: Tradeoff, path: Path) -> bool:
+def draw_sizes(tradeoff: Tradeoff, path: Path) -> bool:
     """Error over image size, and against seconds; False without such points."""
-    points = [point for point in found.points if point.group == "sizes" and point.seconds and point.measured_mae_mm]
+    points = [point for point in tradeoff.points if point.group == "sizes" and point.seconds and point.measured_mae_mm]
     if not points:
         return False
     figure = _figure(11, 4.6)
@@ -91,7 +91,7 @@ def draw_sizes(found: Tradeoff, path: Path) -> bool:
         axes.margins(x=0.08)
         _log(axes)
     by_size.set_xlabel("image width (px)")
-    by_time.set_xlabel(f"milliseconds a view ({_clock(found)}); numbers: image width")
+    by_time.set_xlabel(f"milliseconds per view ({_clock(tradeoff)}); numbers: image width")
     sizes = sorted({point.image_px for point in points})
     by_size.set_xticks(sizes, [str(size) for size in sizes], minor=False)
     by_size.set_xticks([], minor=True)
@@ -101,23 +101,23 @@ def draw_sizes(found: Tradeoff, path: Path) -> bool:
     return True
 
 
-def _clock(found: Tradeoff) -> str:
-    return "processor time" if found.settings.get("clock") == "processor" else "by the wall's clock"
+def _clock(tradeoff: Tradeoff) -> str:
+    return "processor time" if tradeoff.settings.get("clock") == "processor" else "wall-clock time"
 
 
-def draw_growth(growth: Sequence[Growth], path: Path) -> bool:
-    """Seconds against pixels, frames, rows and objects, with the fitted powers; False without any."""
-    if not growth:
+def draw_growth(growths: Sequence[Growth], path: Path) -> bool:
+    """Seconds against pixels, frames, rows and objects, with the fitted powers; False where nothing was timed."""
+    if not growths:
         return False
     panels: list[tuple[str, list[Growth]]] = [
-        ("pixels: stages", [g for g in growth if g.over == "pixels" and ":" not in g.stage]),
-        ("pixels: parts of stages", [g for g in growth if g.over == "pixels" and ":" in g.stage]),
-        ("frames", [g for g in growth if g.over == "frames"]),
-        ("rows or objects", [g for g in growth if g.over in ("rows", "objects")]),
+        ("pixels: stages", [g for g in growths if g.over == "pixels" and ":" not in g.stage]),
+        ("pixels: parts of stages", [g for g in growths if g.over == "pixels" and ":" in g.stage]),
+        ("frames", [g for g in growths if g.over == "frames"]),
+        ("rows or objects", [g for g in growths if g.over in ("rows", "objects")]),
     ]
     figure = _figure(15, 8.5)
     for axes, (title, lines) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        for line in sorted(lines, key=lambda one: -one.seconds[-1]):
+        for line in sorted(lines, key=lambda line: -line.seconds[-1]):
             over = f" over {line.over}" if title.startswith("rows") else ""
             label = f"{line.exponent:.2f}  {line.stage}{over}" + (" (!)" if line.flag else "")
             wide = 2.4 if line.flag else 1.2
@@ -167,8 +167,8 @@ def _families(axes: "Axes", points: Iterable[Point], cost: Cost, error: ErrorKey
                     axes.plot(ends, [up, up], color=colour, lw=0.7, alpha=0.35, zorder=0)
 
 
-def _worth_a_name(point: Point) -> bool:
-    """Beside the front: not the classical steps between the ends."""
+def _named_off_front(point: Point) -> bool:
+    """Whether a point off the front gets a name: of the classical settings, only the first and the last step count."""
     if point.group == "classical":
         return point.title.startswith(("classical N=3,", "classical N=18,"))
     return True
@@ -190,7 +190,7 @@ def _short(point: Point) -> str:
 
 
 def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks: Sequence[tuple[float, float]]) -> None:
-    """A name beside each of ``named`` (x, y, text, on the front) that finds room, the first ones first."""
+    """A name beside each of ``named`` (x, y, text, on the front) that has room, in this order."""
     figure = axes.figure
     figure.canvas.draw()  # constrained layout has then placed the axes
     taken = [_box(float(x), float(y), 3) for x, y in map(axes.transData.transform, marks)]
@@ -207,7 +207,7 @@ def _label(axes: "Axes", named: Sequence[tuple[float, float, str, bool]], marks:
             )  # fmt: skip
             box = label.get_window_extent().extents
             within = box[0] > inside[0] and box[2] < inside[2] and box[1] > inside[1] and box[3] < inside[3]
-            if within and not any(_overlap(box, other) for other in taken):
+            if within and not any(_overlap(box, occupied) for occupied in taken):
                 taken.append(box)
                 break
             label.remove()
@@ -217,8 +217,8 @@ def _box(x: float, y: float, half: float) -> tuple[float, float, float, float]:
     return x - half, y - half, x + half, y + half
 
 
-def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
-    return bool(one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3])
+def _overlap(first: Sequence[float], second: Sequence[float]) -> bool:
+    return bool(first[0] < second[2] and second[0] < first[2] and first[1] < second[3] and second[1] < first[3])
 
 
 def _log(axes: "Axes") -> None:

@@ -1,4 +1,4 @@
-"""How a cost grows: the power of seconds = c amount^p, its interval, and whether it is steeper than it should be."""
+"""How a cost grows: the power p of seconds = c amount^p, its interval, and whether it is steeper than linear."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ import numpy as np
 from fpp_ml_bench.leaderboard.tradeoff_points import Growth
 
 LINEAR_LIMIT = 1.3
-"""Every stage works through its input once, so its power should be 1, less where a fixed cost weighs. Caches that no
-longer hold the input add some tenths; a second loop over the input gives 2."""
+"""Every stage goes through its input once, so its power should be 1, or less with a fixed cost. Input that no longer
+fits the caches adds some tenths; a second loop over the input gives 2."""
 TAIL_POINTS = 3
 CONFIDENCE = 0.95
 
@@ -28,7 +28,7 @@ class Power:
 def fit_power(amounts: Sequence[float], seconds: Sequence[float]) -> Power:
     """Least squares of log seconds on log amount; the interval is Student's t over the residuals.
 
-    Raises ValueError for fewer than three amounts, for some that are not ascending, and for what has no logarithm.
+    Raises ValueError for fewer than three amounts, amounts that do not ascend, and values without a logarithm.
 
     >>> fit_power([1, 2, 4, 8], [3, 12, 48, 192]).exponent
     2.0
@@ -59,16 +59,16 @@ def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[float]) -> Growth:
-    """The growth of ``stage`` over ``over`` with its flag, None where it is as it should be.
+    """The growth of ``stage`` over ``over`` with its flag, None where it is at most linear.
 
-    Flagged is a power above `LINEAR_LIMIT`, of all amounts or of the largest; where the interval reaches down to it,
-    the flag says that the times don't prove it.
+    A power above `LINEAR_LIMIT` is flagged, over all amounts or over the largest. Where the interval includes the
+    limit, the flag says that the times do not prove it.
     """
     power = fit_power(amounts, seconds)
     flag = None
     if power.exponent > LINEAR_LIMIT:
-        sure = power.low > LINEAR_LIMIT
-        flag = "steeper than linear" if sure else "perhaps steeper than linear: times scatter, run it again"
+        above_limit = power.low > LINEAR_LIMIT
+        flag = "steeper than linear" if above_limit else "perhaps steeper than linear: times scatter, run it again"
     elif power.tail > LINEAR_LIMIT:
         flag = "steeper than linear at the largest amounts"
     return Growth(

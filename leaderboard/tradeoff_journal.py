@@ -1,7 +1,7 @@
-"""What a run has measured so far, one JSON line each, so that a stopped run goes on where it was.
+"""What a run has measured so far, a JSON line for each setting, so that a stopped run continues.
 
-The first line says by what rules and on what machine; a file of other rules or another machine is refused, because
-times are only compared within one. A line that a crash cut off is dropped and measured again.
+The first line names rules and machine. A file of other rules or of another machine is refused, because times are only
+compared within a run. An incomplete last line (after a crash) is dropped and measured again.
 """
 
 import json
@@ -41,14 +41,16 @@ class Journal:
             raise SubmissionError(f"{self.path} can't be written: {error.strerror}; give another --out") from None
 
     def add_point(self, point: Point) -> None:
-        """Keep ``point``."""
+        """Store ``point``."""
         self.points[point.key] = point
         self._append({"point": point.model_dump(mode="json", exclude_none=True)})
 
-    def add_growth(self, ladder: str, found: list[Growth]) -> None:
-        """Keep what climbing ``ladder`` gave."""
-        self.growth[ladder] = found
-        self._append({"ladder": ladder, "growth": [one.model_dump(mode="json", exclude_none=True) for one in found]})
+    def add_growth(self, ladder: str, growths: list[Growth]) -> None:
+        """Store the ``growths`` of a ``ladder``."""
+        self.growth[ladder] = growths
+        self._append(
+            {"ladder": ladder, "growth": [growth.model_dump(mode="json", exclude_none=True) for growth in growths]}
+        )
 
     def _append(self, content: dict[str, Any]) -> None:
         with self.path.open("a", encoding="utf-8") as file:
@@ -58,9 +60,9 @@ class Journal:
 
     def _read(self, about: dict[str, Any]) -> None:
         data = self.path.read_bytes()
-        whole = data[: data.rfind(b"\n") + 1]
+        complete = data[: data.rfind(b"\n") + 1]
         try:
-            first, *lines = [json.loads(line) for line in whole.decode("utf-8").splitlines()] or [None]
+            first, *lines = [json.loads(line) for line in complete.decode("utf-8").splitlines()] or [None]
             if not isinstance(first, dict):
                 raise ValueError("its first line is no description of a run")
         except ValueError as error:
@@ -80,12 +82,12 @@ class Journal:
                     point = Point.model_validate(line["point"])
                     self.points[point.key] = point
                 elif "ladder" in line:
-                    self.growth[line["ladder"]] = [Growth.model_validate(one) for one in line["growth"]]
+                    self.growth[line["ladder"]] = [Growth.model_validate(content) for content in line["growth"]]
                 else:
                     self.sittings += 1
         except (ValidationError, KeyError, TypeError) as error:
             raise SubmissionError(f"{self.path}: damaged ({str(error).splitlines()[0]}); give another --out") from None
         self.points = {key: point for key, point in self.points.items() if point.failed is None}
-        if whole != data:
+        if complete != data:
             with self.path.open("r+b") as file:
-                file.truncate(len(whole))
+                file.truncate(len(complete))

@@ -30,7 +30,7 @@ BATCHES = (1, 2, 4, 8)
 
 
 def pixel_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over image pixels, each on one view rendered at each size; networks last, for torch, once there, stays."""
+    """Stages over image pixels, each on a view rendered at each size; networks last, because torch stays loaded."""
     sizes = QUICK_SIZES if quick else SIZES
     yield Ladder("render a view", "pixels", sizes, partial(_render, rig))
     yield Ladder("decode", "pixels", sizes, partial(_decode, rig))
@@ -78,11 +78,11 @@ def _render_frames(rig: Rig, steps: int, folder: Path) -> Rung:
 
 def _photograph(rig: Rig, amount: Callable[[Rig], int]) -> Rung:
     studio, mesh = _studio(rig), solid_mesh(OBJECT)
-    return Rung(amount(rig), lambda: _no_stages(studio.photograph(mesh, VIEW)))
+    return Rung(amount(rig), lambda: _ignore(studio.photograph(mesh, VIEW)))
 
 
-def _no_stages(result: object) -> None:
-    """What was computed is of no interest here."""
+def _ignore(result: object) -> None:
+    """Drop a result: only the time matters."""
 
 
 def _decode(rig: Rig, size: int, folder: Path) -> Rung:
@@ -97,7 +97,7 @@ def _decode_frames(rig: Rig, steps: int, folder: Path) -> Rung:
 
 def _decoding(rig: Rig, amount: int) -> Rung:
     frames, _ = _captured(rig)
-    return Rung(amount, lambda: _no_stages(decode_stack(frames, rig)))
+    return Rung(amount, lambda: _ignore(decode_stack(frames, rig)))
 
 
 def _phase(rig: Rig, size: int, folder: Path) -> Rung:
@@ -106,7 +106,7 @@ def _phase(rig: Rig, size: int, folder: Path) -> Rung:
     frames, _ = _captured(scaled)
     plan = plan_direction(scaled, "vertical", scaled.sequence.steps, Limits())
     grey = np.stack([frames[index].reshape(-1) for index in plan.frames])
-    return Rung(_pixels(scaled), lambda: _no_stages(decode_direction(grey, plan, Limits())))
+    return Rung(_pixels(scaled), lambda: _ignore(decode_direction(grey, plan, Limits())))
 
 
 def _triangulate(rig: Rig, size: int, folder: Path) -> Rung:
@@ -114,7 +114,7 @@ def _triangulate(rig: Rig, size: int, folder: Path) -> Rung:
     rays = scaled.camera.rays()
     depth_m = 1.8 + 0.1 * rays[0]
     u, v = scaled.project(np.stack([rays[0] * depth_m, rays[1] * depth_m, depth_m], axis=-1))
-    return Rung(_pixels(scaled), lambda: _no_stages(depth_from_both(rays, u, v, scaled)))
+    return Rung(_pixels(scaled), lambda: _ignore(depth_from_both(rays, u, v, scaled)))
 
 
 def _phase_route(rig: Rig, size: int, folder: Path) -> Rung:
@@ -130,7 +130,7 @@ def _score(rig: Rig, size: int, folder: Path) -> Rung:
     scaled = rig.scaled(size)
     _, depth_mm = _captured(scaled)
     predicted = depth_mm + np.float32(1.5) * (depth_mm > 0)
-    return Rung(_pixels(scaled), lambda: _no_stages(score_sample(predicted, depth_mm)))
+    return Rung(_pixels(scaled), lambda: _ignore(score_sample(predicted, depth_mm)))
 
 
 def _network(rig: Rig, size: int, folder: Path) -> Rung:

@@ -1,4 +1,4 @@
-"""The ladders over rows and objects, where a loop inside a loop would show: building, reading, scoring, the page."""
+"""The ladders over rows and objects, which would show a nested loop: building, reading, scoring, the page."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -36,7 +36,7 @@ BOARD_ROW = "classical-18-vertical.json"
 
 
 def row_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over objects and rows, and reading over pixels and frames too."""
+    """Stages over objects and rows, and reading also over pixels and frames."""
     yield Ladder("build a dataset", "objects", QUICK_OBJECTS if quick else BUILT_OBJECTS, partial(_build, rig))
     yield Ladder("open and read a frame of each row", "rows", QUICK_ROW_OBJECTS if quick else ROW_OBJECTS, _read_rows)
     yield Ladder("read a row", "frames", READ_FRAMES[:3] if quick else READ_FRAMES, _read_frames)
@@ -47,19 +47,19 @@ def row_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
 
 def _build(rig: Rig, objects: int, folder: Path) -> Rung:
     """The same mesh under many names: only the number of objects grows."""
-    first = folder / "thing_00.ply"
+    first = folder / "object_00.ply"
     write_ply(solid_mesh("cork"), first)
-    one = single_mesh(first)
-    meshes = tuple(replace(one, name=f"thing_{number:02d}") for number in range(objects))
+    mesh_of_all = single_mesh(first)
+    meshes = tuple(replace(mesh_of_all, name=f"object_{number:02d}") for number in range(objects))
     settings = BuildSettings(
         rig.scaled(BUILT_SIZE), tuple(mesh.name for mesh in meshes), stored="single_shot", user_meshes=meshes
     )
     count = iter(range(1_000_000))
-    return Rung(objects, lambda: _none(build(folder / f"dataset-{next(count)}", settings, workers=1)))
+    return Rung(objects, lambda: _ignore(build(folder / f"dataset-{next(count)}", settings, workers=1)))
 
 
-def _none(result: object) -> None:
-    """What was made is of no interest here."""
+def _ignore(result: object) -> None:
+    """Drop a result: only the time matters."""
 
 
 def written_dataset(folder: Path, objects: int, size: int, stored: str = "single_shot", views: int = 6) -> Path:
@@ -71,9 +71,9 @@ def written_dataset(folder: Path, objects: int, size: int, stored: str = "single
     depth_mm = 1800 + rng.random((size, size), np.float32)
     depth_mm[:, : size // 2] = 0
     shards, samples = [], []
-    names = [f"thing_{number:04d}" for number in range(objects)]
-    of = {name: [(sample_name(name, view), name, view) for view in VIEWS[:views]] for name in names}
-    for plan in plan_shards("test", of):
+    names = [f"object_{number:04d}" for number in range(objects)]
+    samples_by_object = {name: [(sample_name(name, view), name, view) for view in VIEWS[:views]] for name in names}
+    for plan in plan_shards("test", samples_by_object):
         writer = ShardWriter(target, scratch, plan, PAPER_SEQUENCE, stored, True, (size, size))
         files, rows = writer.write(Row(*where, frames, depth_mm, depth_mm) for where in plan.samples)
         shards += files
@@ -112,7 +112,7 @@ def _read_pixels(size: int, folder: Path) -> Rung:
 
 
 def _reading(path: Path, frames: int, amount: int) -> Rung:
-    """The first ``frames`` frames of the dataset's one row."""
+    """The first ``frames`` frames of the dataset's only row."""
     opened = DatasetFolder(path)
     (sample,) = opened.samples("test")
 
@@ -134,18 +134,18 @@ def _evaluate(objects: int, folder: Path) -> Rung:
         "seconds_per_sample: null\nseconds_source: self-reported\nhardware: null\nsoftware: {}\nsettings: {}\n",
         encoding="utf-8",
     )
-    return Rung(objects * len(VIEWS), lambda: _none(evaluate(predictions, opened)))
+    return Rung(objects * len(VIEWS), lambda: _ignore(evaluate(predictions, opened)))
 
 
 def _board(rows: int, folder: Path) -> Rung:
     shipped = next(path for path in shipped_rows() if path.name == BOARD_ROW)
     first = read_entry(shipped)
-    entries = [_another(first, number) for number in range(rows)]
-    return Rung(rows, lambda: _none(page_files(rank(entries), [])))
+    entries = [_renamed_entry(first, number) for number in range(rows)]
+    return Rung(rows, lambda: _ignore(page_files(rank(entries), [])))
 
 
-def _another(entry: Entry, number: int) -> Entry:
-    """The row under another name, with an error and a time of its own, so that marks and names do not coincide."""
+def _renamed_entry(entry: Entry, number: int) -> Entry:
+    """The row under another name, with its own error and time, so that marks and names do not coincide."""
     result = entry.result
     about = result.submission.model_copy(update={"name": f"Method {number}"})
     factor = 1.03**number

@@ -27,8 +27,8 @@ from fpp_ml_bench.leaderboard.tradeoff_views import Frames, StoredViews
 
 PRECISIONS = ("fp32", "bf16", "onnx-fp32", "onnx-int8")
 WIDTHS, QUICK_WIDTHS = (4, 8, 16, 32), (4, 8)
-"""Of an untrained UNet; the quick ones for large images too. The paper's 64 is left to --widths: at 960 px it takes a
-minute an image on one thread."""
+"""Of an untrained UNet; the quick widths also for large images. The paper's width 64 only with --widths: at 960 px an
+image takes a minute on one thread."""
 LARGE_PX = 500 * 500
 EMULATED_WIDTH = 8
 """Widest network that is run in bfloat16 on a processor that emulates it, ten times slower than float32."""
@@ -38,7 +38,7 @@ _BF16_FLAGS = ("avx512_bf16", "amx_bf16", "asimdbf16", "bf16")
 
 
 def bf16_note() -> str | None:
-    """What to say of bfloat16 on this processor; None where it has instructions for it (or does not tell)."""
+    """A note about bfloat16 on this processor; None where it has instructions for it or nothing is known."""
     try:
         flags = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").split()
     except OSError:
@@ -47,18 +47,18 @@ def bf16_note() -> str | None:
 
 
 def trained_weights(size: tuple[int, int], runs: Path | None) -> list[WeightsFile]:
-    """Weights for images of ``size`` (H, W): those that ship, and every sound weights file that a training left below
-    ``runs``. The same content twice is one. Raises WeightsError for a ``runs`` that is no folder."""
+    """Weights for images of ``size`` (H, W): those that ship with the package, and every weights file of a training
+    below ``runs``, each content once. Raises WeightsError for a ``runs`` that is no folder."""
     if runs is not None and not runs.is_dir():
         raise WeightsError(f"--runs {runs}: expected a folder of trainings, like the runs/ of fpp-bench reproduce")
     files = sorted(SHIPPED.glob(f"*{SUFFIX}"))
     files += sorted(runs.glob(f"**/weights/*{SUFFIX}")) if runs is not None else []
-    found: dict[str, WeightsFile] = {}
+    by_sha256: dict[str, WeightsFile] = {}
     for path in files:
         weights = open_weights(path)
         if weights.config.image_size == size:
-            found.setdefault(weights.sha256, weights)
-    return list(found.values())
+            by_sha256.setdefault(weights.sha256, weights)
+    return list(by_sha256.values())
 
 
 def network_settings(
@@ -73,32 +73,32 @@ def network_settings(
     for weights in trained_weights((height, width), runs):
         path, config = weights.path, weights.config
         seen[config.name] = seen.get(config.name, 0) + 1
-        again = f" #{seen[config.name]}" if seen[config.name] > 1 else ""
+        repeat = f" #{seen[config.name]}" if seen[config.name] > 1 else ""
         for depth_range in _ranges(config):
             for precision in precisions:
                 if precision.startswith("onnx") and depth_range == "predicted":
-                    continue  # the range heads look into layers that an ONNX file does not show
-                title = f"{config.name}{again}{_told(depth_range)}, {precision}"
+                    continue  # the range heads read layers that an ONNX file does not expose
+                title = f"{config.name}{repeat}{_range_words(depth_range)}, {precision}"
                 make = partial(_trained, path, depth_range, precision, views, threads)
                 key = f"network-{config.name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
                 yield Setting(key, "networks", title, make, views, note=_note(precision))
     if "phase-net" in METHODS:
         yield Setting("phase-net", "networks", "phase-net", partial(method, "phase-net", views.rig), views)
-    for wide in widths if widths is not None else QUICK_WIDTHS if quick or height * width > LARGE_PX else WIDTHS:
+    for unet_width in widths if widths is not None else QUICK_WIDTHS if quick or height * width > LARGE_PX else WIDTHS:
         for precision in precisions:
-            if precision == "bf16" and wide > EMULATED_WIDTH and bf16_note():
+            if precision == "bf16" and unet_width > EMULATED_WIDTH and bf16_note():
                 continue
-            make = partial(_untrained, wide, precision, views, threads)
+            make = partial(_untrained, unet_width, precision, views, threads)
             note = "; ".join(filter(None, (NOT_TRAINED, _note(precision))))
-            title = f"UNet width {wide}, {precision}"
-            yield Setting(f"network-width-{wide:03d}-{precision}", "networks", title, make, views, False, note)
+            title = f"UNet width {unet_width}, {precision}"
+            yield Setting(f"network-width-{unet_width:03d}-{precision}", "networks", title, make, views, False, note)
 
 
 def _ranges(config: ModelConfig) -> tuple[DepthRange | None, ...]:
     return ("predicted", "oracle") if config.normalisation == "individual" else (None,)
 
 
-def _told(depth_range: str | None) -> str:
+def _range_words(depth_range: str | None) -> str:
     return "" if depth_range is None else f" ({depth_range} range)"
 
 
@@ -107,7 +107,7 @@ def _note(precision: str) -> str | None:
 
 
 def in_bfloat16(network: FringeNetwork) -> FringeNetwork:
-    """``network`` with its forward pass under autocast to bfloat16; what is outside of it, heads and mm, is not."""
+    """``network`` with its forward pass under autocast to bfloat16; range heads and conversion to mm stay float32."""
     network.forward = torch.autocast("cpu", dtype=torch.bfloat16)(network.forward)  # type: ignore[method-assign]
     return network
 
@@ -116,27 +116,29 @@ def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: 
     model: Model = load(path, "cpu")
     if depth_range == "predicted" and model.heads is None:
         raise PredictionError(f"{path.name} holds no range heads, so it can't predict a depth range")
-    made = NetworkMethod(model, depth_range, threads=threads, sequence=views.opened.sequence)
+    network_method = NetworkMethod(model, depth_range, threads=threads, sequence=views.opened.sequence)
     if precision == "bf16":
         in_bfloat16(model.network)
     if not precision.startswith("onnx"):
-        return made
-    return OnnxMethod(model.network, made, calibration(views, made), threads, precision == "onnx-int8")
+        return network_method
+    return OnnxMethod(
+        model.network, network_method, calibration(views, network_method), threads, precision == "onnx-int8"
+    )
 
 
-def calibration(views: StoredViews, like: Method, most: int = 8) -> NDArray[np.float32]:
+def calibration(views: StoredViews, like: Method, count: int = 8) -> NDArray[np.float32]:
     """Fringes (n, 1, H, W) in [0, 1] of train samples, spread over the split, as int8 is calibrated on."""
     opened = views.opened
     samples = opened.samples("train") if "train" in opened.splits else []
     if not samples:
         raise PredictionError(f"{opened.path}: int8 is calibrated on train samples, and it has none")
     (frame,) = like.frames_used
-    chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // most)][:most]]
+    chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // count)][:count]]
     return fringe_batch(chosen, opened.size, "the calibration").numpy()
 
 
 class UntrainedMethod:
-    """A network as it is born, for its time: what it puts out means nothing, and is never scored."""
+    """A network with its initial weights, to measure time only: its output is never scored."""
 
     uses_ground_truth_range = False
     units = "normalised"

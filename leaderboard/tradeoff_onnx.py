@@ -1,8 +1,8 @@
 """Networks in onnxruntime: in float32, and in int8 by static quantisation calibrated on train samples.
 
-Quantised are weights (8 bit, one scale a channel) and activations (8 bit, one scale a tensor, from the calibration
-images). The last convolution stays in float32, where mm come out: an 8-bit step of a metre-scale output is 8 mm. On a
-processor without VNNI weights are quantised to 7 bit, because sums of products would overflow 16 bits (the package's
+Weights (8 bit, a scale for each channel) and activations (8 bit, a scale for each tensor, from the calibration images)
+are quantised. The last convolution stays in float32: an 8-bit step of its metre-scale output would be 8 mm. On a
+processor without VNNI weights are quantised to 7 bit, because sums of products would overflow 16 bits (onnxruntime's
 own advice). Needs the optional packages of ``pip install "fpp-ml-bench[onnx]"``.
 """
 
@@ -28,8 +28,8 @@ _VNNI_FLAGS = ("avx512_vnni", "avx_vnni", "asimddp")
 
 
 class OnnxMethod:
-    """``like``'s network in onnxruntime; what it takes and says of itself is ``like``'s. ``quantised``: in int8,
-    calibrated on ``examples`` float32 (n, 1, H, W).
+    """The network of the method ``like`` in onnxruntime, with the input and the description of ``like``. ``quantised``:
+    in int8, calibrated on ``examples`` float32 (n, 1, H, W).
 
     Raises `FppBenchError` where onnx or onnxruntime is not installed.
     """
@@ -86,7 +86,7 @@ def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int
 
 
 def _quantised(path: Path, examples: NDArray[np.float32]) -> Path:
-    """The file quantised, beside the one given."""
+    """A quantised copy beside the file ``path``."""
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
@@ -99,18 +99,18 @@ def _quantised(path: Path, examples: NDArray[np.float32]) -> Path:
             example = next(self._left, None)
             return None if example is None else {name: example[None]}
 
-    prepared, made = path.with_name("prepared.onnx"), path.with_name("int8.onnx")
+    prepared, quantised_path = path.with_name("prepared.onnx"), path.with_name("int8.onnx")
     with _quiet():
         quant_pre_process(str(path), str(prepared))
         graph = onnx.load(str(prepared)).graph
         name = graph.input[0].name
         last = [node.name for node in graph.node if node.op_type == "Conv"][-1:]
         quantize_static(
-            str(prepared), str(made), Examples(), quant_format=QuantFormat.QDQ, per_channel=True,
+            str(prepared), str(quantised_path), Examples(), quant_format=QuantFormat.QDQ, per_channel=True,
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, reduce_range=not _has_vnni(),
             nodes_to_exclude=last,
         )  # fmt: skip
-    return made
+    return quantised_path
 
 
 def _has_vnni() -> bool:
@@ -123,10 +123,10 @@ def _has_vnni() -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the quantiser's advice on the root logger."""
-    before = logging.root.manager.disable
+    """Silence the quantiser's messages on the root logger."""
+    disabled_level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         yield
     finally:
-        logging.disable(before)
+        logging.disable(disabled_level)

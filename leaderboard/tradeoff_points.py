@@ -1,7 +1,7 @@
-"""What `fpp-bench tradeoff` measures, as strict models: one point a setting, one growth a stage, and who is on a front.
+"""What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts.
 
-Two errors stand side by side. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its
-whole depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` says how many did not.
+There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its whole
+depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,12 @@ TRADEOFF_SCHEMA: Literal["1.0.0"] = "1.0.0"
 
 
 class Point(StrictModel):
-    """One setting: ``seconds`` a view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
+    """A setting: ``seconds`` per view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
 
-    ``interval_mm`` is the 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what it was told
-    of the very views that it is scored on. ``note`` says what else to know; ``failed`` why there is no measurement (and
-    then there are no numbers). ``pace_ms``: a fixed piece of work timed beside it, ``load``: the system's one-minute
-    load average then, None where the system does not tell.
+    ``interval_mm`` is the 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method
+    was told about the views that it is scored on. ``note``: further remarks. ``failed``: why there is no measurement;
+    there are no numbers then. ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's
+    one-minute load average at that time, None where the system does not provide it.
     """
 
     key: Text
@@ -75,10 +75,10 @@ class Growth(StrictModel):
 
 
 class Tradeoff(StrictModel):
-    """A whole run: which data, by what rules, on what machine, and all that came out.
+    """A whole run: the data, the rules, the machine, and the results.
 
-    ``sittings``: how often the run was taken up; times of different sittings may differ by more than the machine's pace
-    shows. ``settings``: what was asked for.
+    ``sittings``: how often the run was started or continued; times of different sittings may differ by more than the
+    pace shows. ``settings``: the rules and options of the run.
     """
 
     tradeoff_schema_version: Literal["1.0.0"] = TRADEOFF_SCHEMA
@@ -106,15 +106,16 @@ class Tradeoff(StrictModel):
         return sorted(point.load for point in self.points if point.load is not None)
 
     def slowed(self, point: Point) -> bool:
-        """Whether the machine was clearly busier beside ``point`` than in the run's median."""
+        """Whether the machine was slower beside ``point`` by the factor `SLOWED` than in the run's median."""
         paces = self.pace_ms
         return point.pace_ms is not None and point.pace_ms > SLOWED * paces[len(paces) // 2]
 
     def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
         """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
 
-        Not the precisions: they are the classical method's arithmetic once more, in plain NumPy. Over measured pixels
-        alone, nor who leaves out more than `MOST_LEFT_OUT` of them: leaving the hard ones out is no exactness.
+        The precisions are left out: they repeat the classical method's arithmetic in plain NumPy. For the error over
+        measured pixels, points that leave out more than `MOST_LEFT_OUT` of the object's pixels are left out too:
+        a method must not gain by leaving out difficult pixels.
         """
         points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
         if error == "measured_mae_mm":
@@ -122,11 +123,11 @@ class Tradeoff(StrictModel):
         return [point for point in points if point.seconds and getattr(point, error)]
 
     def front(self, cost: Cost = "seconds", error: ErrorKey = "object_mae_mm") -> list[Point]:
-        """The comparable points that none beats in both, the cheapest first."""
+        """The comparable points that no other beats in both cost and error, the cheapest first."""
         points = self.comparable(error)
         points.sort(key=lambda point: point.key)
-        found = pareto_front([(float(getattr(point, cost)), getattr(point, error)) for point in points])
-        return [points[index] for index in found]
+        indices = pareto_front([(float(getattr(point, cost)), getattr(point, error)) for point in points])
+        return [points[index] for index in indices]
 
 
 def read_tradeoff(path: Path) -> Tradeoff:
@@ -135,11 +136,11 @@ def read_tradeoff(path: Path) -> Tradeoff:
 
 
 def shipped_tradeoff() -> Tradeoff | None:
-    """The one that ships with the package and stands on the leaderboard's page, None without one."""
+    """The trade-off that ships with the package and is shown on the leaderboard's page; None without the file."""
     path = Path(__file__).resolve().parent / TRADEOFF_FILE
     return read_tradeoff(path) if path.is_file() else None
 
 
 def failures(points: Sequence[Point]) -> list[Point]:
-    """Settings that gave no measurement."""
+    """Settings that could not be measured."""
     return [point for point in points if point.failed]

@@ -1,7 +1,7 @@
-"""The classical decoder's formulas in a type of one's choice: what float32 costs in depth, and what it saves in time.
+"""The classical decoder's formulas in float32 or float64: the difference in depth, and in time.
 
 The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from one
-projector coordinate) in plain NumPy, every array in one type, so that two runs differ in nothing but the type.
+projector coordinate) in plain NumPy, with every array of the same type, so that two runs differ only in the type.
 """
 
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ from fpp_ml_bench.rig import Rig
 
 @dataclass(frozen=True)
 class DecodeInType:
-    """One direction's decoding with ``steps`` steps in ``dtype`` (``float32`` or ``float64``). A pixel that is too
-    dark, whose code is ambiguous, or that lies outside the working range gets 0.
+    """Decoding of one direction with ``steps`` steps in ``dtype`` (``float32`` or ``float64``). A pixel that is too
+    dark, has an ambiguous code, or lies outside the working range gets 0.
 
     Raises `DecodeError` for a distorted projector, whose inverse is iterated in float64.
     """
@@ -68,7 +68,7 @@ class DecodeInType:
         return across, forward
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = none."""
+        """Depth float32 (H, W) in mm, 0 = not measured."""
         plan, number = self._plan, np.dtype(self.dtype).type
         grey = [frame for frame in (frames[index] for index in plan.frames) if frame is not None]
         if len(grey) != len(plan.frames):
@@ -87,7 +87,7 @@ class DecodeInType:
         absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
         return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
 
-    def _depth(self, coordinate_px: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         number = np.dtype(self.dtype).type
         axis, device = (0 if self.direction == "vertical" else 1), self.rig.projector
         ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
@@ -96,5 +96,5 @@ class DecodeInType:
             depth = (ideal * number(self.rig.t[2]) - number(self.rig.t[axis])) / (across - ideal * forward)
             depth_mm = depth * number(MM_PER_M)
             near, far = self.rig.working_range_mm
-            kept = kept & (depth_mm >= near) & (depth_mm <= far)
-        return np.where(kept, depth_mm, 0).astype(np.float32)
+            valid = valid & (depth_mm >= near) & (depth_mm <= far)
+        return np.where(valid, depth_mm, 0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A trade-off as files and tables: tradeoff.json, two CSVs, four pictures, and what the terminal shows."""
+"""A trade-off as files and tables: tradeoff.json, two CSVs, four pictures, and the terminal's tables."""
 
 import csv
 import io
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result_io import write_json
 from fpp_ml_bench.leaderboard.tradeoff_figure import draw_growth, draw_sizes, draw_tradeoff
-from fpp_ml_bench.leaderboard.tradeoff_points import TRADEOFF_FILE, Growth, Point, Tradeoff, failures
+from fpp_ml_bench.leaderboard.tradeoff_points import SLOWED, TRADEOFF_FILE, Growth, Point, Tradeoff, failures
 from fpp_ml_bench.loaders.manifest import write_atomically
 
 if TYPE_CHECKING:
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 
 PICTURES: dict[str, Callable[[Tradeoff, Path], bool]] = {
     "tradeoff.png": draw_tradeoff,
-    "tradeoff_measured.png": lambda found, path: draw_tradeoff(found, path, "measured_mae_mm"),
+    "tradeoff_measured.png": lambda tradeoff, path: draw_tradeoff(tradeoff, path, "measured_mae_mm"),
     "sizes.png": draw_sizes,
-    "costs.png": lambda found, path: draw_growth(found.growth, path),
+    "costs.png": lambda tradeoff, path: draw_growth(tradeoff.growth, path),
 }
-"""Name of each picture and what draws it, or says that there is nothing to draw."""
+"""Name of each picture and the function that draws it; the function returns False where there is nothing to draw."""
 _POINT_FIELDS = tuple(name for name in Point.model_fields if name != "interval_mm")
 
 
-def write_report(found: Tradeoff, out: Path) -> list[Path]:
+def write_report(tradeoff: Tradeoff, out: Path) -> list[Path]:
     """Write everything into folder ``out``; returns the files. SubmissionError where one can't be written."""
-    content = found.model_dump(mode="json")
-    content["points"] = [point.model_dump(mode="json", exclude_none=True) for point in found.points]
+    content = tradeoff.model_dump(mode="json")
+    content["points"] = [point.model_dump(mode="json", exclude_none=True) for point in tradeoff.points]
     write_json(content, out / TRADEOFF_FILE)
     written = [out / TRADEOFF_FILE]
-    if found.points:
-        written.append(_write(out / "tradeoff.csv", points_csv(found)))
-    if found.growth:
-        written.append(_write(out / "costs.csv", growth_csv(found.growth)))
-    return written + [out / name for name, draw in PICTURES.items() if draw(found, out / name)]
+    if tradeoff.points:
+        written.append(_write(out / "tradeoff.csv", points_csv(tradeoff)))
+    if tradeoff.growth:
+        written.append(_write(out / "costs.csv", growth_csv(tradeoff.growth)))
+    return written + [out / name for name, draw in PICTURES.items() if draw(tradeoff, out / name)]
 
 
 def _write(path: Path, text: str) -> Path:
@@ -46,28 +46,28 @@ def _write(path: Path, text: str) -> Path:
     return path
 
 
-def points_csv(found: Tradeoff) -> str:
-    """One line a setting; ``front_seconds`` and ``front_frames``: on the front of object MAE; ``slowed``: the machine
-    was busier beside it than in the run's median."""
-    fronts = {cost: {point.key for point in found.front(cost)} for cost in ("seconds", "frames")}  # type: ignore[arg-type]
+def points_csv(tradeoff: Tradeoff) -> str:
+    """A line for each setting; ``front_seconds`` and ``front_frames``: on the front of object MAE; ``slowed``: the
+    machine was busier at that time than in the run's median."""
+    fronts = {cost: {point.key for point in tradeoff.front(cost)} for cost in ("seconds", "frames")}  # type: ignore[arg-type]
     head = [*_POINT_FIELDS, "interval_low_mm", "interval_high_mm", "front_seconds", "front_frames", "slowed"]
     lines = []
-    for point in found.points:
+    for point in tradeoff.points:
         row = [_cell(getattr(point, name)) for name in _POINT_FIELDS]
         row += [_cell(end) for end in point.interval_mm or (None, None)]
         row += [str(point.key in fronts[cost]).lower() for cost in ("seconds", "frames")]
-        lines.append([*row, str(found.slowed(point)).lower()])
+        lines.append([*row, str(tradeoff.slowed(point)).lower()])
     return _csv(head, lines)
 
 
-def growth_csv(growth: Iterable[Growth]) -> str:
-    """One line a stage and amount, with the stage's fitted power."""
+def growth_csv(growths: Iterable[Growth]) -> str:
+    """A line for each stage and amount, with the stage's fitted power."""
     head = ["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"]
     lines = [
-        [one.stage, one.over, _cell(amount), _cell(seconds), *map(_cell, (one.exponent, one.low, one.high, one.tail)),
-         one.flag or ""]
-        for one in growth
-        for amount, seconds in zip(one.amounts, one.seconds, strict=True)
+        [growth.stage, growth.over, _cell(amount), _cell(seconds),
+         *map(_cell, (growth.exponent, growth.low, growth.high, growth.tail)), growth.flag or ""]
+        for growth in growths
+        for amount, seconds in zip(growth.amounts, growth.seconds, strict=True)
     ]  # fmt: skip
     return _csv(head, lines)
 
@@ -86,17 +86,17 @@ def _cell(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def front_table(found: Tradeoff) -> "Table":
+def front_table(tradeoff: Tradeoff) -> "Table":
     """Both fronts of object MAE, the cheapest first."""
     from rich.table import Table
 
-    table = Table(title="Fronts of object MAE: nobody is both cheaper and more exact", title_justify="left")
+    table = Table(title="Fronts of object MAE: no other setting is both cheaper and more exact", title_justify="left")
     table.add_column("Against")
     table.add_column("Setting", overflow="fold")
-    for title in ("ms a view", "5th-95th", "Frames", "Object MAE mm", "Measured MAE mm", "Not measured"):
+    for title in ("ms per view", "5th-95th", "Frames", "Object MAE mm", "Measured MAE mm", "Not measured"):
         table.add_column(title, justify="right")
     for cost in ("seconds", "frames"):
-        for point in found.front(cost):  # type: ignore[arg-type]
+        for point in tradeoff.front(cost):  # type: ignore[arg-type]
             table.add_row(cost, point.title, *_figures(point))
         table.add_section()
     return table
@@ -114,8 +114,8 @@ def _figures(point: Point) -> tuple[str, ...]:
     )
 
 
-def growth_table(growth: Sequence[Growth]) -> "Table":
-    """The fitted powers, flagged ones named as such."""
+def growth_table(growths: Sequence[Growth]) -> "Table":
+    """The fitted powers with their flags."""
     from rich.table import Table
 
     table = Table(title="Costs that grow: seconds = c amount^power", title_justify="left")
@@ -124,30 +124,31 @@ def growth_table(growth: Sequence[Growth]) -> "Table":
     for title in ("From", "To", "ms at most", "Power", "95% interval", "At the end"):
         table.add_column(title, justify="right")
     table.add_column("Flag", overflow="fold")
-    for one in growth:
+    for growth in growths:
         table.add_row(
-            one.stage, one.over, f"{one.amounts[0]:,.0f}", f"{one.amounts[-1]:,.0f}", f"{1000 * one.seconds[-1]:.3g}",
-            f"{one.exponent:.2f}", f"{one.low:.2f} to {one.high:.2f}", f"{one.tail:.2f}", one.flag or "",
+            growth.stage, growth.over, f"{growth.amounts[0]:,.0f}", f"{growth.amounts[-1]:,.0f}",
+            f"{1000 * growth.seconds[-1]:.3g}", f"{growth.exponent:.2f}",
+            f"{growth.low:.2f} to {growth.high:.2f}", f"{growth.tail:.2f}", growth.flag or "",
         )  # fmt: skip
     return table
 
 
-def remarks(found: Tradeoff) -> list[str]:
-    """What to know before the numbers are believed: load, pace, sittings, settings that gave nothing."""
+def remarks(tradeoff: Tradeoff) -> list[str]:
+    """Remarks on how far the numbers can be trusted: load, pace, sittings, settings that could not be measured."""
     lines = []
-    paces, loads = found.pace_ms, found.loads
+    paces, loads = tradeoff.pace_ms, tradeoff.loads
     if loads:
         lines.append(
-            f"Load of the machine: {loads[0]:g} to {loads[-1]:g} on {found.hardware.cores} cores; its pace (a fixed "
+            f"Load of the machine: {loads[0]:g} to {loads[-1]:g} on {tradeoff.hardware.cores} cores; its pace (a fixed "
             f"piece of work): {paces[0]:.3g} to {paces[-1]:.3g} ms, median {paces[len(paces) // 2]:.3g}."
         )
-    slow = sum(map(found.slowed, found.points))
+    slow = sum(map(tradeoff.slowed, tradeoff.points))
     if slow:
         lines.append(
-            f"{slow} of {len(found.points)} settings ran while the machine was clearly busier than in the median "
-            "(column slowed of tradeoff.csv): their times are too long."
+            f"{slow} of {len(tradeoff.points)} settings ran while the machine was over {SLOWED} times slower than in "
+            "the median (column slowed of tradeoff.csv): their times are too long."
         )
-    if found.sittings > 1:
-        lines.append(f"Measured in {found.sittings} sittings: times of different sittings are compared with care.")
-    lines += [f"Not measured: {point.title}: {point.failed}" for point in failures(found.points)]
+    if tradeoff.sittings > 1:
+        lines.append(f"Measured in {tradeoff.sittings} sittings: compare times of different sittings with care.")
+    lines += [f"Not measured: {point.title}: {point.failed}" for point in failures(tradeoff.points)]
     return lines

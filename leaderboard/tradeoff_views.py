@@ -1,4 +1,4 @@
-"""The views that settings are measured on: some of a dataset's test views, or small scenes photographed at a size."""
+"""The views that settings are measured on: some test views of a dataset, or objects rendered at an image size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -59,22 +59,23 @@ class StoredViews:
         return self.opened.target_mm(name, self.target)
 
 
-def some_views(opened: DatasetFolder, an_object: int, split: str = "test") -> StoredViews:
-    """``an_object`` views of each object of ``split``, spread over its views, in row order.
+def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> StoredViews:
+    """``per_object`` views of each object of ``split``, spread over its views, in row order.
 
     Raises `DatasetError` for a split without samples.
     """
-    of: dict[str, list[str]] = {}
+    samples_by_object: dict[str, list[str]] = {}
     for sample in opened.samples(split):
-        of.setdefault(split_sample_name(sample)[0], []).append(sample)
-    if not of:
+        samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
+    if not samples_by_object:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
     chosen: list[str] = []
-    for number, names in enumerate(of.values()):
-        count = min(an_object, len(names))
+    for number, names in enumerate(samples_by_object.values()):
+        count = min(per_object, len(names))
         # Each object begins one view later, so that the views differ between objects.
         chosen += sorted(
-            {names[(number + place * len(names) // count) % len(names)] for place in range(count)}, key=names.index
+            {names[(number + position * len(names) // count) % len(names)] for position in range(count)},
+            key=names.index,
         )
     return StoredViews(opened, chosen)
 
@@ -86,7 +87,7 @@ class PhotographedViews:
     rig: Rig
     objects: list[str]
     view: str = "A60"
-    _taken: dict[str, tuple[list[NDArray[np.uint8]], NDArray[np.float32]]] = field(default_factory=dict)
+    _captures: dict[str, tuple[list[NDArray[np.uint8]], NDArray[np.float32]]] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -100,7 +101,7 @@ class PhotographedViews:
         return self._photograph(name)[1]
 
     def _photograph(self, name: str) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32]]:
-        if name not in self._taken:
+        if name not in self._captures:
             from fpp_ml_bench.loaders.meshes import solid_mesh
             from fpp_ml_bench.loaders.settings import BuildSettings
             from fpp_ml_bench.loaders.view import Studio
@@ -108,8 +109,8 @@ class PhotographedViews:
 
             studio = Studio(BuildSettings(self.rig, tuple(self.objects)))
             row = studio.photograph(solid_mesh(split_sample_name(name)[0]), self.view)
-            # The studio's own memory; it goes with the studio, the next view gets another.
+            # The studio's own memory, which is freed with the studio.
             frames = [row.frames[index] for index in range(len(self.rig.sequence))]
             exact = np.zeros_like(row.depth_mm) if row.depth_exact_mm is None else row.depth_exact_mm
-            self._taken[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
-        return self._taken[name]
+            self._captures[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
+        return self._captures[name]

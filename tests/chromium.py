@@ -24,12 +24,12 @@ SECONDS = 60.0
 
 def chromium() -> str:
     """The browser's path; in CI a missing one is a failure, elsewhere the test is skipped."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
-    if found is None and os.environ.get("CI", "").lower() in ("1", "true"):
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None and os.environ.get("CI", "").lower() in ("1", "true"):
         pytest.fail("CI has no chromium; .ci/run installs it with: apt-get install chromium")
-    if found is None:
+    if path is None:
         pytest.skip("no chromium here; apt-get install chromium")
-    return found
+    return path
 
 
 class Browser:
@@ -38,10 +38,10 @@ class Browser:
     def __init__(self) -> None:
         path = chromium()
         self._home = tempfile.TemporaryDirectory(prefix="fpp-bench-chromium-", ignore_cleanup_errors=True)
-        theirs_in, self._out = os.pipe()
-        self._in, theirs_out = os.pipe()
+        browser_in, self._out = os.pipe()
+        self._in, browser_out = os.pipe()
         # The browser reads commands from 3 and answers on 4; ours are moved out of the way of those numbers first.
-        read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 100) for fd in (theirs_in, theirs_out))
+        read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 100) for fd in (browser_in, browser_out))
 
         def place() -> None:
             os.dup2(read, 3)
@@ -52,7 +52,7 @@ class Browser:
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             preexec_fn=place, pass_fds=(3, 4), start_new_session=True,
         )  # fmt: skip
-        for descriptor in (theirs_in, theirs_out, read, write):
+        for descriptor in (browser_in, browser_out, read, write):
             os.close(descriptor)
         self._pending, self._number = b"", 0
         self._session: str | None = None
@@ -137,14 +137,14 @@ class Browser:
     def complaints(self) -> list[str]:
         """What the console, the page's code or its policy complained about since the page was opened."""
         self.run("1")  # everything before this has come by now
-        found = []
+        complaints = []
         for event in self.events:
             method, params = event.get("method"), event.get("params", {})
             if method in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                found.append(json.dumps(params))
+                complaints.append(json.dumps(params))
             elif method == "Runtime.consoleAPICalled":
-                found.append(json.dumps(params["args"]))
-        return found
+                complaints.append(json.dumps(params["args"]))
+        return complaints
 
     def requests(self) -> list[str]:
         """Addresses that were asked for since the page was opened, data: addresses aside."""

@@ -54,8 +54,8 @@ class HubServer(ThreadingHTTPServer):
 
     def writes(self) -> list[tuple[str, str]]:
         """Requests that change something, and forget them all."""
-        asked, self.requests = self.requests, []
-        return [(m, p) for m, p in asked if m == "PUT" or p.endswith("/repos/create") or "/commit/" in p]
+        requests, self.requests = self.requests, []
+        return [(m, p) for m, p in requests if m == "PUT" or p.endswith("/repos/create") or "/commit/" in p]
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -101,14 +101,14 @@ class _Handler(BaseHTTPRequestHandler):
             return self._answer(200, {"warnings": [], "errors": []})
         if path == "/api/repos/create":
             return self._create(json.loads(body), token)
-        if found := _LFS.fullmatch(path):
+        if match := _LFS.fullmatch(path):
             return self._batch(json.loads(body))
-        if found := _API.fullmatch(path):
-            repo = self._repo(found[1], found[2], token)
-            return self._api(repo, found, body) if repo else None
-        if found := _RESOLVE.fullmatch(path):
-            repo = self._repo(found[1] or "models", found[2], token)
-            return self._resolve(repo, found[4]) if repo else None
+        if match := _API.fullmatch(path):
+            repo = self._repo(match[1], match[2], token)
+            return self._api(repo, match, body) if repo else None
+        if match := _RESOLVE.fullmatch(path):
+            repo = self._repo(match[1] or "models", match[2], token)
+            return self._resolve(repo, match[4]) if repo else None
         return self._refuse(404, f"no such address: {path}")
 
     do_GET = do_HEAD = do_POST = do_PUT = _handle
@@ -123,27 +123,27 @@ class _Handler(BaseHTTPRequestHandler):
             return repo
         return None
 
-    def _create(self, asked: dict[str, Any], token: str) -> None:
-        name = f"{asked.get('organization') or TOKENS[token]}/{asked['name']}"
-        key = f"{asked.get('type', 'model')}s", name
+    def _create(self, request: dict[str, Any], token: str) -> None:
+        name = f"{request.get('organization') or TOKENS[token]}/{request['name']}"
+        key = f"{request.get('type', 'model')}s", name
         if name.startswith("forbidden/"):
             return self._refuse(403, "You don't have the rights to create a repository here")
         if key in self.server.repos:
             return self._refuse(409, "You already created this repository")
-        private = asked.get("visibility") == "private" or bool(asked.get("private"))
-        self.server.repos[key] = Repo(private, asked.get("sdk"))
+        private = request.get("visibility") == "private" or bool(request.get("private"))
+        self.server.repos[key] = Repo(private, request.get("sdk"))
         return self._answer(200, {"url": f"{self.server.endpoint}/{key[0]}/{name}"})
 
-    def _batch(self, asked: dict[str, Any]) -> None:
+    def _batch(self, request: dict[str, Any]) -> None:
         objects = []
-        for one in asked["objects"]:
-            upload = {"upload": {"href": f"{self.server.endpoint}/large/{one['oid']}"}}
-            there = one["oid"] in self.server.large
-            objects.append({**one, **({} if there else {"actions": upload})})
+        for large_file in request["objects"]:
+            upload = {"upload": {"href": f"{self.server.endpoint}/large/{large_file['oid']}"}}
+            stored = large_file["oid"] in self.server.large
+            objects.append({**large_file, **({} if stored else {"actions": upload})})
         self._answer(200, {"transfer": "basic", "objects": objects})
 
-    def _api(self, repo: Repo, found: re.Match[str], body: bytes) -> None:
-        kind, name, action, _, _ = found.groups()
+    def _api(self, repo: Repo, match: re.Match[str], body: bytes) -> None:
+        kind, name, action, _, _ = match.groups()
         if action == "preupload":
             if name.startswith("raced/"):
                 repo.commits.append(hashlib.sha1(b"somebody else").hexdigest())
@@ -195,8 +195,8 @@ class _Handler(BaseHTTPRequestHandler):
         content = repo.files[path]
         etag = self._entry(path, content).get("lfs", {}).get("oid") or git_sha1(content)
         about = {"ETag": f'"{etag}"', "X_Repo_Commit": repo.commits[-1], "Accept_Ranges": "bytes"}
-        if asked := re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or ""):
-            first, last = int(asked[1]), min(int(asked[2] or len(content)), len(content) - 1)
+        if byte_range := re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or ""):
+            first, last = int(byte_range[1]), min(int(byte_range[2] or len(content)), len(content) - 1)
             about["Content_Range"] = f"bytes {first}-{last}/{len(content)}"
             return self._answer(206, content[first : last + 1], **about)
         return self._answer(200, content, **about)

@@ -81,11 +81,11 @@ class Client:
 
     def environment(self, **changes: str | None) -> dict[str, str]:
         plain = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
-        ours = {
+        own = {
             "HF_ENDPOINT": self.server.endpoint, "HF_HUB_DISABLE_XET": "1", "HF_TOKEN": "hf_good",
             "HF_HOME": str(self.home), "HF_HUB_DISABLE_TELEMETRY": "1", "PYTHONPATH": str(ROOT), **changes,
         }  # fmt: skip
-        return {**plain, **{name: value for name, value in ours.items() if value is not None}}
+        return {**plain, **{name: value for name, value in own.items() if value is not None}}
 
     def _start(self, **environment: str | None) -> "subprocess.Popen[str]":
         return subprocess.Popen(
@@ -96,10 +96,10 @@ class Client:
     def run(self, *calls: list[str], **environment: str | None) -> list[tuple[int, str, str]]:
         """Exit status, standard output and standard error of each call."""
         process = self._start(**environment) if environment else self._process
-        said = [self._answer(process, call) for call in calls]
+        answers = [self._answer(process, call) for call in calls]
         if environment:
             stop(process)
-        return said
+        return answers
 
     def _answer(self, process: "subprocess.Popen[str]", call: list[str]) -> tuple[int, str, str]:
         assert process.stdin is not None and process.stdout is not None
@@ -134,6 +134,6 @@ def running_hub(home: Path) -> Iterator[Client]:
         client.close()
 
 
-def listed(said: str) -> dict[str, str]:
+def listed(output: str) -> dict[str, str]:
     """Status by path, as printed."""
-    return {path: status for status, path in re.findall(r"(?m)^  . (\w+) +[\d.]+ \w+  (.+)$", said)}
+    return {path: status for status, path in re.findall(r"(?m)^  . (\w+) +[\d.]+ \w+  (.+)$", output)}

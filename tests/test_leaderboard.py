@@ -11,9 +11,9 @@ from fpp_ml_bench.commands import main
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.evaluation.result_io import write_result
 from fpp_ml_bench.leaderboard import ranking, rows
-from fpp_ml_bench.leaderboard.columns import NAME_WIDTH
 from fpp_ml_bench.leaderboard.export import markdown_text
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, SHOWN_BY_DEFAULT, paper_tables
+from fpp_ml_bench.leaderboard.short_names import cut_at_word
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """Run where no result lies about, and with no shipped rows."""
+    """Run in an empty folder, with no shipped rows."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
@@ -68,11 +68,12 @@ def test_ranks_by_object_error_with_time_beside_it(make, capsys, tmp_path):
     assert [row["name"] for row in by_frames] == ["Worse", "Better"]
 
 
-def test_order_of_files_changes_nothing_and_ties_share_a_rank(make, tmp_path):
+def test_order_of_files_changes_nothing_and_ties_share_ranks(make, tmp_path):
     files = [make(f"{n}.json", offset, name=n) for n, offset in (("d", 2.0), ("a", 2.0), ("c", 1.0), ("b", 3.0))]
     first, second = ranked(tmp_path, *files), ranked(tmp_path, *reversed(files))
     assert first == second
-    assert [(row["rank"], row["name"]) for row in first[0]["rows"]] == [(1, "c"), (2, "a"), (2, "d"), (4, "b")]
+    ranks = [(row["best_rank"], row["worst_rank"], row["name"]) for row in first[0]["rows"]]
+    assert ranks == [(1, 1, "c"), (2, 3, "a"), (2, 3, "d"), (4, 4, "b")]
 
 
 def test_unknown_time_comes_last(make, tmp_path):
@@ -82,27 +83,31 @@ def test_unknown_time_comes_last(make, tmp_path):
 
 
 def test_what_differs_in_data_or_rules_is_never_ranked_together(make, capsys, tmp_path):
-    other = make_dataset(tmp_path / "other", size=(40, 40))
-    folder = write_predictions(tmp_path / "p", other)
-    write_result(evaluate(folder, other), tmp_path / "other.json")
+    larger = make_dataset(tmp_path / "larger", size=(40, 40))
+    folder = write_predictions(tmp_path / "p", larger)
+    write_result(evaluate(folder, larger), tmp_path / "larger.json")
     files = [
         make("metric.json", 1.0),
         make("oracle.json", 1.0, uses_ground_truth_range=True),
         make("exact.json", 1.0, target="depth_exact"),
         make("train.json", 1.0, split="train"),
-        tmp_path / "other.json",
+        tmp_path / "larger.json",
     ]
     groups = ranked(tmp_path, *files)
     assert [len(group["rows"]) for group in groups] == [1] * 5
     assert [group["track"] for group in groups] == ["metric"] * 4 + ["oracle range"]
     out = board(capsys, *files)
-    for words in ("against depth_exact, metric track", "against depth, oracle range track", "train split", "40x40 px"):
+    out = " ".join(out.split())
+    for words in (
+        "metric track, test split, against exact depth", "oracle range track, test split, against decoded depth",
+        "metric track, train split", "40 x 40 px, data",
+    ):  # fmt: skip
         assert words in out
 
 
-def test_results_lying_about_are_found(make, capsys):
+def test_results_of_the_current_folder_are_read(make, capsys):
     make("result.json", 1.0, name="In the folder")
-    make("results/one.json", 2.0, name="In results")
+    make("results/first.json", 2.0, name="In results")
     out = board(capsys)
     assert out.index("In the folder") < out.index("In results")
 
@@ -110,7 +115,8 @@ def test_results_lying_about_are_found(make, capsys):
 def test_new_user_is_told_what_to_do(capsys):
     out = board(capsys)
     assert "No results here yet" in out and "fpp-eval predictions --dataset" in out
-    assert "Reported by the paper (not measured here)" in out and "TransUNet" in out
+    assert "Reported by the paper on other data (not measured here)" in out and "TransUNet" in out
+    assert "oracle range: told the test sample's depth range." in out
 
 
 PAPER = {
@@ -131,11 +137,11 @@ def test_paper_rows_are_the_papers():
         "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 4,
     }  # fmt: skip
     rows = {(table.name, row.row): row for table in tables.values() for row in table.rows}
-    for place, errors in PAPER.items():
-        assert tuple(rows[place].errors_mm.values()) == errors
+    for table_and_row, errors in PAPER.items():
+        assert tuple(rows[table_and_row].errors_mm.values()) == errors
     mae = {row.row: row.errors_mm["object_mae_mm"] for row in tables["architecture"].rows}
     # "UNet ... outperforming TransUNet by 29%, ResUNet by 60%"
-    assert [round(100 * (mae[other] / mae["unet"] - 1)) for other in ("transunet", "resunet")] == [29, 60]
+    assert [round(100 * (mae[network] / mae["unet"] - 1)) for network in ("transunet", "resunet")] == [29, 60]
     for (table, name), row in rows.items():
         ranged, masked = name not in ("raw", "global"), table == "background_removed"
         assert row.track == (
@@ -172,16 +178,23 @@ HOSTILE = "| a `b` <script>alert(1)</script> [x](http://e) ![i](y) **z** @me www
 
 def test_submitted_text_is_only_text(make, capsys, tmp_path):
     path = make("a.json", 1.0, name=HOSTILE)
-    out = board(capsys, path, "--markdown", tmp_path / "t.md")
-    assert "<script>" in out and "![i](y)" in out  # shown, in a cell that may wrap
+    board(capsys, path, "--markdown", tmp_path / "t.md")
     line = next(line for line in (tmp_path / "t.md").read_text().splitlines() if "script" in line)
     head = (tmp_path / "t.md").read_text().splitlines()[2]
     assert line.count("|") == head.count("|")
-    cell = line.split("|")[2].strip()
-    assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
+    short, *_, full = (cell.strip() for cell in line.split("|")[2:-1])
+    for cell in (short, full):
+        assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
     import html
 
-    assert html.unescape(cell) == HOSTILE.strip()[:NAME_WIDTH] + ("..." if len(HOSTILE) > NAME_WIDTH else "")
+    assert html.unescape(full) == HOSTILE[:90] + ("..." if len(HOSTILE) > 90 else "")
+    assert html.unescape(short) == cut_at_word(HOSTILE)
+
+
+@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "![i](y) **z** @me", "[red]x[/red]", "[link=http://e]"])
+def test_terminals_show_names_as_they_are(name, make, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert name in board(capsys, make("a.json", 1.0, name=name))
 
 
 @pytest.mark.parametrize("text", ["plain", "a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
@@ -222,11 +235,11 @@ def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
 
 
 def test_repetition_is_refused(make, capsys, tmp_path):
-    one, two = make("one.json", 1.0), make("two.json", 2.0)
-    assert main(["leaderboard", str(one), str(two)]) == 2
+    first, second = make("first.json", 1.0), make("second.json", 2.0)
+    assert main(["leaderboard", str(first), str(second)]) == 2
     message = capsys.readouterr().err
-    assert "one.json" in message and "two.json" in message and "another name" in message
-    assert main(["leaderboard", str(one), str(one.parent / ".." / "here" / "one.json")]) == 2
+    assert "first.json" in message and "second.json" in message and "another name" in message
+    assert main(["leaderboard", str(first), str(first.parent / ".." / "here" / "first.json")]) == 2
     assert "given twice" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert main(["leaderboard", str(tmp_path / "empty")]) == 2

@@ -1,4 +1,4 @@
-"""The page in headless Chromium: sorting, filters, keys, both colour schemes, a phone, and hostile rows."""
+"""The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and hostile rows."""
 
 import pytest
 from board_rows import some_rows, timing, write_result_file
@@ -71,8 +71,9 @@ def test_a_click_sorts_and_another_turns_it_round(opened):
     assert "t0=ms.descending" in opened.run("location.hash")
     opened.click("#t0 button[data-key=name]")
     assert opened.run(NAMES) == [HOSTILE[:14], "Beaten", "Fast and rough", "Slow and fine"]
-    opened.click("#t0 button[data-key=rank]")
-    assert opened.run(NAMES) == RANKED
+    for key in ("rank", "object_mae_mm"):
+        opened.click(f"#t0 button[data-key={key}]")
+        assert opened.run(NAMES) == RANKED
 
 
 def test_keys_alone_reach_everything(opened):
@@ -122,21 +123,23 @@ def test_a_view_can_be_linked_to(browser, page):
 def test_a_screen_reader_finds_a_table_with_headers(opened):
     opened.call("Accessibility.enable")
     nodes = opened.call("Accessibility.getFullAXTree")["nodes"]
-    found = [
+    elements = [
         (n.get("role", {}).get("value"), n.get("name", {}).get("value", "")) for n in nodes if not n.get("ignored")
     ]
-    roles = [role for role, _ in found]
+    roles = [role for role, _ in elements]
     assert roles.count("table") >= 2 and roles.count("row") >= 5 and "main" in roles and "navigation" in roles
-    heads = [name for role, name in found if role == "columnheader"]
+    heads = [name for role, name in elements if role == "columnheader"]
     assert "Object MAE, mm" in heads and "Frames" in heads
     assert ("rowheader") in roles
     unnamed = {"button", "link", "textbox", "searchbox", "checkbox", "combobox", "image", "region", "group"}
-    assert [role for role, name in found if role in unnamed - {"group"} and not name] == []
+    assert [role for role, name in elements if role in unnamed - {"group"} and not name] == []
 
 
 def test_hostile_text_is_shown_and_does_nothing(opened, page):
-    assert HOSTILE in opened.run("document.body.innerText")
+    assert HOSTILE[:28] in opened.run("document.body.innerText")
     assert opened.run("typeof window.hacked") == "undefined"
+    links = "[...document.querySelectorAll('#t0 tbody a')].map(a => a.title)"
+    assert HOSTILE in opened.run(links)
     for sub in sorted((page.parent / "submissions").glob("*.html")):
         opened.open(sub)
         assert opened.run("typeof window.hacked") == "undefined"
@@ -157,6 +160,48 @@ def test_every_width_in_both_schemes(browser, page, width, dark):
     assert browser.run(shown) == 1
 
 
+@pytest.fixture(scope="module")
+def shipped_page(tmp_path_factory):
+    """The page of the rows that ship with the package."""
+    out = tmp_path_factory.mktemp("shipped") / "page"
+    assert main(["leaderboard", "--page", str(out)]) == 0
+    return out / "index.html"
+
+
+@pytest.mark.parametrize("width", [390, 1240])
+def test_the_shipped_page_fits(browser, shipped_page, width):
+    browser.open(shipped_page, width)
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    lines = "e => e.getBoundingClientRect().height / parseFloat(getComputedStyle(e).lineHeight)"
+    assert browser.run(f"Math.max(...[...document.querySelectorAll('.ranking tbody a')].map({lines}))") < 1.5
+    assert browser.run("document.querySelector('.links').getBoundingClientRect().height") < 220
+
+
+@pytest.mark.parametrize("width", [390, 1240])
+def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_page, width):
+    browser.open(shipped_page, width)
+    pictures = browser.run(_LABEL_BOXES)
+    assert len(pictures) >= 7
+    for picture in pictures:
+        left, top, right, bottom = picture["frame"]
+        boxes = picture["labels"]
+        for number, box in enumerate(boxes):
+            assert left <= box[0] and top <= box[1] and box[2] <= right and box[3] <= bottom
+            for placed in boxes[:number]:
+                apart = box[2] <= placed[0] or placed[2] <= box[0] or box[3] <= placed[1] or placed[3] <= box[1]
+                assert apart, (box, placed)
+
+
+# Boxes of the labels of every picture that is shown: across as drawn, and a line's height without its leading.
+_LABEL_BOXES = """
+[...document.querySelectorAll("svg.scatter")].filter(svg => svg.getBoundingClientRect().width > 0).map(svg => ({
+  frame: (b => [b.left, b.top, b.right, b.bottom])(svg.getBoundingClientRect()),
+  labels: [...svg.querySelectorAll("text.name")].map(text => {
+    const b = text.getBoundingClientRect(), cut = 0.15 * b.height;
+    return [b.left, b.top + cut, b.right, b.bottom - cut];
+  }),
+}))
+"""
 _LEAST_CONTRAST = """
 (() => {
   const context = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
@@ -178,8 +223,8 @@ _LEAST_CONTRAST = """
   for (const element of document.querySelectorAll(texts)) {
     const box = element.getBoundingClientRect();
     if (!box.width || !element.innerText?.trim()) continue;
-    const [one, other] = [light(rgba(getComputedStyle(element).color)), light(ground(element))];
-    least = Math.min(least, (Math.max(one, other) + 0.05) / (Math.min(one, other) + 0.05));
+    const [text, behind] = [light(rgba(getComputedStyle(element).color)), light(ground(element))];
+    least = Math.min(least, (Math.max(text, behind) + 0.05) / (Math.min(text, behind) + 0.05));
   }
   return least;
 })()

@@ -1,6 +1,7 @@
-"""Row files and who stands for them, ranks with ties by interval, and README's block that no hand may edit."""
+"""Row files and their provenance, ranks by interval, and README's generated block."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def files(tmp_path_factory, dataset):
     return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 
 
-def test_a_row_holds_the_result_and_who_stands_for_it(files, tmp_path, capsys):
+def test_a_row_holds_the_result_and_its_provenance(files, tmp_path, capsys):
     row = tmp_path / "row.json"
     assert main(["leaderboard", str(files[0]), "--row", str(row), "--provenance", "verified"]) == 0
     assert capsys.readouterr().out == f"{row}: verified\n"
@@ -88,8 +89,8 @@ def test_unsound_rows_are_refused_by_name(change, message, files, tmp_path, caps
     write_row(read_entry(files[0]), "verified", path)
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     assert main(["leaderboard", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert "odd.json" in said and message in said
+    error = capsys.readouterr().err
+    assert "odd.json" in error and message in error
 
 
 def test_an_edited_row_contradicts_itself(files, tmp_path):
@@ -111,7 +112,7 @@ def test_row_needs_one_result_and_a_known_provenance(files, tmp_path, capsys):
     assert "can't be written" in capsys.readouterr().err
 
 
-def test_ranks_are_shared_where_intervals_overlap(dataset, tmp_path):
+def test_ranks_are_ranges_where_intervals_overlap(dataset, tmp_path):
     # An offset alone has no spread over objects; noise differs from sample to sample, so it has.
     exact = write_result_file(tmp_path / "a.json", dataset, 1.0, name="a")
     close = write_result_file(tmp_path / "b.json", dataset, 1.0, 30.0, name="b")
@@ -119,19 +120,20 @@ def test_ranks_are_shared_where_intervals_overlap(dataset, tmp_path):
     entries = read_entries([near, close, exact])
     spans = {entry.name: entry.interval("object_mae_mm") for entry in entries}
     assert spans["a"][1] < spans["b"][0] and spans["c"][0] < spans["b"][1]  # what the ranks must follow from
-    assert [(row.rank, row.entry.name) for row in rank(entries)[0].rows] == [(1, "a"), (2, "b"), (2, "c")]
+    assert [(row.ranks, row.entry.name) for row in rank(entries)[0].rows] == [("1", "a"), ("2-3", "b"), ("2-3", "c")]
 
 
 def test_more_within_a_tolerance_is_better(dataset, tmp_path):
     paths = [write_result_file(tmp_path / f"{o}.json", dataset, o, name=f"off by {o}") for o in (0.5, 3.0, 20.0)]
-    found = rank(read_entries(paths), "object_within_5mm_share")[0].rows
-    assert [row.entry.name for row in found][-1] == "off by 20.0" and [row.rank for row in found] == [1, 1, 3]
+    ranked = rank(read_entries(paths), "object_within_5mm_share")[0].rows
+    assert [row.entry.name for row in ranked][-1] == "off by 20.0"
+    assert [row.ranks for row in ranked] == ["1-2", "1-2", "3"]
 
 
 def test_a_bias_counts_by_its_size(dataset, tmp_path):
     paths = [write_result_file(tmp_path / f"{o}.json", dataset, o, name=f"bias {o}") for o in (-3.0, 1.0, 2.0)]
-    found = rank(read_entries(paths), "object_bias_mm")[0].rows
-    assert [row.entry.name for row in found] == ["bias 1.0", "bias 2.0", "bias -3.0"]
+    ranked = rank(read_entries(paths), "object_bias_mm")[0].rows
+    assert [row.entry.name for row in ranked] == ["bias 1.0", "bias 2.0", "bias -3.0"]
 
 
 def _png(height: int, width: int) -> bytes:
@@ -154,7 +156,7 @@ def test_the_picture_beside_a_row_is_shown_on_its_page(files, tmp_path):
     "content",
     [b"<svg onload=alert(1)>", b"", b"GIF89a" + bytes(40), _png(20, 30)[:20], _png(1, 5000), bytes(2_000_001)],
 )
-def test_what_is_no_sensible_png_is_refused(content, files, tmp_path):
+def test_a_picture_that_is_no_png_of_sensible_size_is_refused(content, files, tmp_path):
     path = tmp_path / "row.json"
     path.write_bytes(files[0].read_bytes())
     path.with_suffix(".png").write_bytes(content)
@@ -185,11 +187,11 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
     assert block(readme, *files) == 0
     text = readme.read_text()
     assert text.startswith(f"# Title\n\n{BEGIN}\n\n") and text.endswith(f"\n{END}\n\nMore.\n")
-    lines = [line.split(" | ")[1] for line in text.splitlines() if line.startswith(("| 1", "| 2", "| 3"))]
+    lines = [line.split(" | ")[1] for line in text.splitlines() if re.match(r"\| \d+ ", line)]
     assert lines == ["Slow and fine", "Fast and rough", "Beaten", "Was told"]
     assert block(readme, *files[::-1]) == 0 and readme.read_text() == text
     assert block(readme, *files, "--check") == 0
-    assert "is what the rows give" in capsys.readouterr().out
+    assert "is up to date with the rows" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("extra", [0, 1, 4])
@@ -213,12 +215,12 @@ def test_readme_shows_the_best_of_a_group(extra, files):
 def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):
     assert block(readme, *files) == 0
     made = readme.read_text()
-    for edited in (made.replace("| 1 | Slow", "| 2 | Slow"), made.replace(END, f"One more line.\n{END}")):
+    for edited in (made.replace("| 1 | Slow", "| 2 | Slow"), made.replace(END, f"A line too many.\n{END}")):
         readme.write_text(edited)
         assert block(readme, *files, "--check") == 1
         assert "don't edit it by hand, run: fpp-bench leaderboard --readme" in capsys.readouterr().err
         assert readme.read_text() == edited
-    readme.write_text(made.replace("More.", "What stands outside is anyone's."))
+    readme.write_text(made.replace("More.", "Text outside of the markers."))
     assert block(readme, *files, "--check") == 0
 
 
@@ -237,7 +239,7 @@ def test_check_needs_a_readme(files, tmp_path, capsys):
     assert block(tmp_path / "none.md", files[0]) == 2
 
 
-def test_results_lying_about_get_into_neither_page_nor_readme(readme, files, tmp_path, monkeypatch):
+def test_unnamed_results_get_into_neither_page_nor_readme(readme, files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
     (tmp_path / "result.json").write_bytes(files[0].read_bytes())

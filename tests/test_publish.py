@@ -46,29 +46,29 @@ def published(client, dataset):
 
 
 def test_a_dry_run_says_everything_and_changes_nothing(published):
-    said, writes, repos = published["dry"]
-    assert listed(said) == dict.fromkeys(
+    output, writes, repos = published["dry"]
+    assert listed(output) == dict.fromkeys(
         [*DATA, "README.md", "eval.yaml", "fpp-bench.json", "meshes/bowl.ply", "rig.yaml"], "new"
     )
-    assert "(new, public)" in said
-    assert "Dry run: nothing was sent." in said
+    assert "(new, public)" in output
+    assert "Dry run: nothing was sent." in output
     assert (writes, repos) == ([], {})
 
 
 def test_the_real_run_does_what_the_dry_run_said(published, client):
-    said, writes = published["real"]
-    assert listed(said) == listed(published["dry"][0])
+    output, writes = published["real"]
+    assert listed(output) == listed(published["dry"][0])
     repo = client.server.repos["datasets", "alice/fpp"]
-    assert set(repo.files) == {*listed(said), ".gitattributes"}
+    assert set(repo.files) == {*listed(output), ".gitattributes"}
     assert len(repo.commits) == 2  # the Hub's own, and one that makes everything visible at once
     assert not repo.private
     assert sum(method == "PUT" for method, _ in writes) == 4  # three Parquet files and a mesh
 
 
 def test_a_second_run_sends_nothing(published):
-    said, writes = published["again"]
-    assert set(listed(said).values()) == {"unchanged"}
-    assert "Nothing to send" in said
+    output, writes = published["again"]
+    assert set(listed(output).values()) == {"unchanged"}
+    assert "Nothing to send" in output
     assert writes == []
 
 
@@ -113,9 +113,9 @@ def test_load_dataset_reads_the_same_rows_of_every_configuration(published, clie
                     assert columns["depth_max"][row] == dataset.depth_mm(sample).max()
 
 
-def same_bits(came: np.ndarray, wanted: np.ndarray) -> None:
-    assert came.shape == wanted.shape and came.dtype == wanted.dtype
-    assert came.tobytes() == wanted.tobytes()
+def same_bits(loaded: np.ndarray, expected: np.ndarray) -> None:
+    assert loaded.shape == expected.shape and loaded.dtype == expected.dtype
+    assert loaded.tobytes() == expected.tobytes()
 
 
 def test_a_name_with_markup_is_shown_as_it_is(published, client):
@@ -123,7 +123,7 @@ def test_a_name_with_markup_is_shown_as_it_is(published, client):
     head, body = card.split("---\n", 2)[1:]
     assert ODD_OBJECT not in body
     assert "&#60;b&#62;&#95;&#91;x&#93;(y)&#124;&#96;z&#96;" in body
-    assert {one["config_name"] for one in yaml.safe_load(head)["configs"]} == {
+    assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == {
         "single_shot", "horizontal", "vertical", "sinusoidal", "all"
     }  # fmt: skip
 
@@ -143,18 +143,18 @@ def test_other_data_replaces_what_changed_and_leaves_what_others_added(client, t
     repo = client.server.repos["datasets", "alice/replaced"]
     repo.files |= {"NOTES.txt": b"by hand", "data/stray.parquet": b"old"}
     staged = tmp_path / "staged"
-    said = client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
-    assert listed(said)["data/stray.parquet"] == "deleted"
-    assert "NOTES.txt" not in listed(said)
-    assert listed(said)[DATA[2]] == "changed"
+    output = client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
+    assert listed(output)["data/stray.parquet"] == "deleted"
+    assert "NOTES.txt" not in listed(output)
+    assert listed(output)[DATA[2]] == "changed"
     assert "data/stray.parquet" not in repo.files and repo.files["NOTES.txt"] == b"by hand"
     # A kept staging folder is continued, not written again; and it changes nothing on the Hub.
-    before = {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")}
-    assert len(before) == 3
+    modified = {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")}
+    assert len(modified) == 3
     (staged / "files" / "data" / ".test.parquet.1.tmp").write_bytes(b"of a run that was killed")
     client.server.writes()
     assert "Nothing to send" in client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
-    assert {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")} == before
+    assert {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")} == modified
     assert client.server.writes() == []
 
 
@@ -197,9 +197,9 @@ def test_refusals(client, small, tmp_path):
         (["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"], "no such model"),
     ]
     client.server.writes()
-    for (call, wanted), (status, _, error) in zip(cases, client.run(*(call for call, _ in cases)), strict=True):
+    for (call, message), (status, _, error) in zip(cases, client.run(*(call for call, _ in cases)), strict=True):
         assert status == 2, call
-        assert re.search(wanted, error, re.DOTALL), (call, error)
+        assert re.search(message, error, re.DOTALL), (call, error)
         assert "Traceback" not in error and "\x1b" not in error
     assert set(client.server.repos["datasets", "raced/fpp"].files) == {".gitattributes"}
     assert ("datasets", "alice/new") not in client.server.repos
@@ -207,7 +207,7 @@ def test_refusals(client, small, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("environment", "wanted"),
+    ("environment", "message"),
     [
         ({"HF_TOKEN": None}, "no token for the Hub: run 'hf auth login'"),
         ({"HF_TOKEN": "hf_bad"}, r"does not accept the token \(401\)"),
@@ -217,11 +217,11 @@ def test_refusals(client, small, tmp_path):
     ],
     ids=("no token", "bad token", "connection refused", "bad endpoint", "offline"),
 )
-def test_no_way_to_the_hub(client, small, environment, wanted):
+def test_no_way_to_the_hub(client, small, environment, message):
     client.server.writes()
     ((status, _, error),) = client.run(["dataset", str(small.path), "--repo", "alice/never"], **environment)
     assert status == 2
-    assert re.search(wanted, error, re.DOTALL), error
+    assert re.search(message, error, re.DOTALL), error
     assert "Traceback" not in error
     assert client.server.writes() == []
 

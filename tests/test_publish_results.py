@@ -34,14 +34,14 @@ def scored(client, tmp_path_factory):
     """Published dataset ``alice/scored``, and result files by name."""
     folder = tmp_path_factory.mktemp("scored")
     dataset = make_dataset(folder / "dataset", size=SIZE)
-    other = make_dataset(folder / "other", size=(28, 28))
+    small = make_dataset(folder / "other", size=(28, 28))
     client.good(["dataset", str(dataset.path), "--repo", "alice/scored"])
     results = {}
     for name, data, split, target, changed in (
         ("good", dataset, "test", "depth", {"name": HOSTILE, "seconds_source": "self-reported"}),
         ("better", dataset, "test", "depth", {"offset_mm": 1.0}),
         ("many", dataset, "test", "depth", {"frames_used": list(range(18)), "uses_ground_truth_range": True}),
-        ("other", other, "test", "depth", {}),
+        ("other", small, "test", "depth", {}),
         ("train", dataset, "train", "depth", {}),
         ("exact", dataset, "test", "depth_exact", {}),
     ):
@@ -72,8 +72,8 @@ def test_results_parse_back(client, scored):
     client.server.writes()
     dry = client.good([*call, "--dry-run", "--source-url", "https://example.org/page"])
     assert client.server.writes() == []
-    said = client.good([*call, "--source-url", "https://example.org/page"])
-    assert listed(said) == listed(dry) == {
+    output = client.good([*call, "--source-url", "https://example.org/page"])
+    assert listed(output) == listed(dry) == {
         ".eval_results/multi_frame_depth_oracle_range--alice--scored.yaml": "new",
         ".eval_results/single_shot_depth--alice--scored.yaml": "new",
     }  # fmt: skip
@@ -123,8 +123,8 @@ def test_results_that_belong_to_no_task_are_refused(client, scored, tmp_path):
         ([*call[:-1], "alice/nowhere", str(scored["good"])], "no such dataset"),
     ]
     client.server.writes()
-    for (asked, wanted), (status, _, error) in zip(cases, client.run(*(asked for asked, _ in cases)), strict=True):
-        assert status == 2 and wanted in error and "Traceback" not in error, (asked, error)
+    for (arguments, message), (status, _, error) in zip(cases, client.run(*(case for case, _ in cases)), strict=True):
+        assert status == 2 and message in error and "Traceback" not in error, (arguments, error)
     assert client.server.writes() == []
 
 
@@ -149,8 +149,8 @@ def test_the_page_becomes_a_static_space(client, tmp_path):
     assert first[0] == second[0] == third[0] == 0
     assert listed(dry) == listed(first[1])
     assert "Nothing to send" in second[1]
-    gone = {name for name, status in listed(third[1]).items() if status == "deleted"}
-    assert gone == {"submissions/b.html", "submissions/b.png"}
+    deleted = {name for name, status in listed(third[1]).items() if status == "deleted"}
+    assert deleted == {"submissions/b.html", "submissions/b.png"}
     space = client.server.repos["spaces", "alice/board"]
     assert space.sdk == "static" and len(space.commits) == 3
     assert space.files["index.html"] == (page / "index.html").read_bytes()
@@ -166,10 +166,12 @@ def test_the_page_becomes_a_static_space(client, tmp_path):
 def test_the_page_of_results(client, scored, tmp_path):
     """The leaderboard's own page, made from results, passes as a page; without any it is that of the shipped rows."""
     call = ["leaderboard", str(scored["good"]), str(scored["many"]), "--repo", "alice/ranked"]
-    made, again, none, both = client.run(call, call, ["leaderboard", "--repo", "alice/ranked"], [*call, "--page", "x"])
-    assert made[0] == again[0] == none[0] == 0, (made, again, none)
-    assert "Nothing to send" in again[1]
-    pages = [name for name in listed(made[1]) if name.startswith("submissions/")]
+    first, second, none, both = client.run(
+        call, call, ["leaderboard", "--repo", "alice/ranked"], [*call, "--page", "x"]
+    )
+    assert first[0] == second[0] == none[0] == 0, (first, second, none)
+    assert "Nothing to send" in second[1]
+    pages = [name for name in listed(first[1]) if name.startswith("submissions/")]
     assert len(pages) == 2
     assert {name: listed(none[1])[name] for name in pages} == dict.fromkeys(pages, "deleted")
     assert both[0] == 2 and "got both" in both[2]
@@ -191,7 +193,7 @@ def test_what_is_no_part_of_a_page_stays_home(client, tmp_path):
 def test_the_score_falls_with_the_error_and_stays_between_0_and_100():
     errors = [0.0, 1e-3, 0.5, 1.0, 9.99, 10.0, 100.0, 1800.0, 1e6]
     scores = [score(error) for error in errors]
-    assert all(one > other for one, other in itertools.pairwise(scores))
+    assert all(higher > lower for higher, lower in itertools.pairwise(scores))
     assert scores[0] == 100.0 and score(10.0) == 50.0 and score(1e30) == 0.0
 
 
@@ -212,14 +214,14 @@ def test_changes_compare_with_the_hashes_the_hub_keeps(tmp_path):
     for name, content in {"same.txt": b"1", "same.bin": b"2", "other.txt": b"3", "d/new.txt": b""}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(content)
-    known = {
+    stored = {
         "same.txt": RemoteFile("same.txt", 1, "56a6051ca2b02b04ef92d5150c9ef600403cb1de"),  # git hash-object of "1"
         "same.bin": RemoteFile("same.bin", 1, "0" * 40, hashlib.sha256(b"2").hexdigest()),
         "other.txt": RemoteFile("other.txt", 1, git_sha1(b"4")),
         "d/gone.txt": RemoteFile("d/gone.txt", 7, git_sha1(b"")),
         "kept.txt": RemoteFile("kept.txt", 8, git_sha1(b"")),
     }
-    remote = Remote("c" * 40, files=known)
+    remote = Remote("c" * 40, files=stored)
     assert changes(Publication("dataset", "a/b", tmp_path, "m", owned=("d/",)), remote) == [
         Change("deleted", "d/gone.txt", 7), Change("new", "d/new.txt", 0), Change("changed", "other.txt", 1),
         Change("unchanged", "same.bin", 1), Change("unchanged", "same.txt", 1),

@@ -40,7 +40,7 @@ def _timing(folder):
     return time_method(opened, ClassicalMethod(opened.rig, steps=3), repeats=1)
 
 
-def measured_once(opened, method, split, repeats):
+def reused_timing(opened, method, split, repeats):
     """A timing of something else, for tests that are not about time."""
     return _timing(opened.path).model_copy(update={"frames": len(method.frames_used)})
 
@@ -55,10 +55,10 @@ def small(monkeypatch, opened, request):
 
     monkeypatch.setattr(reproduce_plan, "load_recipe", tiny_recipe)
     monkeypatch.setattr("fpp_ml_bench.leaderboard.reproduce_row.REPEATS", 2)
-    for what in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
-        monkeypatch.setattr(f"fpp_ml_bench.baselines.range_heads.{what}", 4)
+    for constant in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
+        monkeypatch.setattr(f"fpp_ml_bench.baselines.range_heads.{constant}", 4)
     if "from_trainings" not in request.node.name:  # there the time is really measured
-        monkeypatch.setattr(reproduce_row, "time_method", measured_once)
+        monkeypatch.setattr(reproduce_row, "time_method", reused_timing)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -98,9 +98,9 @@ class Trainer:
 
 @pytest.fixture
 def trainer(monkeypatch):
-    made = Trainer()
-    monkeypatch.setattr(reproduce, "train", made)
-    return made
+    stand_in = Trainer()
+    monkeypatch.setattr(reproduce, "train", stand_in)
+    return stand_in
 
 
 @pytest.fixture
@@ -166,7 +166,7 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "cpu"
-    before = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    weights_before = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
     training = below / "unet-individual-rmse"
     for path in training.iterdir():
         path.unlink()
@@ -176,15 +176,15 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    after = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
-    assert before != after and len(trainer.trained) == 4
+    weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    assert weights_before != weights_after and len(trainer.trained) == 4
 
 
 def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, tmp_path, capsys):
     trainer.says["unet-global-rmse"] = "out of time"
     assert run(TABLE, "--minutes", "5") == 1
     out = capsys.readouterr().out
-    assert "Stopped at unet-global-rmse after 5 minutes. Go on with: fpp-bench reproduce normalization" in out
+    assert "Stopped at unet-global-rmse after 5 minutes. Continue with: fpp-bench reproduce normalization" in out
     assert "--only-missing --minutes 5" in out
     text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
     assert "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization" in text
@@ -217,8 +217,8 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     other = {**recipe.to_dict(), "batch": 8, "seed": 1}
     (out / engine.RECIPE).write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
     assert run(TABLE) == 2
-    said = capsys.readouterr().err
-    assert "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in said and f"mv {out}" in said
+    error = capsys.readouterr().err
+    assert "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in error and f"mv {out}" in error
     assert trainer.trained == []
     (out / engine.RECIPE).write_text("[]")
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
@@ -227,31 +227,33 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
 def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
     monkeypatch.setattr(reproduce_training, "_gpu", lambda: False)
     assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2
-    said = capsys.readouterr().err
-    assert "no CUDA GPU" in said and "fpp-bench reproduce normalization --preset paper" in said and "--anyway" in said
+    error = capsys.readouterr().err
+    assert (
+        "no CUDA GPU" in error and "fpp-bench reproduce normalization --preset paper" in error and "--anyway" in error
+    )
     assert trainer.trained == []
     assert run(TABLE, "--preset", "paper", "--anyway") == 0 and len(trainer.trained) == 3
     assert run(TABLE, "--preset", "paper") == 0  # nothing is left to train
 
 
 def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path, opened):
-    others = ("horizontal", "sinusoidal", "all")
-    trainer.says |= {f"unet-individual-rmse-{name}": TrainingError("left out") for name in others}
+    unscored_configs = ("horizontal", "sinusoidal", "all")
+    trainer.says |= {f"unet-individual-rmse-{name}": TrainingError("left out") for name in unscored_configs}
     assert run("multi_frame") == 2
     below = tmp_path / "runs" / "cpu"
-    found = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-vertical-all-frames.json")
-    assert found.frames == list(range(18, 36)) and found.pairs == 18 * len(opened.samples("test"))
+    scores = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-vertical-all-frames.json")
+    assert scores.frames == list(range(18, 36)) and scores.pairs == 18 * len(opened.samples("test"))
     row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").result
     assert row.submission.frames_used == [18]
-    first = next(part.metrics for part in found.per_frame if part.frame == 18)
+    first = next(part.metrics for part in scores.per_frame if part.frame == 18)
     for key in ("object_mae_mm", "overall_rmse_mm", "background_mae_mm"):
         assert getattr(first, key) == pytest.approx(getattr(row.metrics, key), rel=1e-9)
-        each = [getattr(part.metrics, key) for part in found.per_frame]
-        assert getattr(found.metrics, key) == pytest.approx(np.mean(each), rel=1e-9)
+        per_frame = [getattr(part.metrics, key) for part in scores.per_frame]
+        assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_frame), rel=1e-9)
     table = (below / "multi_frame.md").read_text().split("## ")[0]
     lines = [line for line in table.splitlines() if line.startswith("| 18 vertical")]
     assert len(lines) == 2 and "its first frame only" in lines[1]
-    assert f"| {found.metrics.object_mae_mm:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
+    assert f"| {scores.metrics.object_mae_mm:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
     assert f"| {row.metrics.object_mae_mm:.2f} / " in lines[1] and "12.36" not in lines[1]
     frame0 = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-all-frames.json")
     alone = read_entry(below / "rows" / "cpu-unet-individual-rmse.json").result
@@ -262,12 +264,12 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
     def zeros(frame):
         return np.zeros(frame.shape, np.float32)
 
-    found = score_all_frames(opened, zeros, [0, 3], "mm", "standard", "r", 64 * "a")
+    scores = score_all_frames(opened, zeros, [0, 3], "mm", "standard", "r", 64 * "a")
     path = tmp_path / "all.json"
-    write_all_frames(found, path)
-    assert read_all_frames(path) == found == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
+    write_all_frames(scores, path)
+    assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
     assert all_frames_that_hold(path, opened.fingerprint, 64 * "b") is None
-    assert found.metrics.background_mae_mm == 0 and found.metrics.object_mae_mm > 1500
+    assert scores.metrics.background_mae_mm == 0 and scores.metrics.object_mae_mm > 1500
     path.write_text(path.read_text().replace('"pairs"', '"pear"'))
     with pytest.raises(SubmissionError, match="pear"):
         read_all_frames(path)
@@ -290,8 +292,8 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper-individual")
-    found = score_all_frames(opened, lambda frame: next(waiting), [0], "normalised", "paper-individual", "r", 64 * "a")
-    for key, value in found.metrics:
+    scores = score_all_frames(opened, lambda frame: next(waiting), [0], "normalised", "paper-individual", "r", 64 * "a")
+    for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 
 

@@ -14,11 +14,11 @@ from fpp_ml_bench.evaluation.compare import compare
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.leaderboard import reproduce_plan
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
-from fpp_ml_bench.leaderboard.reproduce_data import default_folder, the_dataset
+from fpp_ml_bench.leaderboard.reproduce_data import default_folder, open_dataset
 from fpp_ml_bench.leaderboard.reproduce_lines import Line, Scored, scored_entry
 from fpp_ml_bench.leaderboard.reproduce_order import Ordering, orderings
 from fpp_ml_bench.leaderboard.reproduce_plan import Folders, places, planned, variants
-from fpp_ml_bench.leaderboard.reproduce_table import orderings_said, table_markdown
+from fpp_ml_bench.leaderboard.reproduce_table import orderings_sentence, table_markdown
 from fpp_ml_bench.leaderboard.rows import Entry
 
 
@@ -53,10 +53,10 @@ def test_rows_of_one_recipe_are_one_training(preset):
 
 def test_places_hold_the_papers_numbers():
     for table in PAPER_TABLES:
-        found = {place.row: place for place in places(table)}
+        by_row = {place.row: place for place in places(table)}
         for row in paper_tables()[table].rows:
-            assert (found[row.row].errors_mm, found[row.row].pairs) == (row.errors_mm, row.test_samples)
-        extra = [name for name, place in found.items() if place.errors_mm is None]
+            assert (by_row[row.row].errors_mm, by_row[row.row].pairs) == (row.errors_mm, row.test_samples)
+        extra = [name for name, place in by_row.items() if place.errors_mm is None]
         assert extra == (["hformer"] if table == "architecture" else [])
 
 
@@ -83,30 +83,30 @@ def test_default_folders():
 
 
 def test_a_dataset_of_another_size_is_refused(tmp_path):
-    other = make_dataset(tmp_path / "other")
+    small = make_dataset(tmp_path / "other")
     jobs = planned(["normalization"], "cpu")
     with pytest.raises(DatasetError, match=r"expected images of 224 x 224 px, which preset cpu .* got 40 x 32.*--size"):
-        the_dataset(other.path, jobs, folders(tmp_path), print)
+        open_dataset(small.path, jobs, folders(tmp_path), print)
 
 
 def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
     with pytest.raises(
         DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
     ):
-        the_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
+        open_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
 
 
 def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
-    jobs, where = planned(["normalization"], "cpu"), folders(tmp_path)
-    first = the_dataset(dataset.path, jobs, where, print)
-    assert the_dataset(dataset.path, jobs, where, print).fingerprint == first.fingerprint
-    known = json.loads(where.dataset_record.read_text())
-    where.dataset_record.write_text(json.dumps({**known, "fingerprint": 64 * "a"}))
-    with pytest.raises(DatasetError, match=r"was trained on aaaaaaaa .*give that one as --data, or another --runs"):
-        the_dataset(dataset.path, jobs, where, print)
-    where.dataset_record.write_text("{")
+    jobs, run_folders = planned(["normalization"], "cpu"), folders(tmp_path)
+    first = open_dataset(dataset.path, jobs, run_folders, print)
+    assert open_dataset(dataset.path, jobs, run_folders, print).fingerprint == first.fingerprint
+    recorded = json.loads(run_folders.dataset_record.read_text())
+    run_folders.dataset_record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
+    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
+        open_dataset(dataset.path, jobs, run_folders, print)
+    run_folders.dataset_record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
-        the_dataset(dataset.path, jobs, where, print)
+        open_dataset(dataset.path, jobs, run_folders, print)
 
 
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
@@ -136,17 +136,17 @@ def test_orderings_are_judged_by_number():
         line("odd", 3.0, swapped),
         line("own", None, noise),
     ]
-    found = orderings(lines[::-1])
-    assert [(item.better, item.worse, item.verdict) for item in found] == [
+    judged = orderings(lines[::-1])
+    assert [(ordering.better, ordering.worse, ordering.verdict) for ordering in judged] == [
         ("best", "worse", "holds"), ("best", "odd", "within noise"), ("worse", "odd", "within noise"),
     ]  # fmt: skip
-    assert [item.paper_gap_mm for item in found] == [1.0, 2.0, 1.0]
-    assert found[0].gap_mm == pytest.approx(2.0)
+    assert [ordering.paper_gap_mm for ordering in judged] == [1.0, 2.0, 1.0]
+    assert judged[0].gap_mm == pytest.approx(2.0)
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
-    assert [item.verdict for item in turned] == ["reversed"]
-    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_said(found)
+    assert [ordering.verdict for ordering in turned] == ["reversed"]
+    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_sentence(judged)
     assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
-    assert "none of its orderings" in orderings_said([])
+    assert "none of its orderings" in orderings_sentence([])
 
 
 @pytest.mark.parametrize(
@@ -168,9 +168,9 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
         replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_entry(entry))
         for n, entry in enumerate(entries, 1)
     ]
-    found, told = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
-    assert (found.gap_mm, list(found.interval_mm)) == (told.mean_mm, told.interval_mm)
-    assert found.same_track
+    ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
+    assert (ordering.gap_mm, list(ordering.interval_mm)) == (difference.mean_mm, difference.interval_mm)
+    assert ordering.same_track
     oracle = results[1].model_copy(
         update={"submission": results[1].submission.model_copy(update={"uses_ground_truth_range": True})}
     )

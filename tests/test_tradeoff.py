@@ -18,14 +18,14 @@ from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.evaluator import evaluate
 from fpp_ml_bench.leaderboard import tradeoff_report
 from fpp_ml_bench.leaderboard.page import page_files
-from fpp_ml_bench.leaderboard.tradeoff import Plan, Wish, planned, tradeoff
+from fpp_ml_bench.leaderboard.tradeoff import Plan, TradeoffSettings, planned, tradeoff
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_journal import JOURNAL
 from fpp_ml_bench.leaderboard.tradeoff_measure import Setting, measured
 from fpp_ml_bench.leaderboard.tradeoff_points import Point, Tradeoff, read_tradeoff
 from fpp_ml_bench.leaderboard.tradeoff_precision import DecodeInType
 from fpp_ml_bench.leaderboard.tradeoff_report import remarks, write_report
-from fpp_ml_bench.leaderboard.tradeoff_views import some_views
+from fpp_ml_bench.leaderboard.tradeoff_views import choose_views
 from fpp_ml_bench.loaders.folder_lock import exclusive
 
 QUICK = Rules(runs=3, limit_s=0.05)
@@ -46,7 +46,6 @@ class Answer:
     rows: int = 0
     frames_used: tuple = (0,)
     uses_ground_truth_range: bool = False
-    made: list = field(default_factory=list)
     name = title = "answer"
     settings: dict = field(default_factory=dict)
 
@@ -58,15 +57,15 @@ class Answer:
         return depth
 
 
-def setting(dataset, key="one", made=(), **changes):
+def setting(dataset, key="a", calls=(), **changes):
     method = Answer(dataset, **changes)
 
     def make():
-        if isinstance(made, list):
-            made.append(key)
+        if isinstance(calls, list):
+            calls.append(key)
         return method
 
-    return Setting(key, "classical", f"Setting {key}", make, some_views(dataset, 2))
+    return Setting(key, "classical", f"Setting {key}", make, choose_views(dataset, 2))
 
 
 def test_a_point_is_what_the_evaluator_says(small, tmp_path):
@@ -97,15 +96,15 @@ def test_untrained_is_timed_and_never_scored(small):
         Setting("width", "networks", "UNet", base.make, base.views, scored=False, note="not trained"), QUICK
     )
     assert point.seconds > 0 and point.object_mae_mm is None and point.note == "not trained"
-    assert whole(small, [point]).comparable() == []
+    assert tradeoff_of(small, [point]).comparable() == []
 
 
 def test_views_are_spread_and_differ_between_objects(small):
-    views = some_views(small, 1)
+    views = choose_views(small, 1)
     assert views.names == ["power_drill_A0", "wooden_boards_A60"] and views.objects == ["power_drill", "wooden_boards"]
-    assert list(some_views(small, 9).names) == small.samples("test")
+    assert list(choose_views(small, 9).names) == small.samples("test")
     with pytest.raises(DatasetError, match="no split"):
-        some_views(small, 1, "nowhere")
+        choose_views(small, 1, "nowhere")
 
 
 def point(key, seconds, frames, error, group="classical", **changes):
@@ -116,7 +115,7 @@ def point(key, seconds, frames, error, group="classical", **changes):
     )  # fmt: skip
 
 
-def whole(dataset, points, growth=()):
+def tradeoff_of(dataset, points, growth=()):
     return Tradeoff(
         created="2026-01-01T00:00:00+00:00", dataset="small", fingerprint=dataset.fingerprint, image_size=[32, 40],
         target="depth_exact", views=["power_drill_A0"], settings={"threads": 1, "clock": "wall"},
@@ -132,16 +131,16 @@ numbers = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
 @given(st.lists(numbers, min_size=1, max_size=12), st.sampled_from(["seconds", "frames"]))
 def test_the_front_is_what_no_point_beats(triples, cost):
     points = [point(f"k{n:02d}", float(a), b, float(c)) for n, (a, b, c) in enumerate(triples)]
-    made = Tradeoff.model_construct(points=points)
+    run = Tradeoff.model_construct(points=points)
     beaten = {
-        one.key
-        for one in points
-        for two in points
-        if getattr(two, cost) <= getattr(one, cost)
-        and two.object_mae_mm <= one.object_mae_mm
-        and (getattr(two, cost), two.object_mae_mm) != (getattr(one, cost), one.object_mae_mm)
+        beaten_point.key
+        for beaten_point in points
+        for better in points
+        if getattr(better, cost) <= getattr(beaten_point, cost)
+        and better.object_mae_mm <= beaten_point.object_mae_mm
+        and (getattr(better, cost), better.object_mae_mm) != (getattr(beaten_point, cost), beaten_point.object_mae_mm)
     }
-    assert {p.key for p in made.front(cost)} == {p.key for p in points} - beaten
+    assert {p.key for p in run.front(cost)} == {p.key for p in points} - beaten
 
 
 def test_only_comparable_points_are_on_a_front(small):
@@ -153,48 +152,48 @@ def test_only_comparable_points_are_on_a_front(small):
         Point(key="absent", group="networks", title="Absent", failed="onnxruntime is not installed"),
     ]
     sparse = point("sparse", 0.1, 1, 5.0).model_copy(update={"measured_mae_mm": 0.1, "missing_share": 0.5})
-    made = whole(small, [*points, sparse])
-    assert [p.key for p in made.front("seconds")] == [p.key for p in made.front("frames")] == ["sparse", "a"]
-    assert [p.key for p in made.front("seconds", "measured_mae_mm")] == ["a"]
-    assert any("onnxruntime is not installed" in line for line in remarks(made))
+    run = tradeoff_of(small, [*points, sparse])
+    assert [p.key for p in run.front("seconds")] == [p.key for p in run.front("frames")] == ["sparse", "a"]
+    assert [p.key for p in run.front("seconds", "measured_mae_mm")] == ["a"]
+    assert any("onnxruntime is not installed" in line for line in remarks(run))
 
 
 def test_a_busy_machine_shows(small):
     points = [point(f"k{n}", 1.0, 1, 1.0) for n in range(4)] + [point("busy", 1.0, 1, 1.0)]
     points[-1] = points[-1].model_copy(update={"pace_ms": 6.5, "load": 9.0})
-    made = whole(small, points)
-    assert [made.slowed(p) for p in points] == [False] * 4 + [True]
-    assert "0.5 to 9 on 2 cores" in remarks(made)[0] and remarks(made)[1].startswith("1 of 5 settings")
+    run = tradeoff_of(small, points)
+    assert [run.slowed(p) for p in points] == [False] * 4 + [True]
+    assert "0.5 to 9 on 2 cores" in remarks(run)[0] and remarks(run)[1].startswith("1 of 5 settings")
 
 
 def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path):
-    made: list[str] = []
-    wish = Wish(small.path, tmp_path / "out", quick=True)
-    plan = Plan(small, some_views(small, 1), [setting(small, key, made) for key in "ab"], [])
-    plan.settings.append(setting(small, "lost", made, frames_used=(7,)))
+    calls: list[str] = []
+    settings_of_run = TradeoffSettings(small.path, tmp_path / "out", quick=True)
+    plan = Plan(small, choose_views(small, 1), [setting(small, key, calls) for key in "ab"], [])
+    plan.settings.append(setting(small, "lost", calls, frames_used=(7,)))
     seen: list[str] = []
-    first = tradeoff(wish, plan, seen.append)
-    assert seen == made == ["a", "b", "lost"] and first.sittings == 1
+    first = tradeoff(settings_of_run, plan, seen.append)
+    assert seen == calls == ["a", "b", "lost"] and first.sittings == 1
     journal = tmp_path / "out" / JOURNAL
     journal.write_bytes(journal.read_bytes() + b'{"point": {"key": "torn')
-    again = tradeoff(wish, plan)
-    assert made == ["a", "b", "lost", "lost"] and again.sittings == 2
-    assert again.points[:2] == first.points[:2]
+    second = tradeoff(settings_of_run, plan)
+    assert calls == ["a", "b", "lost", "lost"] and second.sittings == 2
+    assert second.points[:2] == first.points[:2]
     assert all(json.loads(line) for line in journal.read_text().splitlines())
 
 
 def test_runs_of_other_rules_do_not_mix(small, tmp_path):
-    plan = Plan(small, some_views(small, 1), [setting(small)], [])
-    tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+    plan = Plan(small, choose_views(small, 1), [setting(small)], [])
+    tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
     with pytest.raises(SubmissionError, match=r"another rules .*give another --out"):
-        tradeoff(Wish(small.path, tmp_path), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path), plan)
     with pytest.raises(SubmissionError, match="another views"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), Plan(small, some_views(small, 2), [], []))
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), Plan(small, choose_views(small, 2), [], []))
     (tmp_path / JOURNAL).write_text("nonsense\n")
     with pytest.raises(SubmissionError, match="expected what a run of fpp-bench tradeoff left"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
     with exclusive(tmp_path / ".lock", tmp_path, "measuring"), pytest.raises(BuildError, match="another process"):
-        tradeoff(Wish(small.path, tmp_path, quick=True), plan)
+        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
 
 
 def test_files_hold_what_was_measured(small, tmp_path):
@@ -205,12 +204,12 @@ def test_files_hold_what_was_measured(small, tmp_path):
         point("phase-x", 0.2, 1, 9.0),
         point("size-0240", 1, 1, 1, "sizes"),
     ]
-    made = whole(small, points)
-    made = made.model_copy(update={"growth": Tradeoff.model_validate({**made.model_dump(), "growth": growth}).growth})
-    written = {path.name for path in write_report(made, tmp_path)}
+    run = tradeoff_of(small, points)
+    run = run.model_copy(update={"growth": Tradeoff.model_validate({**run.model_dump(), "growth": growth}).growth})
+    written = {path.name for path in write_report(run, tmp_path)}
     pictures = {"tradeoff.png", "tradeoff_measured.png", "sizes.png", "costs.png"}
     assert written == {"tradeoff.json", "tradeoff.csv", "costs.csv", *pictures}
-    assert read_tradeoff(tmp_path / "tradeoff.json") == made
+    assert read_tradeoff(tmp_path / "tradeoff.json") == run
     rows = list(csv.DictReader((tmp_path / "tradeoff.csv").open()))
     assert [row["front_seconds"] for row in rows] == ["true", "false", "false"]
     assert [row["front_frames"] for row in rows] == ["true", "true", "false"]
@@ -225,7 +224,7 @@ def test_the_page_shows_settings_as_text(small):
     hostile = '"><script>hacked=1</script>'
     points = [point("a", 1.0, 10, 2.0), point("b", 0.5, 1, 9.0, group="phase")]
     points[0] = points[0].model_copy(update={"title": hostile})
-    index = page_files([], [], whole(small, points))["index.html"].decode()
+    index = page_files([], [], tradeoff_of(small, points))["index.html"].decode()
     section = re.search(r'<section id="tradeoff">.*?</section>', index, flags=re.DOTALL)[0]
     assert "<script" not in section and "&lt;script&gt;" in section and section.count("<svg") == 2
     assert 'href="#tradeoff"' in index and "time and frames" in section
@@ -237,12 +236,14 @@ def test_types_of_the_decoder(opened):
     sample = opened.samples("test")[0]
     frames = opened.frames(sample, range(len(opened.sequence)))
     for direction in ("vertical", "horizontal"):
-        theirs = ClassicalMethod(opened.rig, direction, 18).predict(frames)
+        packaged = ClassicalMethod(opened.rig, direction, 18).predict(frames)
         double = DecodeInType(opened.rig, direction, 18, "float64").predict(frames)
         single = DecodeInType(opened.rig, direction, 18, "float32").predict(frames)
-        both = (theirs > 0) & (double > 0) & (single > 0)
-        assert both.sum() > 0.99 * (theirs > 0).sum()
-        assert np.abs(theirs - double)[both].max() < 2e-4  # one unit in the last place of the float32 that they end in
+        both = (packaged > 0) & (double > 0) & (single > 0)
+        assert both.sum() > 0.99 * (packaged > 0).sum()
+        assert (
+            np.abs(packaged - double)[both].max() < 2e-4
+        )  # one unit in the last place of the float32 that they end in
         assert 0 < np.abs(single - double)[both].mean() < 0.01
 
 
@@ -255,22 +256,24 @@ def test_the_command_measures_and_feeds_the_page(tiny, tmp_path, capsys, monkeyp
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert "Fronts of object MAE" in printed and "Load of the machine" in printed
-    found = read_tradeoff(out / "tradeoff.json")
-    by_key = {one.key: one for one in found.points}
-    assert len(by_key) == 11 and not any(one.failed for one in found.points)
+    run = read_tradeoff(out / "tradeoff.json")
+    by_key = {point.key: point for point in run.points}
+    assert len(by_key) == 11 and not any(point.failed for point in run.points)
     many, few = by_key["classical-both-18"], by_key["classical-vertical-03"]
     assert (many.frames, few.frames) == (50, 10) and many.measured_mae_mm < few.measured_mae_mm < 2
-    assert many.key in {one.key for one in found.front("frames")}
+    assert many.key in {point.key for point in run.front("frames")}
     page = ["leaderboard", "--page", str(tmp_path / "page"), "--tradeoff", str(out / "tradeoff.json")]
     assert main(page) == 0 and 'id="tradeoff"' in (tmp_path / "page" / "index.html").read_text()
 
 
 def test_sizes_are_photographed_and_scored(tiny):
-    plan = planned(Wish(tiny, tiny, only=("sizes",), quick=True))
-    first, second, third = (one for one in plan.settings if one.views.rig.camera.width == 240)
+    plan = planned(TradeoffSettings(tiny, tiny, only=("sizes",), quick=True))
+    first, second, third = (
+        size_setting for size_setting in plan.settings if size_setting.views.rig.camera.width == 240
+    )
     assert first.title == second.title.replace("vertical", "both").replace("=3", "=18") and third.key.endswith("phase")
-    found = measured(first, QUICK)
-    assert found.image_px == 240 and found.frames == 50 and 0.05 < found.measured_mae_mm < 0.5
+    scored_point = measured(first, QUICK)
+    assert scored_point.image_px == 240 and scored_point.frames == 50 and 0.05 < scored_point.measured_mae_mm < 0.5
 
 
 def test_refusals(small, tiny, tmp_path, capsys):
@@ -289,8 +292,8 @@ def test_refusals(small, tiny, tmp_path, capsys):
 
 def test_settings_without_their_frames_do_not_stop_the_others(small, tmp_path):
     """A dataset of single shots: classical steps are refused one by one, and the run ends well."""
-    wish = Wish(small.path, tmp_path / "out", only=("precision",), quick=True)
-    found = tradeoff(wish, planned(wish))
-    assert [("frame" in one.failed) for one in found.points] == [True, True] and found.front() == []
-    assert {path.name for path in write_report(found, wish.out)} == {"tradeoff.json", "tradeoff.csv"}
-    assert partial(page_files, [], [])(found) == page_files([], [])
+    settings_of_run = TradeoffSettings(small.path, tmp_path / "out", only=("precision",), quick=True)
+    run = tradeoff(settings_of_run, planned(settings_of_run))
+    assert [("frame" in point.failed) for point in run.points] == [True, True] and run.front() == []
+    assert {path.name for path in write_report(run, settings_of_run.out)} == {"tradeoff.json", "tradeoff.csv"}
+    assert partial(page_files, [], [])(run) == page_files([], [])

@@ -8,7 +8,7 @@ from fpp_ml_bench.leaderboard import tradeoff_clock
 from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_figure import draw_growth
 from fpp_ml_bench.leaderboard.tradeoff_growth import fit_power, growth
-from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, Rung, climb
+from fpp_ml_bench.leaderboard.tradeoff_ladder import Ladder, Rung, time_ladder
 from fpp_ml_bench.leaderboard.tradeoff_report import growth_csv
 
 AMOUNTS = [10, 20, 40, 80, 160]
@@ -16,20 +16,20 @@ AMOUNTS = [10, 20, 40, 80, 160]
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
 def test_a_pure_power_is_found_exactly(power):
-    found = fit_power(AMOUNTS, [3e-4 * n**power for n in AMOUNTS])
-    assert found.exponent == pytest.approx(power, abs=1e-9) and found.tail == pytest.approx(power, abs=1e-9)
-    assert found.low == pytest.approx(power, abs=1e-6) and found.high == pytest.approx(power, abs=1e-6)
+    fitted = fit_power(AMOUNTS, [3e-4 * n**power for n in AMOUNTS])
+    assert fitted.exponent == pytest.approx(power, abs=1e-9) and fitted.tail == pytest.approx(power, abs=1e-9)
+    assert fitted.low == pytest.approx(power, abs=1e-6) and fitted.high == pytest.approx(power, abs=1e-6)
 
 
 def test_slope_and_interval_are_those_of_scipys_regression():
     rng = np.random.default_rng(1)
     seconds = 2e-3 * np.array(AMOUNTS) ** 1.4 * np.exp(0.1 * rng.standard_normal(5))
-    found = fit_power(AMOUNTS, list(seconds))
-    theirs = stats.linregress(np.log(AMOUNTS), np.log(seconds))
-    half = stats.t.ppf(0.975, 3) * theirs.stderr
-    assert found.exponent == pytest.approx(theirs.slope)
-    assert (found.low, found.high) == pytest.approx((theirs.slope - half, theirs.slope + half))
-    assert found.tail == pytest.approx(stats.linregress(np.log(AMOUNTS[2:]), np.log(seconds[2:])).slope)
+    fitted = fit_power(AMOUNTS, list(seconds))
+    regression = stats.linregress(np.log(AMOUNTS), np.log(seconds))
+    half = stats.t.ppf(0.975, 3) * regression.stderr
+    assert fitted.exponent == pytest.approx(regression.slope)
+    assert (fitted.low, fitted.high) == pytest.approx((regression.slope - half, regression.slope + half))
+    assert fitted.tail == pytest.approx(stats.linregress(np.log(AMOUNTS[2:]), np.log(seconds[2:])).slope)
 
 
 def test_a_quadratic_shows_and_a_line_does_not():
@@ -47,7 +47,7 @@ def test_a_quadratic_shows_and_a_line_does_not():
 
 
 @pytest.mark.parametrize(
-    "amounts, seconds, said",
+    "amounts, seconds, message",
     [
         ([1, 2], [1, 2], "at least 3"),
         ([1, 2, 3], [1, 2], "at least 3"),
@@ -56,8 +56,8 @@ def test_a_quadratic_shows_and_a_line_does_not():
         ([1, 2, 3], [1, float("nan"), 3], "finite"),
     ],
 )
-def test_what_has_no_power_is_refused(amounts, seconds, said):
-    with pytest.raises(ValueError, match=said):
+def test_what_has_no_power_is_refused(amounts, seconds, message):
+    with pytest.raises(ValueError, match=message):
         fit_power(amounts, seconds)
 
 
@@ -74,10 +74,10 @@ class World:
 
 @pytest.fixture
 def world(monkeypatch):
-    made = World()
-    monkeypatch.setattr(tradeoff_clock, "perf_counter", lambda: made.now)
-    monkeypatch.setattr(tradeoff_clock, "process_time", lambda: made.now)
-    return made
+    clock = World()
+    monkeypatch.setattr(tradeoff_clock, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(tradeoff_clock, "process_time", lambda: clock.now)
+    return clock
 
 
 def quadratic(world, folders):
@@ -94,22 +94,22 @@ def quadratic(world, folders):
     return Ladder("look up", "rows", (4, 8, 16, 32), prepare)
 
 
-def test_climbing_takes_the_least_time_and_flags_a_loop_in_a_loop(world):
+def test_a_ladder_takes_the_least_time_and_flags_a_nested_loop(world):
     folders = []
-    whole, search, rest = climb(quadratic(world, folders))
-    assert whole.stage == "look up" and whole.over == "rows" and whole.amounts == [4, 8, 16, 32]
-    assert whole.seconds == pytest.approx([0.016, 0.064, 0.256, 1.024]) and whole.flag == "steeper than linear"
+    stage, search, rest = time_ladder(quadratic(world, folders))
+    assert stage.stage == "look up" and stage.over == "rows" and stage.amounts == [4, 8, 16, 32]
+    assert stage.seconds == pytest.approx([0.016, 0.064, 0.256, 1.024]) and stage.flag == "steeper than linear"
     assert search.stage == "look up: search" and search.exponent == 2.0 and rest.exponent == 0.0 and rest.flag is None
     assert not any(folder.exists() for folder in folders)
 
 
 def test_parts_are_the_walls_and_are_left_out_of_processor_time(world):
-    assert [one.stage for one in climb(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
+    assert [growth.stage for growth in time_ladder(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
 
 
 def test_csv_of_growth(world, tmp_path):
-    found = climb(quadratic(world, []))
-    lines = growth_csv(found).splitlines()
+    growths = time_ladder(quadratic(world, []))
+    lines = growth_csv(growths).splitlines()
     assert lines[0].startswith("stage,over,amount,seconds,exponent") and len(lines) == 1 + 3 * 4
     assert lines[1] == "look up,rows,4,0.016,2,2,2,2,steeper than linear"
     assert not draw_growth([], tmp_path / "none.png") and not (tmp_path / "none.png").exists()

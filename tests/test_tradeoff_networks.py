@@ -16,7 +16,7 @@ from fpp_ml_bench.leaderboard.tradeoff_clock import Rules
 from fpp_ml_bench.leaderboard.tradeoff_ladders import frame_ladders, pixel_ladders
 from fpp_ml_bench.leaderboard.tradeoff_measure import measured
 from fpp_ml_bench.leaderboard.tradeoff_networks import calibration, network_settings
-from fpp_ml_bench.leaderboard.tradeoff_views import some_views
+from fpp_ml_bench.leaderboard.tradeoff_views import choose_views
 from fpp_ml_bench.rig import paper_rig
 
 SIZE = (32, 48)
@@ -33,7 +33,7 @@ def grey_scene(seed):
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory):
-    return some_views(make_dataset(tmp_path_factory.mktemp("data") / "grey", SIZE, scene=grey_scene), 1)
+    return choose_views(make_dataset(tmp_path_factory.mktemp("data") / "grey", SIZE, scene=grey_scene), 1)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def chosen(views, runs):
 
 
 def of(chosen, *parts):
-    (found,) = (setting for key, setting in chosen.items() if all(part in key for part in parts))
-    return found
+    (setting,) = (setting for key, setting in chosen.items() if all(part in key for part in parts))
+    return setting
 
 
 def test_every_network_in_every_precision(chosen):
@@ -80,8 +80,8 @@ def test_precisions_of_one_network_agree_up_to_their_type(chosen, views):
 
 
 def test_an_oracle_range_is_told_and_a_range_without_heads_is_refused(chosen, views):
-    told = measured(of(chosen, "individual", "oracle-fp32"), QUICK)
-    assert told.given == "depth range" and told.object_mae_mm > 0 and told.parameters > 1000
+    oracle = measured(of(chosen, "individual", "oracle-fp32"), QUICK)
+    assert oracle.given == "depth range" and oracle.object_mae_mm > 0 and oracle.parameters > 1000
     refused = measured(of(chosen, "individual", "predicted-fp32"), QUICK)
     assert "holds no range heads" in refused.failed
 

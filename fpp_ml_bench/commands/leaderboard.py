@@ -1,4 +1,4 @@
-"""``fpp-bench leaderboard``: rank result files, and show the paper's rows beside them."""
+"""``fpp-bench leaderboard``: rank result files, and show the paper's rows apart."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from fpp_ml_bench.evaluation.protocol import METRICS
 
 SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
 EXAMPLES = (
-    "fpp-bench leaderboard result.json other.json",
+    "fpp-bench leaderboard result.json second.json",
     "fpp-bench leaderboard results/ --sort object_rmse_mm --markdown table.md",
     "fpp-bench leaderboard --paper loss",
     "fpp-bench leaderboard --page page",
@@ -31,42 +31,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
         help=f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
     )  # fmt: skip
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables as Markdown too")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the ranking as JSON too")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables as Markdown")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the ranking as JSON")
     parser.add_argument(
         "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
-        help=f"tables the paper reports: {', '.join(_TABLES)} (default: architecture, normalization; alone: all)",
+        help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
     )  # fmt: skip
     parser.add_argument(
         "--page",
         type=Path,
         metavar="DIR",
-        help="write the static page of the shipped rows, or of those given: index.html, one page a submission",
+        help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
     )
     parser.add_argument(
         "--tradeoff", type=Path, metavar="FILE",
-        help="with --page: the tradeoff.json that stands on it (default: the one shipped, with the shipped rows)",
+        help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
     )  # fmt: skip
     parser.add_argument(
         "--readme", type=Path, metavar="FILE",
-        help="make the block between the leaderboard markers of this file anew, from the rows shipped with the package",
+        help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
     )  # fmt: skip
     parser.add_argument(
         "--check",
         action="store_true",
-        help="with --readme: only tell; exit status 1 when the block is not what rows give",
+        help="with --readme: write nothing; exit status 1 when the block is not up to date",
     )
     parser.add_argument(
-        "--row", type=Path, metavar="FILE", help="write the one result given as a row file for the page"
+        "--row", type=Path, metavar="FILE", help="write the given result as a row file for the leaderboard"
     )
     parser.add_argument(
         "--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
-        help=f"who stands for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
+        help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
     )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what was asked for and print the tables. Raises SubmissionError naming a file that is no sound result."""
+    """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
     from fpp_ml_bench.evaluation.console import output_width, show
     from fpp_ml_bench.leaderboard.export import markdown, table_json
     from fpp_ml_bench.leaderboard.page import write_page
@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.manifest import write_atomically
 
     if args.check and args.readme is None:
-        raise SubmissionError("--check asks about a README; give it with --readme FILE")
+        raise SubmissionError("--check checks a README; give it with --readme FILE")
     if args.tradeoff is not None and args.page is None:
-        raise SubmissionError("--tradeoff puts settings on a page; give it with --page DIR")
+        raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
     if args.readme is not None:
         return _readme(args)
     if args.row is not None:
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         write_row(read_entry(args.results[0]), args.provenance, args.row)
         print(f"{args.row}: {args.provenance}")
         return 0
-    # What gets published holds the shipped rows or what was named, never a result that happens to lie about.
+    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
     unnamed = shipped_rows() if args.page is not None else discover(Path.cwd())
     files = expand(args.results) if args.results else unnamed
     entries = read_entries(files)
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _readme(args: argparse.Namespace) -> int:
-    """Make or check README's block from the shipped rows: results lying about must not get into it."""
+    """Write or check README's block from the shipped rows or the named files, never from the current folder."""
     from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
     from fpp_ml_bench.leaderboard.readme_block import update_readme
 
@@ -122,10 +122,10 @@ def _readme(args: argparse.Namespace) -> int:
     same = update_readme(args.readme, rank(entries), args.check)
     if args.check and not same:
         print(
-            f"{args.readme}: the ranking is not what the rows give; don't edit it by hand, run: "
+            f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
             f"fpp-bench leaderboard --readme {args.readme}",
             file=sys.stderr,
         )
         return 1
-    print(f"{args.readme}: {'the ranking is what the rows give' if same else 'written'}")
+    print(f"{args.readme}: {'the ranking is up to date with the rows' if same else 'written'}")
     return 0

@@ -23,9 +23,9 @@ _SIGNS = {"new": "+", "changed": "~", "deleted": "-", "unchanged": " "}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    what = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
+    kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
 
-    dataset = _part(what, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
+    dataset = _part(kinds, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
     dataset.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
     dataset.add_argument("--private", action="store_true", help="make the repository private if it is new")
     dataset.add_argument("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
@@ -33,19 +33,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--staging",
         type=Path,
         metavar="DIR",
-        help="put the files together here, keep them and continue from them (default: a temporary folder)",
+        help="put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
     )
 
-    page = _part(what, "leaderboard", "the leaderboard's page as a static Space")
+    page = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
     page.add_argument(
         "results", type=Path, nargs="*", metavar="RESULT.json",
         help="result or row files, or folders of them (default: the rows shipped with the package)",
     )  # fmt: skip
-    page.add_argument("--page", type=Path, metavar="DIR", help="a page written before, instead of results")
+    page.add_argument("--page", type=Path, metavar="DIR", help="an existing page instead of results")
     page.add_argument("--private", action="store_true", help="make the Space private if it is new")
     page.add_argument("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")
 
-    results = _part(what, "results", "results as .eval_results/*.yaml of a model's repository", adopt=False)
+    results = _part(kinds, "results", "results as .eval_results/*.yaml of a model's repository", adopt=False)
     results.add_argument("results", type=Path, nargs="+", metavar="RESULT.json", help="result files of fpp-eval")
     results.add_argument(
         "--dataset-repo", required=True, metavar="OWNER/NAME", help="published dataset that the results were scored on"
@@ -53,19 +53,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     results.add_argument("--source-url", metavar="URL", help="https address where the results come from")
 
 
-def _part(what: "argparse._SubParsersAction", name: str, summary: str, adopt: bool = True) -> argparse.ArgumentParser:
-    part: argparse.ArgumentParser = what.add_parser(
+def _part(kinds: "argparse._SubParsersAction", name: str, summary: str, adopt: bool = True) -> argparse.ArgumentParser:
+    part: argparse.ArgumentParser = kinds.add_parser(
         name, help=summary, description=f"Publish {summary}.", allow_abbrev=False
     )
     part.add_argument("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
     part.add_argument("--dry-run", action="store_true", help="print what would change and send nothing")
     if adopt:
-        part.add_argument("--adopt", action="store_true", help="publish into a repository that was filled otherwise")
+        part.add_argument(
+            "--adopt", action="store_true", help="publish into a repository that was not filled by this command"
+        )
     return part
 
 
 def run(args: argparse.Namespace) -> int:
-    """Publish. Raises FppBenchError for what can't be published, and for whatever the Hub or the network refuses."""
+    """Publish. Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
     from fpp_ml_bench.leaderboard.publish_hub import Hub, check_repo_name
 
     check_repo_name(args.repo)
@@ -106,11 +108,11 @@ def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
     from fpp_ml_bench.leaderboard.publish_page import stage_page, write_page_of
 
     if args.page is not None and args.results:
-        raise PublishError("expected result files or --page, got both: the page is made from the results, or given")
-    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as made:
+        raise PublishError("expected result files or --page, got both; give one of them")
+    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
         if args.page is None:
-            write_page_of(args.results, Path(made))
-        publication = stage_page(args.page or Path(made), args.repo, Path(folder), args.dataset_repo)
+            write_page_of(args.results, Path(written))
+        publication = stage_page(args.page or Path(written), args.repo, Path(folder), args.dataset_repo)
         return _carry_out(args, hub, publication, _remote(args, hub, "space"))
 
 
@@ -120,17 +122,17 @@ def _results(args: argparse.Namespace, hub: "Hub") -> int:
     from fpp_ml_bench.leaderboard.publish_results import stage_results
 
     remote = _remote(args, hub, "model")
-    there = hub.state("dataset", args.dataset_repo)
-    published = hub.mark("dataset", args.dataset_repo, there)
+    dataset = hub.state("dataset", args.dataset_repo)
+    published = hub.mark("dataset", args.dataset_repo, dataset)
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
         publication = stage_results(
-            args.results, args.repo, args.dataset_repo, published, there.commit or "", Path(folder), args.source_url
+            args.results, args.repo, args.dataset_repo, published, dataset.commit or "", Path(folder), args.source_url
         )
         return _carry_out(args, hub, publication, remote)
 
 
 def _remote(args: argparse.Namespace, hub: "Hub", kind: str) -> "Remote":
-    """The repository as it stands, once token, owner and visibility are known to allow what was asked for."""
+    """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if args.dry_run else hub.check_token()
     remote = hub.state(kind, args.repo)  # type: ignore[arg-type]
     if not remote.exists and kind == "model":
@@ -143,7 +145,7 @@ def _remote(args: argparse.Namespace, hub: "Hub", kind: str) -> "Remote":
 
 
 def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication", remote: "Remote") -> int:
-    """Print what changes and, unless it is a dry run or nothing does, send it."""
+    """Print what changes and send it, unless nothing changes or this is a dry run."""
     from fpp_ml_bench.commands.console import progress_bar
     from fpp_ml_bench.leaderboard.publish import changes, check_replaceable
 
@@ -151,7 +153,7 @@ def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication",
     planned = changes(publication, remote)
     _show(args, hub, publication, remote, planned)
     if all(change.status == "unchanged" for change in planned):
-        print("Nothing to send: the Hub has it all.")
+        print("Nothing to send: the Hub has all files.")
         return 0
     if args.dry_run:
         print("Dry run: nothing was sent.")
@@ -170,10 +172,10 @@ def _show(
     from fpp_ml_bench.evaluation.text import printable
 
     if remote.exists:
-        there = "private" if remote.private else "public"
+        visibility = "private" if remote.private else "public"
     else:
-        there = "new, private" if getattr(args, "private", False) else "new, public"
-    print(f"{publication.kind} {hub.url(publication.kind, publication.repo)} ({there})")
+        visibility = "new, private" if getattr(args, "private", False) else "new, public"
+    print(f"{publication.kind} {hub.url(publication.kind, publication.repo)} ({visibility})")
     for change in planned:
         size = gigabytes(change.bytes)
         print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")

@@ -11,11 +11,11 @@ from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
 if TYPE_CHECKING:
     from fpp_ml_bench.leaderboard.reproduce_plan import Folders
 
-SUMMARY = "Train, predict, time and score the rows of the paper's tables, and set them beside its numbers."
+SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
 EXAMPLES = (
     "fpp-bench reproduce --list",
     "fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop",
-    "fpp-bench reproduce all --only-missing                 every table; rows that hold are kept",
+    "fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept",
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
@@ -40,15 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
     parser.add_argument(
         "--only-missing", action="store_true",
-        help="keep rows that hold for the dataset and the weights; without it, they are predicted and scored again. "
-        "Finished trainings are kept either way",
+        help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
+        "again. Finished trainings are always kept",
     )  # fmt: skip
     parser.add_argument(
         "--minutes", type=_minutes, metavar="M",
-        help="stop before an epoch that would outlast them, everything saved; exit status 1, the same command goes on",
+        help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
+        "continues",
     )  # fmt: skip
-    parser.add_argument("--anyway", action="store_true", help="train preset paper without a GPU all the same")
-    parser.add_argument("--list", action="store_true", help="show rows, recipes and what is done, and stop")
+    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
+    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
 
 
 def _minutes(text: str) -> float:
@@ -62,7 +63,7 @@ def _minutes(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what is missing, print the tables. Raises FppBenchError where something can't be done or a training failed."""
+    """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
     from fpp_ml_bench.commands import CHECK_FAILED
     from fpp_ml_bench.errors import RecipeError, TrainingError
     from fpp_ml_bench.evaluation.console import show
@@ -75,30 +76,32 @@ def run(args: argparse.Namespace) -> int:
         return _list(tables, folders)
     if args.table is None:
         raise RecipeError(f"expected a table: {', '.join(PAPER_TABLES)} or {ALL}; --list shows their rows")
-    from fpp_ml_bench.leaderboard.reproduce import Wish, reproduce
+    from fpp_ml_bench.leaderboard.reproduce import ReproduceSettings, reproduce
     from fpp_ml_bench.leaderboard.reproduce_lines import table_lines
     from fpp_ml_bench.leaderboard.reproduce_order import orderings
-    from fpp_ml_bench.leaderboard.reproduce_table import orderings_said, table_rich
+    from fpp_ml_bench.leaderboard.reproduce_table import orderings_sentence, table_rich
 
     command = _command(args)
     outcome = reproduce(
-        Wish(tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, say=_say)
+        ReproduceSettings(
+            tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, report=_report
+        )
     )
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = table_lines(table, outcome.jobs, folders, outcome.opened)
-        show(table_rich(table, lines, args.preset), orderings_said(orderings(lines)))
+        show(table_rich(table, lines, args.preset), orderings_sentence(orderings(lines)))
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
         raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
     if outcome.stopped is not None:
-        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Go on with: {command}")
+        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Continue with: {command}")
         return CHECK_FAILED
     return 0
 
 
-def _say(line: str) -> None:
-    """On stderr, where the engine's progress is; with the time, for a run of hours is read afterwards."""
+def _report(line: str) -> None:
+    """Print a line with the time on stderr, where the engine's progress is too."""
     import sys
     from datetime import datetime
 
@@ -106,7 +109,7 @@ def _say(line: str) -> None:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command that goes on where this one stops, keeping what it has done."""
+    """The command that continues where this run stops, keeping its results."""
     words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
     for option, value in (("--data", args.data), ("--rows", args.rows)):
         words += [] if value is None else [option, str(value)]
@@ -125,17 +128,17 @@ def _list(tables: "tuple[str, ...]", folders: "Folders") -> int:
     from fpp_ml_bench.leaderboard.reproduce_training import state_of
 
     jobs = planned(tables, folders.preset)
-    shown = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     for title in ("Row", "Training", "State", "Rows written"):
-        shown.add_column(title, overflow="fold")
+        table.add_column(title, overflow="fold")
     for job in jobs:
-        wanted = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
-        shown.add_row(
+        row_files = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
+        table.add_row(
             "\n".join(place.recipe_name for place in job.places),
             job.recipe.name,
             state_of(folders.training(job.recipe)),
-            f"{sum(path.is_file() for path in wanted)} of {len(wanted)}",
+            f"{sum(path.is_file() for path in row_files)} of {len(row_files)}",
         )
-    show(shown)
+    show(table)
     print(f"{len(jobs)} trainings fill {sum(len(job.places) for job in jobs)} rows.")
     return 0

@@ -1,11 +1,11 @@
-"""``fpp-bench tradeoff``: error against run time and captures, and what each stage costs as its input grows."""
+"""``fpp-bench tradeoff``: error against run time and captured frames, and what each stage costs as its input grows."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.leaderboard.tradeoff import Plan, Wish
+    from fpp_ml_bench.leaderboard.tradeoff import Plan, TradeoffSettings
 
 SUMMARY = "Error against run time and frames for every method and setting on this machine, and how each cost grows."
 EXAMPLES = (
@@ -22,21 +22,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
     parser.add_argument(
         "--out", type=Path, default=Path("tradeoff"), metavar="DIR",
-        help="folder for the results, or of a stopped run to go on with (default: tradeoff)",
+        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
     )  # fmt: skip
     parser.add_argument(
         "--only", action="append", choices=_GROUPS, default=[], metavar="GROUP",
-        help=f"this group alone, may be given again: {', '.join(_GROUPS)} (default: all)",
+        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="fewer settings, views, runs and sizes")
-    parser.add_argument("--list", action="store_true", help="show what would be measured, measure nothing")
+    parser.add_argument("--list", action="store_true", help="show what would be measured, and stop")
     parser.add_argument("--threads", type=_count, default=1, metavar="N", help="threads a method may use (default: 1)")
     parser.add_argument(
         "--clock", choices=("wall", "processor"), default="wall",
-        help="processor: time that this process got, for a machine that others use too (default: wall)",
+        help="processor: processor time of this process, for a shared machine (default: wall)",
     )  # fmt: skip
     parser.add_argument("--views", type=_count, metavar="N", help="views of each test object (default: 2, quick: 1)")
-    parser.add_argument("--runs", type=Path, metavar="DIR", help="measure the networks trained below DIR too")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
     parser.add_argument(
         "--widths", type=_count, nargs="*", metavar="W",
         help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)",
@@ -50,42 +50,42 @@ def _count(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure what is missing, write everything, print fronts, growths and what to know of them."""
+    """Measure what is missing, write all files, print fronts, growths and remarks."""
     from fpp_ml_bench.linear_algebra import limit_threads
 
     limit_threads(args.threads)
     from fpp_ml_bench.commands.console import progress_bar
     from fpp_ml_bench.evaluation.console import show
-    from fpp_ml_bench.leaderboard.tradeoff import Wish, planned, tradeoff
+    from fpp_ml_bench.leaderboard.tradeoff import TradeoffSettings, planned, tradeoff
     from fpp_ml_bench.leaderboard.tradeoff_report import front_table, growth_table, remarks, write_report
 
-    wish = Wish(
+    settings = TradeoffSettings(
         args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock, args.views, args.runs,
         args.widths,
     )  # fmt: skip
-    plan = planned(wish)
+    plan = planned(settings)
     if args.list:
-        return _list(wish, plan)
+        return _list(settings, plan)
     with progress_bar("measuring", len(plan), "settings") as advance:
-        found = tradeoff(wish, plan, lambda key: advance(1))
-    written = write_report(found, args.out)
-    if found.points:
-        show(front_table(found))
-    if found.growth:
-        show(growth_table(found.growth))
-    for line in remarks(found):
+        measurements = tradeoff(settings, plan, lambda key: advance(1))
+    written = write_report(measurements, args.out)
+    if measurements.points:
+        show(front_table(measurements))
+    if measurements.growth:
+        show(growth_table(measurements.growth))
+    for line in remarks(measurements):
         print(line)
     for path in written:
         print(f"Written: {path}")
     return 0
 
 
-def _list(wish: "Wish", plan: "Plan") -> int:
+def _list(settings: "TradeoffSettings", plan: "Plan") -> int:
     from rich.table import Table
 
     from fpp_ml_bench.evaluation.console import show
 
-    table = Table(title=f"{wish.dataset}: {len(plan.views.names)} views", title_justify="left")
+    table = Table(title=f"{settings.dataset}: {len(plan.views.names)} views", title_justify="left")
     for title in ("Group", "Setting", "Note"):
         table.add_column(title, overflow="fold")
     for setting in plan.settings:
