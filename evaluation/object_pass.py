@@ -1,8 +1,4 @@
-"""The first pass over a sample: the object's errors picked out, the background's summed. NumPy, or compiled.
-
-Both give the same numbers to a few units in the last place; which one runs is the caller's choice, because importing
-numba takes as long as scoring a hundred samples with NumPy.
-"""
+"""The first pass over a sample: the errors of the object's pixels, and the statistics of the background's."""
 
 from typing import Any, NamedTuple
 
@@ -11,13 +7,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import error_stats
-from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish, stats_of
+from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish
 from fpp_ml_bench.pixel_sets import object_mask
 
-COMPILED_FROM_SAMPLES = 400
-"""From this many samples on the compiled pass earns its import back (960 px, `benchmarks/eval_speed.py`)."""
 _BLOCKS_AT_ONCE = 8
-_COMPILED_DTYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
 
 class ObjectErrors(NamedTuple):
@@ -31,17 +24,13 @@ class ObjectErrors(NamedTuple):
 
 
 @np.errstate(over="ignore")  # an overflow is no warning here: `finish` refuses it
-def object_errors(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> ObjectErrors:
+def object_errors(prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]]) -> ObjectErrors:
     """Split a sample into its object and its background (paper Section 5.3.2).
 
     ``prediction_mm`` and ``target_mm`` (H, W) real floats in mm. Raises PredictionError for shapes that differ, dtypes
     that are not real floats, and errors that are not finite.
     """
     prediction, target = _flat(prediction_mm, target_mm)
-    if compiled and compilable(prediction, target):
-        return _compiled(prediction, target)
     index = np.flatnonzero(object_mask(target))
     measured = prediction.take(index)
     errors = measured.astype(np.float64)
@@ -49,31 +38,6 @@ def object_errors(
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
     return ObjectErrors(index, errors, measured <= 0, _background_stats(prediction, target, index))
-
-
-@np.errstate(over="ignore")
-def headline_stats(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> tuple[ErrorStats, ErrorStats]:
-    """Statistics of the object and of the background alone. Arguments and errors as `object_errors`."""
-    prediction, target = _flat(prediction_mm, target_mm)
-    if not (compiled and compilable(prediction, target)):
-        found = object_errors(prediction_mm, target_mm)
-        return stats_of(found.errors), found.background
-    from fpp_ml_bench.evaluation.object_kernel import headline_pass
-
-    sums = np.empty((-(-prediction.size // error_stats.BLOCK), 4))
-    inside = headline_pass(prediction, target, error_stats.BLOCK, sums)
-    absolute, squares, outside, outside_squares = sums.T.tolist()
-    return (
-        finish(inside, absolute, squares, lambda: _errors(prediction, target, object_mask(target))),
-        finish(prediction.size - inside, outside, outside_squares, lambda: _background(prediction, target)),
-    )
-
-
-def compilable(*images: NDArray[np.floating[Any]]) -> bool:
-    """Whether the compiled passes take these dtypes: not float16, and not another byte order."""
-    return all(image.dtype in _COMPILED_DTYPES for image in images)
 
 
 def _flat(
@@ -88,29 +52,9 @@ def _flat(
     return prediction_mm.ravel(), target_mm.ravel()
 
 
-def _compiled(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> ObjectErrors:
-    from fpp_ml_bench.evaluation.object_kernel import object_pass
-
-    size, block = prediction.size, error_stats.BLOCK
-    index, errors, missing = np.empty(size, np.intp), np.empty(size), np.empty(size, np.bool_)
-    blocks = -(-size // block)
-    absolute, squares = np.zeros(blocks), np.zeros(blocks)
-    found = object_pass(prediction, target, block, index, errors, missing, absolute, squares)
-    errors = errors[:found]
-    if not np.isfinite(errors).all():
-        raise PredictionError(NOT_FINITE)
-    background = finish(size - found, absolute.tolist(), squares.tolist(), lambda: _background(prediction, target))
-    return ObjectErrors(index[:found], errors, missing[:found], background)
-
-
-def _errors(
-    prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]], where: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    return prediction[where].astype(np.float64) - target[where]
-
-
 def _background(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    return _errors(prediction, target, ~object_mask(target))
+    outside = ~object_mask(target)
+    return prediction[outside].astype(np.float64) - target[outside]
 
 
 def _background_stats(

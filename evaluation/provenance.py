@@ -15,8 +15,8 @@ from fpp_ml_bench.hardware import describe_hardware
 
 _HERE = Path(__file__).resolve().parent
 _SCORING = (
-    "error_stats.py", "object_pass.py", "object_kernel.py", "predictions.py", "protocol.py", "scores.py", "scoring.py",
-    "summary.py", "uncertainty.py", "units.py",
+    "error_stats.py", "object_pass.py", "predictions.py", "protocol.py", "scores.py", "scoring.py", "summary.py",
+    "uncertainty.py", "units.py",
 )  # fmt: skip
 _COMMIT = re.compile(r"[0-9a-f]{40,64}")
 

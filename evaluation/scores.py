@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.evaluation.error_stats import EMPTY as EMPTY
 from fpp_ml_bench.evaluation.error_stats import ErrorStats, combine, mean_of, stats_of
-from fpp_ml_bench.evaluation.object_pass import ObjectErrors, headline_stats, object_errors
+from fpp_ml_bench.evaluation.object_pass import ObjectErrors, object_errors
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN, WITHIN_MM
 from fpp_ml_bench.pixel_sets import object_near_edges
 
@@ -134,13 +134,11 @@ def score_sample(
     prediction_mm: NDArray[np.floating[Any]],
     target_mm: NDArray[np.floating[Any]],
     edge_band_px: int = EDGE_BAND_PX,
-    compiled: bool = False,
 ) -> SampleScores:
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
     sets after paper Section 5.3.2 (`fpp_ml_bench.pixel_sets`): object where the target is above 0, else background.
-    ``compiled`` takes the numba pass over the image; the numbers agree to a few units in the last place.
 
     Raises PredictionError for shapes that differ, dtypes that are not real floats, and errors that are not finite.
 
@@ -149,7 +147,7 @@ def score_sample(
     >>> score_sample(target + 2.0, target).overall
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
-    found = object_errors(prediction_mm, target_mm, compiled)
+    found = object_errors(prediction_mm, target_mm)
     if not found.pixels.size:
         return SampleScores(found.background, {}, Distribution())
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
@@ -159,17 +157,6 @@ def score_sample(
     present = np.flatnonzero(np.bincount(zone)).tolist()
     zones = {code: stats_of(found.errors[zone == code]) for code in present}
     return SampleScores(found.background, zones, _distribution(found))
-
-
-def headline_scores(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> tuple[ErrorStats, ErrorStats, ErrorStats]:
-    """Overall, object and background of one sample alone: the six headline numbers, without zones and distribution.
-
-    Arguments and errors as `score_sample`.
-    """
-    inside, outside = headline_stats(prediction_mm, target_mm, compiled)
-    return combine(inside, outside), inside, outside
 
 
 def _distribution(found: ObjectErrors) -> Distribution:

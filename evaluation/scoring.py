@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.listing import Listing
-from fpp_ml_bench.evaluation.object_pass import COMPILED_FROM_SAMPLES
 from fpp_ml_bench.evaluation.predictions import value_problems
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.reading import reader_for
@@ -48,7 +47,6 @@ def scored(
 
     Work begins with this call, in threads, and not only when the first result is asked for.
     """
-    compiled = _compiled(len(listing.present))
     read = reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
     memory, looking_up = local(), Lock()
 
@@ -65,7 +63,7 @@ def scored(
             problems = value_problems(values, target, high, rules.units)
             if not problems:
                 pair = scored_pair(values, target, rules.units, rules.mode, sample)
-                scores = score_sample(*pair, rules.edge_band_px, compiled)
+                scores = score_sample(*pair, rules.edge_band_px)
         except PredictionError as error:
             problems = [str(error)]
         with looking_up:
@@ -92,9 +90,3 @@ def _results(pool: ThreadPoolExecutor, waiting: list[Future[Found]]) -> Iterator
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _compiled(samples: int) -> bool:
-    from fpp_ml_bench.acceleration import numba_enabled
-
-    return samples >= COMPILED_FROM_SAMPLES and numba_enabled()

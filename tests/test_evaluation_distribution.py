@@ -1,4 +1,4 @@
-"""Every score against an independent float128 reference, the identity of the three sets, and the compiled kernels."""
+"""Every score against an independent float128 reference, and the identity of the three sets."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.acceleration import numba_enabled
 from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED
-from fpp_ml_bench.evaluation.scores import headline_scores, score_sample
+from fpp_ml_bench.evaluation.scores import score_sample
 
 LONG = np.longdouble
 
@@ -98,11 +97,11 @@ def cases(draw):
     return np.asarray(prediction, order=draw(st.sampled_from("CF"))), target, draw(st.sampled_from([0, 1, 3, 8, 50]))
 
 
-@given(cases(), st.booleans())
+@given(cases())
 @settings(max_examples=200, deadline=None)
-def test_every_score_agrees_with_float128_to_1e_minus_10(case, compiled):
+def test_every_score_agrees_with_float128_to_1e_minus_10(case):
     prediction, target, band = case
-    found = score_sample(prediction, target, band, compiled and numba_enabled()).metrics()
+    found = score_sample(prediction, target, band).metrics()
     expected = reference(prediction, target, band)
     assert set(found) == set(expected) == set(METRICS)
     scale = float(expected["object_mae_mm"] or 0)
@@ -123,35 +122,6 @@ def test_identity_of_the_three_sets(case):
     share = np.count_nonzero(target > 0) / target.size
     composed = share * (found["object_mae_mm"] or 0.0) + (1 - share) * (found["background_mae_mm"] or 0.0)
     assert found["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
-
-
-@pytest.mark.skipif(not numba_enabled(), reason="numba is switched off")
-@pytest.mark.parametrize("kinds", [("f4", "f4"), ("f8", "f4"), ("f2", "f4"), (">f4", "<f4")])
-@pytest.mark.parametrize("size", [(3, 5), (97, 103), (240, 250)])
-def test_compiled_passes_give_the_same_numbers(kinds, size):
-    rng = np.random.default_rng(3)
-    target = disk_depth(size, 4).astype(kinds[1])
-    prediction = ((target + rng.normal(0, 3, size)) * (rng.random(size) < 0.9)).astype(kinds[0])
-    plain, compiled = (score_sample(prediction, target, compiled=flag).metrics() for flag in (False, True))
-    for key, value in plain.items():
-        assert compiled[key] == (value if value is None else pytest.approx(value, rel=1e-13, abs=1e-13)), key
-    for flag in (False, True):
-        overall, inside, outside = headline_scores(prediction, target, compiled=flag)
-        for name, stats in (("overall", overall), ("object", inside), ("background", outside)):
-            assert stats.mae_mm == pytest.approx(plain[f"{name}_mae_mm"], rel=1e-13)
-            assert stats.rmse_mm == pytest.approx(plain[f"{name}_rmse_mm"], rel=1e-13)
-
-
-def test_compiled_passes_refuse_what_numpy_refuses():
-    from fpp_ml_bench.errors import PredictionError
-
-    target = disk_depth((20, 20), 0)
-    for row, column in (np.argwhere(target > 0)[0], np.argwhere(target == 0)[0]):
-        prediction = target.copy()
-        prediction[row, column] = np.nan
-        for score in (score_sample, headline_scores):
-            with pytest.raises(PredictionError, match="finite"):
-                score(prediction, target, compiled=numba_enabled())
 
 
 def test_closed_forms_of_the_distribution():

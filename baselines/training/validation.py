@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.training.pairs import spread
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.scores import headline_scores
+from fpp_ml_bench.evaluation.scores import score_sample
 from fpp_ml_bench.evaluation.units import scored_pair
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 from fpp_ml_bench.normalisation import Normalisation
@@ -73,10 +73,8 @@ def validate(
                 sample = data.samples[row]
                 if not np.isfinite(value).all():
                     raise TrainingError(f"{out}: the network's answer to {sample} is not finite; it has diverged")
-                overall, inside, outside = headline_scores(
-                    *scored_pair(value, data.source.depth_mm(sample), units, mode, sample)
-                )
-                rows.append((loss, *_plain(inside.mae_mm, outside.mae_mm, overall.mae_mm)))
+                scores = score_sample(*scored_pair(value, data.source.depth_mm(sample), units, mode, sample))
+                rows.append((loss, *_plain(scores.object.mae_mm, scores.background.mae_mm, scores.overall.mae_mm)))
     return Validated(rows)
 
 
