@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from conftest import TINY_SIZE
 
 from fpp_ml_bench.baselines.model import load
