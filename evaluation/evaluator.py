@@ -161,8 +161,10 @@ def _result(
 ) -> "Result":
     from fpp_ml_bench.evaluation.provenance import environment
     from fpp_ml_bench.evaluation.result import result_from_rows
+    from fpp_ml_bench.loaders.benchmark import benchmark_of
 
     height, width = dataset.size
+    benchmark = benchmark_of(dataset.fingerprint)
     return result_from_rows(
         [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
         protocol_version=PROTOCOL_VERSION,
@@ -171,6 +173,7 @@ def _result(
         dataset={
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "fingerprint": dataset.fingerprint,
+            "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
             "split": split,
             "size": [height, width],
             "samples": len(rows),

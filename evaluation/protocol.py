@@ -7,8 +7,9 @@ A change that can move any number in a result raises `PROTOCOL_VERSION`; a chang
 from typing import Literal, get_args
 
 PROTOCOL_VERSION = "1.1.0"
-SchemaVersion = Literal["2.0.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.0.0"
+SchemaVersion = Literal["2.0.0", "2.1.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.1.0"
+"""What is written. 2.1.0 adds the optional ``dataset.benchmark``; files of every `SchemaVersion` are read."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]

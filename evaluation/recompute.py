@@ -8,6 +8,7 @@ from fpp_ml_bench.evaluation.evaluator import ScoredDataset, evaluate
 from fpp_ml_bench.evaluation.protocol import METRICS, PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.result_checks import same
+from fpp_ml_bench.evaluation.result_models import dataset_identity
 from fpp_ml_bench.evaluation.text import printable
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
@@ -27,8 +28,8 @@ def differences(result: Result, folder: Path, dataset: ScoredDataset) -> list[st
         )
     if result.dataset.fingerprint != dataset.fingerprint:
         return [
-            f"dataset.fingerprint: {result.dataset.fingerprint[:16]} in the result, {dataset.fingerprint[:16]} is what "
-            f"{printable(str(dataset.path), 200)} has"
+            f"dataset.fingerprint: {_shown(result.dataset.identity)} in the result, "
+            f"{dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
         ]
     again = evaluate(folder, dataset, result.dataset.split, result.target, result.edge_band_px, result.mode)
     problems = [

@@ -143,7 +143,7 @@ def report_body(result: Result, panels: list[str]) -> str:
     taken = submission.seconds_per_sample
     time = "unknown time" if taken is None else f"{seconds(taken)} s a sample ({submission.seconds_source})"
     lines = [
-        f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
+        f"{about.split} split of {printable(about.name)} ({printable(about.identity)}), {about.samples} samples of "
         f"{about.size[1]} x {about.size[0]} px, against {result.target}, {result.track} track",
         f"{len(submission.frames_used)} frames a sample; {time}; protocol {result.protocol_version}, scored "
         f"{result.created}",

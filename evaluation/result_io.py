@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION
+from fpp_ml_bench.evaluation.protocol import SchemaVersion
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.evaluation.text import printable
@@ -74,10 +74,10 @@ def parse_result(content: Any, path: Path) -> Result:
     """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
     shown = printable(str(path), 500)
     version = content.get("schema_version") if isinstance(content, dict) else None
-    if version != RESULT_SCHEMA_VERSION:
+    if version not in get_args(SchemaVersion):
         came = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
         raise SubmissionError(
-            f"{shown}: expected a result file with schema_version {RESULT_SCHEMA_VERSION}, got {came}; "
+            f"{shown}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {came}; "
             "score the predictions again with this version's fpp-eval"
         )
     result: Result = validate(Result, content, path, "result of fpp-eval")

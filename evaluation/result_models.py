@@ -1,13 +1,14 @@
 """The parts of ``result.json`` as strict models: scores, samples, objects, data, and what was scored with what."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from fpp_ml_bench.evaluation.error_stats import ErrorStats
 from fpp_ml_bench.evaluation.protocol import METRICS
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Share, StrictModel, Text
 from fpp_ml_bench.evaluation.submission import HardwareInfo
+from fpp_ml_bench.loaders import benchmark as benchmarks
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
@@ -107,14 +108,61 @@ class Bootstrap(StrictModel):
     confidence: Annotated[float, Field(gt=0, lt=1)]
 
 
+class BenchmarkInfo(StrictModel):
+    """Name and version of a benchmark; `fpp_ml_bench.loaders.benchmark` lists those that this package knows."""
+
+    name: Text
+    version: Count
+
+
 class DatasetInfo(StrictModel):
-    """What was scored on. ``fingerprint`` identifies the data to the byte; ``name`` is only the folder's name."""
+    """What was scored on. ``fingerprint`` identifies the data to the byte; ``name`` is only the folder's name.
+
+    ``benchmark`` is absent for a dataset that is none of the named benchmarks. Refused is a name and version that this
+    package knows with another fingerprint, and a fingerprint that it knows under another name or version.
+    """
 
     name: Text
     fingerprint: Sha256
+    benchmark: BenchmarkInfo | None = None
     split: Literal["train", "validation", "test", "all"]
     size: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)]
     samples: Annotated[int, Field(gt=0)]
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        if self.benchmark is None:
+            content.pop("benchmark", None)
+        return content
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "DatasetInfo":
+        if self.benchmark is None:
+            return self
+        claim = self.benchmark.name, self.benchmark.version
+        claimed = next((b for b in benchmarks.BENCHMARKS if (b.name, b.version) == claim), None)
+        actual = benchmarks.benchmark_of(self.fingerprint)
+        if claimed != actual:
+            expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""
+            raise ValueError(
+                f"benchmark says {claim[0]} version {claim[1]}, but fingerprint {self.fingerprint[:16]} is "
+                f"{actual.title if actual else 'not that benchmark'}{expected}"
+            )
+        return self
+
+    @property
+    def identity(self) -> str:
+        """What identifies the data, for people: fingerprint, and name and version of the benchmark."""
+        if self.benchmark is None:
+            return dataset_identity(self.fingerprint)
+        return f"{self.benchmark.name} version {self.benchmark.version}, fingerprint {self.fingerprint[:8]}"
+
+
+def dataset_identity(fingerprint: str) -> str:
+    """`DatasetInfo.identity` of a dataset with this fingerprint."""
+    benchmark = benchmarks.benchmark_of(fingerprint)
+    return f"{benchmark.title if benchmark else 'no named benchmark'}, fingerprint {fingerprint[:8]}"
 
 
 class Environment(StrictModel):

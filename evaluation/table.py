@@ -24,7 +24,7 @@ def _title(result: Result) -> Text:
     about = result.dataset
     return Text(
         f"\n{printable(result.submission.name)}\n"
-        f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
+        f"{about.split} split of {printable(about.name)} ({printable(about.identity)}),\n{about.samples} samples of "
         f"{about.size[1]}x{about.size[0]} px, against {result.target}, {result.track} track"
         f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )

@@ -105,6 +105,11 @@ def _run(args: argparse.Namespace) -> int:
     for written in (args.json, args.report):
         if written is not None:
             print(f"Written: {written}")
+    from fpp_ml_bench.loaders.benchmark import benchmark_sentence
+
+    has_expected_bytes, sentence = benchmark_sentence(dataset.manifest)
+    if not has_expected_bytes:
+        print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
     if args.explain or args.explain_json:
         from fpp_ml_bench.evaluation.explain_eval import explain_eval
 
