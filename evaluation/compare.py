@@ -1,6 +1,7 @@
-"""Two results of the same samples, sample by sample: the paired difference, how sure it is, and what that means.
+"""Two results of the same samples, sample by sample: the paired difference, its interval, and a sentence about it.
 
-Pairing takes out what both methods find hard. It can therefore tell two methods apart whose own intervals overlap.
+Samples that are hard for both methods cancel in the difference. A comparison can therefore tell two methods apart whose
+own intervals overlap.
 """
 
 import statistics
@@ -43,13 +44,13 @@ class Difference(StrictModel):
 
     @property
     def told_apart(self) -> bool:
-        """Whether the interval leaves 0 out."""
+        """Whether 0 is outside the interval."""
         low, high = self.interval_mm
         return low is not None and high is not None and not low <= 0 <= high
 
 
 class Comparison(StrictModel):
-    """``second`` against ``first``: one `Difference` for each headline key, and each sample's own."""
+    """``second`` against ``first``: a `Difference` for each headline key, and the differences of each sample."""
 
     first: Text
     second: Text
@@ -64,7 +65,7 @@ class Comparison(StrictModel):
 
 
 def compare(first: Result, second: Result) -> Comparison:
-    """The paired comparison of two results. SubmissionError, naming all of it, where they are not of the same data."""
+    """The paired comparison of two results. SubmissionError names everything in which their data differ."""
     _check_same_data(first, second)
     second_rows = {row.sample: row for row in second.per_sample}
     paired = [
@@ -144,7 +145,7 @@ def _summary(paired: list[PairedSample], key: str) -> Difference:
 
 
 def sentence(first: str, second: str, difference: Difference) -> str:
-    """What the difference in object MAE means, in words."""
+    """The difference in object MAE as a sentence."""
     if difference.mean_mm is None:
         return "No sample has an object in it, so object MAE says nothing."
     if not difference.lower and not difference.higher:

@@ -1,4 +1,4 @@
-"""The first pass over a sample: the errors of the object's pixels, and the statistics of the background's."""
+"""The first pass over a sample: the errors of the object's pixels, and the error statistics of the background."""
 
 from typing import Any, NamedTuple
 
@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import error_stats
-from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish
+from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, stats_of_sums
 from fpp_ml_bench.pixel_sets import object_mask
 
 _BLOCKS_AT_ONCE = 8
 
 
 class ObjectErrors(NamedTuple):
-    """Where in the flat image the object's n pixels lie, their errors in mm float64 (n,), which of them were
-    not measured (n,), and the statistics of all other pixels."""
+    """The object's n pixels: flat indices (n,), errors in mm float64 (n,), which were not measured (n,); and the
+    error statistics of all other pixels."""
 
     pixels: NDArray[np.intp]
     errors: NDArray[np.float64]
@@ -23,7 +23,7 @@ class ObjectErrors(NamedTuple):
     background: ErrorStats
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: `finish` refuses it
+@np.errstate(over="ignore")  # an overflow is no warning here: `stats_of_sums` refuses it
 def object_errors(prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]]) -> ObjectErrors:
     """Split a sample into its object and its background (paper Section 5.3.2).
 
@@ -32,12 +32,12 @@ def object_errors(prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[n
     """
     prediction, target = _flat(prediction_mm, target_mm)
     index = np.flatnonzero(object_mask(target))
-    measured = prediction.take(index)
-    errors = measured.astype(np.float64)
+    depths = prediction.take(index)
+    errors = depths.astype(np.float64)
     errors -= target.take(index)
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
-    return ObjectErrors(index, errors, measured <= 0, _background_stats(prediction, target, index))
+    return ObjectErrors(index, errors, depths <= 0, _background_stats(prediction, target, index))
 
 
 def _flat(
@@ -62,7 +62,7 @@ def _background_stats(
 ) -> ErrorStats:
     """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
 
-    Not overall minus object: that would leave rounding dust where the background is perfect.
+    Not overall minus object: that would leave rounding errors where the background is perfect.
     """
     pixels = prediction.size - index.size
     if pixels == 0:
@@ -77,14 +77,14 @@ def _background_stats(
     starts = range(0, prediction.size, step)
     cuts = [*np.searchsorted(index, list(starts)).tolist(), index.size]
     for number, start in enumerate(starts):
-        part = flat[: min(step, prediction.size - start)]
-        np.copyto(part, prediction[start : start + step])
+        errors = flat[: min(step, prediction.size - start)]
+        np.copyto(errors, prediction[start : start + step])
         if not target_is_zero:
-            part -= target[start : start + step]
-        part[index[cuts[number] : cuts[number + 1]] - start] = 0.0
-        flat[part.size :] = 0.0
+            errors -= target[start : start + step]
+        errors[index[cuts[number] : cuts[number + 1]] - start] = 0.0
+        flat[errors.size :] = 0.0
         squares += [float(block.dot(block)) for block in buffer]
         if signed:
             np.abs(buffer, out=buffer)
         absolute += buffer.sum(axis=1).tolist()
-    return finish(pixels, absolute, squares, lambda: _background(prediction, target))
+    return stats_of_sums(pixels, absolute, squares, lambda: _background(prediction, target))

@@ -26,7 +26,7 @@ class Headline(StrictModel):
 
 
 class Metrics(Headline):
-    """The headline and what stands beside it: errors in mm, shares of the object's pixels. PROTOCOL.md defines each."""
+    """All scores: errors in mm, shares of the object's pixels. PROTOCOL.md defines each."""
 
     object_interior_mae_mm: NonNegative | None
     object_interior_rmse_mm: NonNegative | None
@@ -71,7 +71,7 @@ class SampleResult(Metrics):
 
 
 class ObjectResult(StrictModel):
-    """One object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
+    """An object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
 
     object: Text
     samples: Annotated[int, Field(gt=0)]
@@ -90,11 +90,11 @@ class Intervals(StrictModel):
     background_rmse_mm: Interval
 
     def __getitem__(self, key: str) -> list[float | None]:
-        found: list[float | None] = getattr(self, key)
-        return found
+        ends: list[float | None] = getattr(self, key)
+        return ends
 
     def of(self, key: str) -> tuple[float, float] | None:
-        """The interval of ``key``; None where there is none (another key than the headline's, too few objects)."""
+        """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
         low, high = getattr(self, key, (None, None))
         return None if low is None or high is None else (low, high)
 
@@ -116,7 +116,7 @@ class BenchmarkInfo(StrictModel):
 
 
 class DatasetInfo(StrictModel):
-    """What was scored on. ``fingerprint`` identifies the data to the byte; ``name`` is only the folder's name.
+    """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
 
     ``benchmark`` is absent for a dataset that is none of the named benchmarks. Refused is a name and version that this
     package knows with another fingerprint, and a fingerprint that it knows under another name or version.
@@ -169,7 +169,7 @@ class Environment(StrictModel):
     """Where and with what the scores were computed (not where the predictions were made: see ``submission``).
 
     ``git`` is the commit of the checkout this package ran from, null for an installed package. ``code_sha256`` covers
-    the source of the scoring itself and so tells an edited checkout from its commit.
+    the source of the scoring, so an edited checkout differs from its commit.
     """
 
     python: Text

@@ -205,7 +205,7 @@ def test_edited_result_is_refused(case, dataset, predictions, tmp_path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ('{"schema_version": "1.0.0", "schema_version": "1.0.0"}', "stands twice"),
+        ('{"schema_version": "1.0.0", "schema_version": "1.0.0"}', "is given twice"),
         ('{"schema_version": NaN}', "NaN is no number"),
         ('{"schema_version": -Infinity}', "-Infinity is no number"),
         ('{"a": ', "is no valid JSON"),
