@@ -55,8 +55,8 @@ def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, caps
     assert result_json(read_result(path)) == path.read_bytes()
     command = [str(tmp_path / "predictions"), "--dataset", str(named.path), "--report", str(tmp_path / "report")]
     assert main(command) == 0
-    shown = capsys.readouterr()
-    assert f"(tiny-bench version 4, fingerprint {named.fingerprint[:8]})" in shown.out and shown.err == ""
+    printed = capsys.readouterr()
+    assert f"(tiny-bench version 4, fingerprint {named.fingerprint[:8]})" in printed.out and printed.err == ""
     assert "tiny-bench version 4" in (tmp_path / "report" / "index.html").read_text()
     assert main(["verify", str(path), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 0
 
@@ -65,8 +65,8 @@ def test_a_result_on_any_other_dataset_has_no_such_key(dataset, tmp_path, capsys
     path = result_file(dataset, tmp_path)
     assert "benchmark" not in json.loads(path.read_text())["dataset"]
     assert main([str(tmp_path / "predictions"), "--dataset", str(dataset.path)]) == 0
-    shown = capsys.readouterr()
-    assert f"(no named benchmark, fingerprint {dataset.fingerprint[:8]})" in shown.out and shown.err == ""
+    printed = capsys.readouterr()
+    assert f"(no named benchmark, fingerprint {dataset.fingerprint[:8]})" in printed.out and printed.err == ""
 
 
 def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_path, monkeypatch, capsys):
@@ -74,9 +74,9 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
     monkeypatch.setattr(benchmarks, "intended_benchmark", lambda manifest: intended)
     folder = write_predictions(tmp_path / "predictions", dataset)
     assert main([str(folder), "--dataset", str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
-    shown = capsys.readouterr()
-    assert shown.err.startswith(f"fpp-eval: warning: {dataset.path}: built with the settings of tiny-bench version 4")
-    assert "warning" not in shown.out and read_result(tmp_path / "r.json").dataset.benchmark is None
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"fpp-eval: warning: {dataset.path}: built with the settings of tiny-bench version 4")
+    assert "warning" not in printed.out and read_result(tmp_path / "r.json").dataset.benchmark is None
 
 
 def test_a_file_of_schema_2_0_0_is_read_and_stays_as_it_is(named, tmp_path):
@@ -121,14 +121,14 @@ def test_a_benchmark_that_this_package_does_not_know_is_taken_as_it_is(named, tm
 
 
 def test_compare_and_verify_name_both_versions(named, tmp_path, capsys):
-    path, other = result_file(named, tmp_path), result_file(named, tmp_path / "other")
-    change_dataset(other, fingerprint="e" * 64, benchmark={"name": "tiny-bench", "version": 5})
-    assert main(["compare", str(path), str(other)]) == 2
+    path, newer = result_file(named, tmp_path), result_file(named, tmp_path / "newer")
+    change_dataset(newer, fingerprint="e" * 64, benchmark={"name": "tiny-bench", "version": 5})
+    assert main(["compare", str(path), str(newer)]) == 2
     expected = f"tiny-bench version 4, fingerprint {named.fingerprint[:8]}"
     assert f"dataset: {expected} against tiny-bench version 5, fingerprint eeeeeeee" in capsys.readouterr().err
-    assert main(["verify", str(other), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 1
-    shown = capsys.readouterr().out
-    assert "tiny-bench version 5, fingerprint eeeeeeee in the result" in shown and f"{expected} is what" in shown
+    assert main(["verify", str(newer), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 1
+    printed = capsys.readouterr().out
+    assert "tiny-bench version 5, fingerprint eeeeeeee in the result" in printed and f"{expected} is what" in printed
 
 
 def test_two_versions_of_one_fingerprint_are_not_compared(named, tmp_path, capsys):
