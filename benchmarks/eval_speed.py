@@ -103,11 +103,11 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
             np.save(predictions / f"{sample}.npy", (depth + noise).astype(np.float32))
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
-        written, about = ShardWriter(
+        written, rows_described = ShardWriter(
             data, data / ".build", plan, PAPER_SEQUENCE, "single_shot", False, (size, size)
         ).write(rows)
         shards += written
-        described += about
+        described += rows_described
     (data / ".build").rmdir()
     Manifest(
         origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=(size, size),
@@ -152,7 +152,7 @@ def main() -> None:
         ]
         metrics = json.loads(Path(result).read_text())["metrics"]
     wall, used = (
-        {name: statistics.median(times[name][place] for times in rounds) for name in commands} for place in (0, 1)
+        {name: statistics.median(times[name][kind] for times in rounds) for name in commands} for kind in (0, 1)
     )
     print(f"{args.samples} samples of {args.size}x{args.size} px, median of {args.repeats} rounds")
     print(f"fpp-eval, every check and score: {wall['fpp-eval']:.2f} s wall, {used['fpp-eval']:.2f} s processor")

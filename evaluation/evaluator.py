@@ -59,7 +59,7 @@ def evaluate(
     score: a command uses it to import what it needs afterwards.
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
-    and DatasetError for a target that is no depth map.
+    and DatasetError for a target that is not a depth map.
     """
     folder = Path(folder)
     samples = _samples(folder, dataset, split, target, mode)

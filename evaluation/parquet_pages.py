@@ -34,7 +34,7 @@ def check_pages(metadata: Any, content: bytes, largest_bytes: int, largest_value
     if total > largest_bytes or values > largest_values:
         raise PredictionError(
             f"would unpack to {total} bytes and {values} values, expected at most {largest_bytes} and "
-            f"{largest_values} for this split; write one float32 map a sample"
+            f"{largest_values} for this split; write one float32 map per sample"
         )
 
 

@@ -20,7 +20,7 @@ _ENCRYPTED = 0x1
 
 
 def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
-    """The one array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_prediction`.
+    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_prediction`.
 
     The array may have any name. The size that the archive declares is checked before a byte is unpacked, and unpacking
     stops at the limit even where the archive declares a wrong size.

@@ -50,7 +50,7 @@ def _check(content: bytes, size: tuple[int, int]) -> None:
         raise PredictionError(f"expected shape {size} (H, W), got ({height}, {width}); predict at that size")
     if bits != 16 or colour != 0 or interlaced:
         raise PredictionError(
-            f"has {bits} bits a channel, colour type {colour}, interlacing {interlaced}; expected 16, 0 and 0: "
+            f"has {bits} bits per channel, colour type {colour}, interlacing {interlaced}; expected 16, 0 and 0: "
             + _ADVICE
         )
     kinds, packed = [], []
@@ -72,18 +72,18 @@ def _check(content: bytes, size: tuple[int, int]) -> None:
 
 
 def _chunks(view: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    place = len(_SIGNATURE)
-    while place < len(view):
-        length = struct.unpack(">I", view[place : place + 4])[0] if len(view) - place >= 12 else len(view)
-        stop = place + 12 + length
+    offset = len(_SIGNATURE)
+    while offset < len(view):
+        length = struct.unpack(">I", view[offset : offset + 4])[0] if len(view) - offset >= 12 else len(view)
+        stop = offset + 12 + length
         if stop > len(view):
             raise PredictionError(f"is cut off; {_ADVICE}")
-        if zlib.crc32(view[place + 4 : stop - 4]) != struct.unpack(">I", view[stop - 4 : stop])[0]:
+        if zlib.crc32(view[offset + 4 : stop - 4]) != struct.unpack(">I", view[stop - 4 : stop])[0]:
             raise PredictionError(f"is damaged, a checksum does not match; {_ADVICE}")
-        kind = bytes(view[place + 4 : place + 8])
-        yield kind, view[place + 8 : stop - 4]
-        place = stop
+        kind = bytes(view[offset + 4 : offset + 8])
+        yield kind, view[offset + 8 : stop - 4]
+        offset = stop
         if kind == b"IEND":
-            if place != len(view):
+            if offset != len(view):
                 raise PredictionError(f"has foreign bytes after the image; {_ADVICE}")
             return

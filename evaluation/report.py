@@ -144,12 +144,12 @@ def report_body(result: Result, panels: list[str]) -> str:
     time = (
         "unknown time"
         if sample_seconds is None
-        else f"{seconds(sample_seconds)} s a sample ({submission.seconds_source})"
+        else f"{seconds(sample_seconds)} s per sample ({submission.seconds_source})"
     )
     lines = [
         f"{info.split} split of {printable(info.name)} ({printable(info.identity)}), {info.samples} samples of "
         f"{info.size[1]} x {info.size[0]} px, against {result.target}, {result.track} track",
-        f"{len(submission.frames_used)} frames a sample; {time}; protocol {result.protocol_version}, scored "
+        f"{len(submission.frames_used)} frames per sample; {time}; protocol {result.protocol_version}, scored "
         f"{result.created}",
     ]
     errors = [row.object_mae_mm for row in result.per_sample if row.object_mae_mm is not None]

@@ -70,12 +70,12 @@ def html_table(
 ) -> str:
     """A table with column and row headers; every cell is text. The first ``text_columns`` are aligned left."""
     head = "".join(
-        f'<th scope="col"{_left(place < text_columns)}>{escaped(title)}</th>' for place, title in enumerate(titles)
+        f'<th scope="col"{_left(column < text_columns)}>{escaped(title)}</th>' for column, title in enumerate(titles)
     )
     body = "".join(
         "<tr>"
         + f'<th scope="row">{escaped(row[0])}</th>'
-        + "".join(f"<td{_left(place < text_columns)}>{escaped(cell)}</td>" for place, cell in enumerate(row[1:], 1))
+        + "".join(f"<td{_left(column < text_columns)}>{escaped(cell)}</td>" for column, cell in enumerate(row[1:], 1))
         + "</tr>\n"
         for row in rows
     )

@@ -118,8 +118,8 @@ class BenchmarkInfo(StrictModel):
 class DatasetInfo(StrictModel):
     """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
 
-    ``benchmark`` is absent for a dataset that is none of the named benchmarks. Refused is a name and version that this
-    package knows with another fingerprint, and a fingerprint that it knows under another name or version.
+    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version that this package knows
+    with another fingerprint, or a fingerprint that it knows under another name or version, is refused.
     """
 
     name: Text

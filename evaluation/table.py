@@ -103,7 +103,7 @@ def _notes(result: Result) -> Text:
         if sample_seconds is None
         else f"{seconds(sample_seconds)} s ({result.submission.seconds_source})"
     )
-    lines.append(f"Frames used: {frames}; {time} a sample.")
+    lines.append(f"Frames used: {frames}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
 

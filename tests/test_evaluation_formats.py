@@ -247,7 +247,7 @@ PER_SAMPLE = {
     "mat v7.3 virtual": (".mat", mat73_bytes(virtual), "stored in other files"),
     "mat v7.3 chunk": (".mat", mat73_bytes(huge_chunk), "too large for a depth map"),
     "mat v7.3 cut off": (".mat", mat73_bytes(lambda h: h.create_dataset("depth", data=DEPTH.T))[:900], "can't be read"),
-    "png 8 bit": (".png", png_bytes(np.zeros(SIZE, np.uint8)), "has 8 bits a channel"),
+    "png 8 bit": (".png", png_bytes(np.zeros(SIZE, np.uint8)), "has 8 bits per channel"),
     "png colour": (".png", png_bytes(np.zeros((*SIZE, 3), np.uint16)), "colour type 2"),
     "png shape": (".png", png_bytes(np.zeros((40, 32), np.uint16)), r"got \(40, 32\)"),
     "png full": (".png", png_bytes(np.full(SIZE, 65535, np.uint16)), "where depth above 3276.75 mm is cut off"),

@@ -47,7 +47,7 @@ def validate(
     units, mode = SCORING[recipe.normalisation]
     network.eval()
     metric = DepthScores()
-    if accelerator.device.type == "cuda":  # NCCL adds up only what lies on a GPU
+    if accelerator.device.type == "cuda":  # NCCL adds up tensors on a GPU only
         metric.to(accelerator.device)
     losses: list[float] = []
     for read in data.batches(recipe.batch, indices):
