@@ -1,26 +1,27 @@
-"""Scoring speed: the whole command against a bare script that only loads, and the kernel against boolean masking.
+"""Scoring speed: the whole `fpp-eval` command against two scripts, each as a process of its own.
 
     python benchmarks/eval_speed.py [--size 960] [--samples 30] [--repeats 7]
 
-1. `fpp-eval` (everything: imports, reading, hashing, checking, all scores, intervals, table) on 30 samples, against a
-   Python script that starts, imports NumPy and ``np.load``s the same predictions and targets. Wall time of whole
-   processes and their processor time, run alternately; the ratio is of medians. Two processors are needed for what
-   runs beside one another.
-2. The headline scores of one sample (MAE and RMSE over the three pixel sets), against plain NumPy boolean masking of
-   the three sets, in one process; medians. The numbers are compared as well.
+- ``fpp-eval PREDICTIONS --dataset DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
+  table and result file.
+- `LOAD`: imports NumPy and loads the predictions and targets, nothing else.
+- `PLAIN`: what a careful user writes: loads the same files, checks shapes and values, and computes the six headline
+  scores with NumPy boolean masks in float64, averaged over samples.
 
-The object covers a tenth of each image, as in the paper's test split.
+Both scripts read the targets as .npy files, which is faster than any dataset format. Each round runs all three, one
+after the other; times are medians over the rounds, wall time and processor time (the sum over all cores). The six
+scores of `PLAIN` are compared with those in the command's result file. The object covers a tenth of each image, as in
+the paper's test split.
 """
 
 import argparse
+import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,41 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.acceleration import numba_enabled
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
-from fpp_ml_bench.evaluation.scores import headline_scores, score_sample
+from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.frames import PAPER_SEQUENCE
 from fpp_ml_bench.loaders.manifest import Manifest, ShardFile
 from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
 from fpp_ml_bench.rig import paper_rig
 
-ROOT = Path(__file__).resolve().parent.parent
 COVER = 0.1
-_COMMAND = "import sys; sys.path.insert(0, sys.argv.pop(1)); from fpp_ml_bench.commands.evaluate import main; main()"
-_BARE = "import sys, numpy as np\nfor name in sys.argv[1:]: np.load(name)"
+COMMAND = Path(sys.executable).with_name("fpp-eval")
+LOAD = """\
+import sys
+from pathlib import Path
+import numpy as np
+for folder in sys.argv[1:]:
+    for path in sorted(Path(folder).glob("*.npy")):
+        np.load(path)
+"""
+PLAIN = """\
+import json, sys
+from pathlib import Path
+import numpy as np
+predictions, targets = map(Path, sys.argv[1:])
+scores = []
+for path in sorted(predictions.glob("*.npy")):
+    prediction, target = np.load(path), np.load(targets / path.name)
+    if prediction.shape != target.shape or not np.isfinite(prediction).all():
+        sys.exit(f"{path}: wrong shape, or values that are not finite")
+    error = prediction.astype(np.float64) - target
+    inside = target > 0
+    row = []
+    for pixels in (np.ones(target.shape, bool), inside, ~inside):
+        row += [np.abs(error[pixels]).mean(), np.sqrt((error[pixels] ** 2).mean())]
+    scores.append(row)
+print(json.dumps(np.mean(scores, axis=0).tolist()))
+"""
 _DESCRIPTION = """\
 name: Noise of 2 mm
 method: benchmark
@@ -61,9 +85,8 @@ def depth_map(size: int, seed: int) -> NDArray[np.float32]:
     return np.where(inside, depth, 0.0).astype(np.float32)
 
 
-def prepare(folder: Path, size: int, samples: int) -> tuple[list[str], list[str]]:
-    """Write a dataset, predictions and the targets as .npy; arguments of the command and of the bare script."""
-    data, predictions, targets = folder / "data", folder / "predictions", folder / "targets"
+def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: int) -> None:
+    """Write a dataset of ``samples`` views, predictions with 2 mm of noise, and the targets as .npy."""
     for path in (data / ".build", predictions, targets):
         path.mkdir(parents=True)
     names = [(f"{name}_{view}", name, view) for name in TEST_OBJECTS for view in VIEWS][:samples]
@@ -80,88 +103,68 @@ def prepare(folder: Path, size: int, samples: int) -> tuple[list[str], list[str]
             np.save(predictions / f"{sample}.npy", (depth + noise).astype(np.float32))
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
-        written, about = ShardWriter(
+        written, rows_described = ShardWriter(
             data, data / ".build", plan, PAPER_SEQUENCE, "single_shot", False, (size, size)
         ).write(rows)
         shards += written
-        described += about
+        described += rows_described
     (data / ".build").rmdir()
     Manifest(
         origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=(size, size),
         stored="single_shot", exact=False, samples={"test": described}, shards=shards,
     ).write(data)  # fmt: skip
     (predictions / "submission.yaml").write_text(_DESCRIPTION)
-    command = [sys.executable, "-c", _COMMAND, str(ROOT), str(predictions), "--dataset", str(data)]
-    loaded = [str(path) for place in (predictions, targets) for path in sorted(place.glob("*.npy"))]
-    return [*command, "--json", str(folder / "result.json")], [sys.executable, "-c", _BARE, *loaded]
 
 
-def seconds(command: list[str], bytecode: Path) -> tuple[float, float]:
-    """Wall and processor time of a whole process. Compiled modules are kept in ``bytecode``, as when installed."""
+def seconds(command: list[str], bytecode: Path) -> tuple[float, float, str]:
+    """Wall time, processor time and output of a whole process. Compiled modules are kept in ``bytecode``."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     environment["PYTHONPYCACHEPREFIX"] = str(bytecode)
     started, before = time.perf_counter(), os.times()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=environment)
     after = os.times()
+    wall = time.perf_counter() - started
     used = after.children_user + after.children_system - before.children_user - before.children_system
-    return time.perf_counter() - started, used
-
-
-def plain_scores(prediction: NDArray, target: NDArray) -> list[float]:
-    """The six headline scores as one writes them with NumPy: a difference in float64 and a mask a set."""
-    error = prediction.astype(np.float64) - target
-    inside = target > 0
-    found = []
-    for pixels in (np.ones(target.shape, bool), inside, ~inside):
-        found += [np.abs(error[pixels]).mean(), np.sqrt((error[pixels] ** 2).mean())]
-    return found
-
-
-def kernel_scores(prediction: NDArray, target: NDArray) -> list[float]:
-    """The same six, from the package's kernel."""
-    parts = headline_scores(prediction, target, compiled=numba_enabled())
-    return [value for stats in parts for value in (stats.mae_mm or 0.0, stats.rmse_mm or 0.0)]
-
-
-def milliseconds(run: Callable[[], object], repeats: int) -> float:
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - started)
-    return 1000 * statistics.median(seconds)
+    return wall, used, done.stdout.decode()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=960, help="image height and width in px")
     parser.add_argument("--samples", type=int, default=30, help="samples of the split, at most 30")
-    parser.add_argument("--repeats", type=int, default=7, help="runs of each")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds")
     args = parser.parse_args()
+    if not COMMAND.is_file():
+        sys.exit(f"expected the command fpp-eval at {COMMAND}; install the package into this environment")
     with tempfile.TemporaryDirectory(prefix="eval-speed-") as folder:
-        command, bare = prepare(Path(folder), args.size, args.samples)
-        kept = Path(folder) / "bytecode"
-        for warm in (command, bare):
-            seconds(warm, kept)
-        pairs = [(seconds(command, kept), seconds(bare, kept)) for _ in range(args.repeats)]
-    about = f"whole command, {args.samples} samples of {args.size}x{args.size}"
-    for place, kind in enumerate(("wall", "processor")):
-        ours, theirs = (statistics.median(pair[side][place] for pair in pairs) for side in (0, 1))
-        aim = " (target: at most 3)" if kind == "wall" else " (does not depend on how busy the machine is)"
-        print(
-            f"{about}, {kind} time: {ours:.2f} s, start and load alone {theirs:.2f} s: {ours / theirs:.1f} times{aim}"
+        data, predictions, targets, result, bytecode = (
+            str(Path(folder) / name) for name in ("data", "predictions", "targets", "result.json", "bytecode")
         )
-    target = depth_map(args.size, 0)
-    prediction = (target + np.random.default_rng(0).normal(0, 2, target.shape)).astype(np.float32)
-    one, two = kernel_scores(prediction, target), plain_scores(prediction, target)
-    apart = max(abs(a - b) / b for a, b in zip(one, two, strict=True))
-    runs = 10 * args.repeats
-    ours, theirs = (milliseconds(partial(f, prediction, target), runs) for f in (kernel_scores, plain_scores))
-    everything = milliseconds(lambda: score_sample(prediction, target), runs)
-    kind = "compiled" if numba_enabled() else "NumPy"
-    print(f"headline scores of one sample: kernel ({kind}) {ours:.2f} ms, masking {theirs:.2f} ms: "
-          f"{theirs / ours:.1f} times as fast (target: at least 10); largest difference {apart:.0e}")  # fmt: skip
-    print(f"every score of one sample (edges, bands, order statistics): {everything:.2f} ms")
+        prepare(Path(data), Path(predictions), Path(targets), args.size, args.samples)
+        commands = {
+            "fpp-eval": [str(COMMAND), predictions, "--dataset", data, "--json", result],
+            "load": [sys.executable, "-c", LOAD, predictions, targets],
+            "plain": [sys.executable, "-c", PLAIN, predictions, targets],
+        }
+        outputs = {name: seconds(command, Path(bytecode))[2] for name, command in commands.items()}  # warms up
+        rounds = [
+            {name: seconds(command, Path(bytecode)) for name, command in commands.items()} for _ in range(args.repeats)
+        ]
+        metrics = json.loads(Path(result).read_text())["metrics"]
+    wall, used = (
+        {name: statistics.median(times[name][kind] for times in rounds) for name in commands} for kind in (0, 1)
+    )
+    print(f"{args.samples} samples of {args.size}x{args.size} px, median of {args.repeats} rounds")
+    print(f"fpp-eval, every check and score: {wall['fpp-eval']:.2f} s wall, {used['fpp-eval']:.2f} s processor")
+    for name, title in (("load", "only loading the same files"), ("plain", "the six headline scores in plain NumPy")):
+        print(
+            f"{title}: {wall[name]:.2f} s wall, {used[name]:.2f} s processor; fpp-eval takes "
+            f"{wall['fpp-eval'] / wall[name]:.1f} times the wall time, {used['fpp-eval'] / used[name]:.1f} times the "
+            "processor time"
+        )
+    plain = dict(zip(HEADLINE, json.loads(outputs["plain"]), strict=True))
+    difference = max(abs(metrics[key] - plain[key]) / plain[key] for key in HEADLINE)
+    print(f"largest relative difference of the six scores: {difference:.0e}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Whether an Arrow IPC stream has compressed buffers: read off its messages' headers, before anything is unpacked.
+"""Whether an Arrow IPC stream has compressed buffers, from the headers of its messages, before anything is unpacked.
 
-A compressed buffer begins with a length of its own choosing, for which Arrow takes memory at once. An uncompressed one
-can't be larger than the file it lies in.
+A compressed buffer states its own unpacked length, and Arrow allocates that much memory at once. An uncompressed buffer
+can't be larger than its file.
 """
 
 import struct
@@ -17,7 +17,10 @@ _DICTIONARY_BATCH = 1
 
 
 def check_uncompressed(stream: pa.Buffer) -> None:
-    """Refuse (PredictionError) a stream with a compressed record batch. pyarrow's errors for a damaged one pass on."""
+    """Refuse (PredictionError) a stream with a compressed record batch.
+
+    Raises pyarrow's own errors for a damaged stream.
+    """
     reader = pa.BufferReader(stream)
     while True:
         try:
@@ -48,17 +51,17 @@ def _compressed(metadata: bytes) -> bool:
 
 
 def _field(metadata: bytes, table: int, number: int) -> int:
-    """Where field ``number`` of the table at ``table`` lies; 0 when it is absent."""
-    slots = table - struct.unpack_from("<i", metadata, table)[0]
-    if slots < 0 or table < 0:
+    """Offset of field ``number`` of the table at offset ``table``; 0 when the field is absent."""
+    vtable = table - struct.unpack_from("<i", metadata, table)[0]
+    if vtable < 0 or table < 0:
         raise struct.error("outside")
-    place = 4 + 2 * number
-    if place + 2 > struct.unpack_from("<H", metadata, slots)[0]:
+    slot = 4 + 2 * number
+    if slot + 2 > struct.unpack_from("<H", metadata, vtable)[0]:
         return 0
-    offset = struct.unpack_from("<H", metadata, slots + place)[0]
+    offset = struct.unpack_from("<H", metadata, vtable + slot)[0]
     return table + offset if offset and table + offset < len(metadata) else 0
 
 
 def _table(metadata: bytes, table: int, number: int) -> int | None:
-    place = _field(metadata, table, number)
-    return place + struct.unpack_from("<I", metadata, place)[0] if place else None
+    offset = _field(metadata, table, number)
+    return offset + struct.unpack_from("<I", metadata, offset)[0] if offset else None

@@ -1,6 +1,7 @@
-"""Two results of the same samples, sample by sample: the paired difference, how sure it is, and what that means.
+"""Two results of the same samples, sample by sample: the paired difference, its interval, and a sentence about it.
 
-Pairing takes out what both methods find hard. It can therefore tell two methods apart whose own intervals overlap.
+Samples that are hard for both methods cancel in the difference. A comparison can therefore tell two methods apart whose
+own intervals overlap.
 """
 
 import statistics
@@ -12,7 +13,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.result_models import Interval
+from fpp_ml_bench.evaluation.result_models import DatasetInfo, Interval
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text
 from fpp_ml_bench.evaluation.text import printable
 from fpp_ml_bench.evaluation.uncertainty import caution, object_interval
@@ -43,13 +44,13 @@ class Difference(StrictModel):
 
     @property
     def told_apart(self) -> bool:
-        """Whether the interval leaves 0 out."""
+        """Whether 0 is outside the interval."""
         low, high = self.interval_mm
         return low is not None and high is not None and not low <= 0 <= high
 
 
 class Comparison(StrictModel):
-    """``second`` against ``first``: one `Difference` for each headline key, and each sample's own."""
+    """``second`` against ``first``: a `Difference` for each headline key, and the differences of each sample."""
 
     first: Text
     second: Text
@@ -64,14 +65,16 @@ class Comparison(StrictModel):
 
 
 def compare(first: Result, second: Result) -> Comparison:
-    """The paired comparison of two results. SubmissionError, naming all of it, where they are not of the same data."""
+    """The paired comparison of two results. SubmissionError names everything in which their data differ."""
     _check_same_data(first, second)
-    others = {row.sample: row for row in second.per_sample}
+    second_rows = {row.sample: row for row in second.per_sample}
     paired = [
         PairedSample(
             sample=row.sample,
             object=row.object,
-            differences={key: _difference(getattr(row, key), getattr(others[row.sample], key)) for key in HEADLINE},
+            differences={
+                key: _difference(getattr(row, key), getattr(second_rows[row.sample], key)) for key in HEADLINE
+            },
         )
         for row in first.per_sample
     ]
@@ -95,74 +98,78 @@ def compare(first: Result, second: Result) -> Comparison:
 
 def _check_same_data(first: Result, second: Result) -> None:
     pairs: dict[str, tuple[Any, Any]] = {
-        "dataset": (first.dataset.fingerprint[:16], second.dataset.fingerprint[:16]),
         "split": (first.dataset.split, second.dataset.split),
         "target": (first.target, second.target),
         "track": (first.track, second.track),
         "mode": (first.mode, second.mode),
         "protocol": (first.protocol_version, second.protocol_version),
-        "samples": (_samples(first), _samples(second)),
     }
-    other = [
-        f"{name}: the samples differ" if name == "samples" else f"{name}: {one} against {two}"
-        for name, (one, two) in pairs.items()
-        if one != two
-    ]
-    if other:
-        lines = "\n  ".join(other)
+    lines = [f"{key}: {a} against {b}" for key, (a, b) in pairs.items() if a != b]
+    if not _same_dataset(first.dataset, second.dataset):
+        lines.insert(0, f"dataset: {printable(first.dataset.identity)} against {printable(second.dataset.identity)}")
+    if _samples(first) != _samples(second):
+        lines.append("samples: the samples differ")
+    if lines:
         raise SubmissionError(
             "the two results can't be compared, they were not scored on the same data by the same rules; score both "
-            f"with the same fpp-eval options:\n  {lines}"
+            "with the same fpp-eval options:\n  " + "\n  ".join(lines)
         )
+
+
+def _same_dataset(first: DatasetInfo, second: DatasetInfo) -> bool:
+    """Whether both have the same fingerprint and do not name two different benchmarks."""
+    named = {info.benchmark for info in (first, second) if info.benchmark is not None}
+    return first.fingerprint == second.fingerprint and len(named) < 2
 
 
 def _samples(result: Result) -> list[tuple[str, int]]:
     return sorted((row.sample, row.object_pixels) for row in result.per_sample)
 
 
-def _difference(one: float | None, two: float | None) -> float | None:
-    return None if one is None or two is None else two - one
+def _difference(first: float | None, second: float | None) -> float | None:
+    return None if first is None or second is None else second - first
 
 
 def _summary(paired: list[PairedSample], key: str) -> Difference:
     values = [row.differences[key] for row in paired]
-    known = [value for value in values if value is not None]
+    differences = [value for value in values if value is not None]
     interval = object_interval(values, [row.object for row in paired])
     return Difference(
-        mean_mm=statistics.fmean(known) if known else None,
+        mean_mm=statistics.fmean(differences) if differences else None,
         interval_mm=[None, None] if interval is None else list(interval),
-        samples=len(known),
+        samples=len(differences),
         objects=len({row.object for row, value in zip(paired, values, strict=True) if value is not None}),
-        lower=sum(value < 0 for value in known),
-        higher=sum(value > 0 for value in known),
+        lower=sum(value < 0 for value in differences),
+        higher=sum(value > 0 for value in differences),
     )
 
 
-def sentence(first: str, second: str, found: Difference) -> str:
-    """What the difference in object MAE means, in words."""
-    if found.mean_mm is None:
+def sentence(first: str, second: str, difference: Difference) -> str:
+    """The difference in object MAE as a sentence."""
+    if difference.mean_mm is None:
         return "No sample has an object in it, so object MAE says nothing."
-    if not found.lower and not found.higher:
-        return f"{second} and {first} have the same object MAE in all {found.samples} samples."
-    size = f"{millimetres(abs(found.mean_mm))} mm"
-    word = "lower" if found.mean_mm < 0 else "higher"
-    count = found.lower if found.mean_mm < 0 else found.higher
-    views = f"{word} in {count} of {found.samples} samples"
-    low, high = found.interval_mm
+    if not difference.lower and not difference.higher:
+        return f"{second} and {first} have the same object MAE in all {difference.samples} samples."
+    size = f"{millimetres(abs(difference.mean_mm))} mm"
+    word = "lower" if difference.mean_mm < 0 else "higher"
+    count = difference.lower if difference.mean_mm < 0 else difference.higher
+    views = f"{word} in {count} of {difference.samples} samples"
+    low, high = difference.interval_mm
     if low is None or high is None:
         return (
             f"{second} has an object MAE {size} {word} than {first} on average, {views}; with one object there is no "
             "interval, so nothing can be said beyond it."
         )
-    ends = f"{_signed(low)} to {_signed(high)} mm over {found.objects} objects"
-    few = f" {said}" if (said := caution(found.objects)) else ""
-    if found.told_apart:
+    ends = f"{_signed(low)} to {_signed(high)} mm over {difference.objects} objects"
+    few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
+    if difference.told_apart:
         return (
-            f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {ends}), {views}.{few}"
+            f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {ends}), "
+            f"{views}.{few_objects}"
         )
     return (
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
-        f"but the 95% interval, {ends}, holds 0.{few}"
+        f"but the 95% interval, {ends}, holds 0.{few_objects}"
     )
 
 

@@ -1,8 +1,9 @@
-"""MAE and RMSE over a set of pixels, sums that keep their digits, and unions of sets.
+"""MAE and RMSE over a set of pixels, accurate sums, and unions of sets.
 
 Numerical contract: differences are formed in float64 whatever the input; every sum is float64 over blocks of
-`BLOCK` pixels that stay in the cache, the block sums added exactly (`math.fsum`). Errors above 1e140 are refused, and
-errors so small that their squares vanish are squared as parts of the largest, so that an RMSE is never 0 by underflow.
+`BLOCK` pixels that fit into the cache, and the block sums are added exactly (`math.fsum`). Errors above 1e140 are
+refused. Errors so small that their squares underflow are divided by the largest before they are squared, so that an
+RMSE is never 0 by underflow.
 """
 
 import math
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from fpp_ml_bench.errors import PredictionError
 
 BLOCK = 9600
-"""Pixels a block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
-would then depend on the number of cores; below that a score is the same on every machine of one kind."""
+"""Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
+would then depend on the number of cores. Below that a score depends on the type of processor only."""
 
 _SQUARES_LOST = 1e-280
-"""Mean square below which squares have lost digits, the smallest normal number being 2e-308 and an image a million
-pixels."""
+"""Mean square below which squares may have lost digits: the smallest normal number is 2e-308, and an image has about a
+million pixels."""
 NOT_FINITE = "the errors are not finite, or too large to square (above about 1e140)"
 
 
@@ -37,7 +38,7 @@ EMPTY = ErrorStats(0, None, None)
 
 
 def combine(*parts: ErrorStats) -> ErrorStats:
-    """Statistics of the union of disjoint pixel sets. Exact for one non-empty part; no square leaves its scale."""
+    """Statistics of the union of disjoint pixel sets, without overflow or underflow; exact for one non-empty part."""
     filled = [(s.pixels, s.mae_mm, s.rmse_mm) for s in parts if s.mae_mm is not None and s.rmse_mm is not None]
     if not filled:
         return EMPTY
@@ -57,20 +58,20 @@ def stats_of(errors: NDArray[np.float64]) -> ErrorStats:
         block = errors[start : start + BLOCK]
         squares.append(float(block.dot(block)))
         absolute.append(float(np.abs(block).sum()))
-    return finish(errors.size, absolute, squares, lambda: errors)
+    return stats_of_sums(errors.size, absolute, squares, lambda: errors)
 
 
 def mean_of(errors: NDArray[np.float64]) -> float | None:
-    """Mean of float64 values (n,) of either sign, with the same blocks; None of none."""
+    """Mean of float64 values (n,) of either sign, in the same blocks; None for no values."""
     if errors.size == 0:
         return None
     return math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK)) / errors.size
 
 
-def finish(
+def stats_of_sums(
     pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], NDArray[np.float64]]
 ) -> ErrorStats:
-    """Statistics from the blocks' sums; ``errors`` gives the errors themselves (n,) where the squares underflow.
+    """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the squares underflow.
 
     Raises PredictionError where a sum is not finite.
     """

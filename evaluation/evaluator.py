@@ -1,4 +1,4 @@
-"""Scoring a folder of predictions against one split of a dataset: everything checked, every offender named, at once."""
+"""Scoring a folder of predictions against one split of a dataset: everything is checked, every problem is named."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -49,61 +49,62 @@ def evaluate(
     target: str = "depth",
     edge_band_px: int = EDGE_BAND_PX,
     mode: str = "standard",
-    meanwhile: Callable[[], object] = lambda: None,
+    while_scoring: Callable[[], object] = lambda: None,
 ) -> "Result":
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
     or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
-    of samples, and the result does not depend on the number of cores. ``meanwhile`` is called once while threads score:
-    a command imports there what it needs afterwards.
+    of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once while threads
+    score: a command uses it to import what it needs afterwards.
 
-    Raises SubmissionError for the description, PredictionError (naming every offending file) for the predictions, and
-    DatasetError for a target that is no depth map.
+    Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
+    and DatasetError for a target that is not a depth map.
     """
     folder = Path(folder)
     samples = _samples(folder, dataset, split, target, mode)
-    content, refused = None, None
+    content, description_error = None, None
     try:
         content = read_plain(folder)
     except SubmissionError as error:
-        refused = error
+        description_error = error
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
     listing = list_folder(folder, samples, split, split_of)
-    units, level = _declared(content or {})
-    rules = scoring.Rules(dataset.size, units, level, mode, edge_band_px)  # type: ignore[arg-type]
+    units, mm_per_level = _declared_units(content or {})
+    rules = scoring.Rules(dataset.size, units, mm_per_level, mode, edge_band_px)  # type: ignore[arg-type]
     problems, rows = list(listing.problems), []
     # The description is checked while the first files are scored: pydantic takes long to import.
-    known = units in get_args(Units)
-    release = getattr(dataset, "release", lambda sample: None)  # a dataset that is no map of files has nothing to free
-    found = (
+    release = getattr(dataset, "release", lambda sample: None)  # only a memory-mapped dataset has pages to release
+    outcomes = (
         scoring.scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target), release)
-        if known
+        if units in get_args(Units)
         else ()
     )
     submission: Submission | None = None
     if content is not None:
         try:
-            submission = _described(folder, content, len(dataset.sequence), listing.form, mode)
+            submission = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
-            refused = error
+            description_error = error
         from fpp_ml_bench.evaluation import provenance, result  # noqa: F401  imported while the threads score
 
-        meanwhile()
-    for offences, row in found:
-        problems += offences
-        rows += row
+        while_scoring()
+    for file_problems, file_rows in outcomes:
+        problems += file_problems
+        rows += file_rows
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        described = [str(refused)] if refused else []
-        raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {count}:", described + problems)
-    if refused or submission is None:
-        raise refused or SubmissionError(f"{printable(str(folder), 500)} has no description")
+        description_problems = [str(description_error)] if description_error else []
+        raise PredictionError(
+            f"{printable(str(folder), 500)} can't be scored, {count}:", description_problems + problems
+        )
+    if description_error or submission is None:
+        raise description_error or SubmissionError(f"{printable(str(folder), 500)} has no description")
     return _result(rows, dataset, split, target, mode, edge_band_px, submission)
 
 
 def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode: str) -> list[str]:
-    """The split's samples; refuses arguments that name nothing."""
+    """The split's samples; refuses arguments that name no folder, target, mode or sample."""
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
     if target not in TARGETS:
@@ -118,13 +119,13 @@ def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode
     return samples
 
 
-def _declared(content: dict[Any, Any]) -> tuple[Any, float | None]:
-    """Units and PNG scale as declared; what they are not is `submission`'s to refuse."""
-    units, level = content.get("units", "mm"), content.get("png_mm_per_level")
-    return units, float(level) if isinstance(level, int | float) and not isinstance(level, bool) else None
+def _declared_units(content: dict[Any, Any]) -> tuple[Any, float | None]:
+    """Units and PNG scale as declared; `submission` refuses values that are neither."""
+    units, scale = content.get("units", "mm"), content.get("png_mm_per_level")
+    return units, float(scale) if isinstance(scale, int | float) and not isinstance(scale, bool) else None
 
 
-def _described(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> "Submission":
+def _checked_submission(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> "Submission":
     """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
     from fpp_ml_bench.evaluation.submission import check_submission
 
@@ -161,8 +162,10 @@ def _result(
 ) -> "Result":
     from fpp_ml_bench.evaluation.provenance import environment
     from fpp_ml_bench.evaluation.result import result_from_rows
+    from fpp_ml_bench.loaders.benchmark import benchmark_of
 
     height, width = dataset.size
+    benchmark = benchmark_of(dataset.fingerprint)
     return result_from_rows(
         [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
         protocol_version=PROTOCOL_VERSION,
@@ -171,6 +174,7 @@ def _result(
         dataset={
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "fingerprint": dataset.fingerprint,
+            "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
             "split": split,
             "size": [height, width],
             "samples": len(rows),

@@ -1,4 +1,4 @@
-"""What scoring left out: columns that no score needs, and edges looked for only around the object."""
+"""What scoring skipped: columns that no score needs, and the search for depth edges far from the object."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _DEPTH_BYTES, _FRAME_BYTES = 4, 1
 
 
 def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
-    """The account of scoring one split. Reads the split's targets once more."""
+    """What scoring one split skipped. Reads the split's targets again."""
     samples = dataset.samples(split)
     height, width = dataset.size
     pixels = height * width
@@ -22,7 +22,7 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     read = 1 + (target != "depth")
     median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
     depth_mm = dataset.target_mm(median, target)
-    left = len(samples) * pixels - sum(boxes.values())
+    skipped = len(samples) * pixels - sum(boxes.values())
     lines = [
         LeftOut(
             "columns that no score needs", "images", len(samples) * read, len(samples) * (frames + depths - read),
@@ -30,25 +30,25 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
             "not read; seconds not measured, they depend on the disk",
         ),
         LeftOut(
-            "depth edges far from the object", "pixels", sum(boxes.values()), left, None,
+            "depth edges far from the object", "pixels", sum(boxes.values()), skipped, None,
             saved_by(
-                lambda: object_near_edges(depth_mm, (edge_band_px, WIDE_BAND_PX)), pixels - boxes[median], left
+                lambda: object_near_edges(depth_mm, (edge_band_px, WIDE_BAND_PX)), pixels - boxes[median], skipped
             ),
-            f"processor seconds of one sample ({median}) with skipping off less on, measured now, times what all left "
-            "out",
+            f"processor seconds of one sample ({median}) without skipping minus with it, measured now, scaled to the "
+            "pixels that all samples skipped",
         ),
     ]  # fmt: skip
     return explained("fpp-eval", f"{len(samples)} samples of {width}x{height} px", lines)
 
 
 def _box_px(dataset: DatasetFolder, sample: str, target: str) -> int:
-    """Pixels of the box around the object in which edges are looked for."""
+    """Pixels of the box around the object in which edges are searched."""
     inside = object_mask(dataset.target_mm(sample, target))
     dataset.release(sample)
     extents = []
     for axis in (1, 0):
-        found = np.flatnonzero(inside.any(axis=axis))
-        if not found.size:
+        occupied = np.flatnonzero(inside.any(axis=axis))
+        if not occupied.size:
             return 0
-        extents.append(min(int(found[-1]) + 2, inside.shape[1 - axis]) - max(int(found[0]) - 1, 0))
+        extents.append(min(int(occupied[-1]) + 2, inside.shape[1 - axis]) - max(int(occupied[0]) - 1, 0))
     return extents[0] * extents[1]

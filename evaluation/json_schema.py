@@ -1,4 +1,4 @@
-"""The JSON Schema of the strict file models, for who writes or reads these files without Python."""
+"""The JSON Schema of the strict file models, for programs that write or read these files without Python."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ MODELS: dict[str, type[StrictModel]] = {"result": Result, "submission": Submissi
 def json_schema(name: str) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``.
 
-    It says which keys there are and what each may hold. That averages follow from the samples is checked on reading.
+    It lists the keys and what each may hold. Whether averages follow from the samples is checked on reading.
     """
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -23,9 +23,9 @@ class Listing(NamedTuple):
 
 
 def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> Listing:
-    """What ``folder`` holds for ``samples``: the form that most of it has, and every entry that does not belong.
+    """What ``folder`` holds for ``samples``: the form of most of its files, and every entry that is missing or extra.
 
-    ``split_of`` gives the split of every sample of the dataset, for the hint beside a sample of another split.
+    ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split.
     """
     try:
         names = sorted(entry.name for entry in os.scandir(folder))
@@ -65,9 +65,9 @@ def _in_order(expected: set[str], samples: Sequence[str], form: str) -> list[str
 
 def _hint(name: str, form: str, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> str:
     stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
-    other = split_of.get(stem) if suffix in PER_SAMPLE else None
-    if other and stem not in samples:
-        return f"a sample of split {other}, not of {split}: move it away or score that split"
-    if other or name in TABLES:
+    sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
+    if sample_split and stem not in samples:
+        return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
+    if sample_split or name in TABLES:
         return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
     return "remove it"

@@ -2,7 +2,7 @@
 
 
 def millimetres(value: float | None) -> str:
-    """An error in mm to three decimals, in powers of ten where those say nothing, a dash for an empty pixel set."""
+    """An error in mm to three decimals, in powers of ten where very small or large, a dash for an empty pixel set."""
     if value is None:
         return "-"
     if value == 0:
@@ -11,7 +11,7 @@ def millimetres(value: float | None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share as per cent with one decimal, a dash where there is nothing to take a share of."""
+    """A share as per cent with one decimal, a dash where there is none."""
     return "-" if share is None else f"{100 * share:.1f}%"
 
 

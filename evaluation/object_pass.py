@@ -1,8 +1,4 @@
-"""The first pass over a sample: the object's errors picked out, the background's summed. NumPy, or compiled.
-
-Both give the same numbers to a few units in the last place; which one runs is the caller's choice, because importing
-numba takes as long as scoring a hundred samples with NumPy.
-"""
+"""The first pass over a sample: the errors of the object's pixels, and the error statistics of the background."""
 
 from typing import Any, NamedTuple
 
@@ -11,18 +7,15 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import error_stats
-from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, finish, stats_of
+from fpp_ml_bench.evaluation.error_stats import EMPTY, NOT_FINITE, ErrorStats, stats_of_sums
 from fpp_ml_bench.pixel_sets import object_mask
 
-COMPILED_FROM_SAMPLES = 400
-"""From this many samples on the compiled pass earns its import back (960 px, `benchmarks/eval_speed.py`)."""
 _BLOCKS_AT_ONCE = 8
-_COMPILED_DTYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
 
 class ObjectErrors(NamedTuple):
-    """Where in the flat image the object's n pixels lie, their errors in mm float64 (n,), which of them were
-    not measured (n,), and the statistics of all other pixels."""
+    """The object's n pixels: flat indices (n,), errors in mm float64 (n,), which were not measured (n,); and the
+    error statistics of all other pixels."""
 
     pixels: NDArray[np.intp]
     errors: NDArray[np.float64]
@@ -30,50 +23,21 @@ class ObjectErrors(NamedTuple):
     background: ErrorStats
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: `finish` refuses it
-def object_errors(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> ObjectErrors:
+@np.errstate(over="ignore")  # an overflow is no warning here: `stats_of_sums` refuses it
+def object_errors(prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]]) -> ObjectErrors:
     """Split a sample into its object and its background (paper Section 5.3.2).
 
     ``prediction_mm`` and ``target_mm`` (H, W) real floats in mm. Raises PredictionError for shapes that differ, dtypes
     that are not real floats, and errors that are not finite.
     """
     prediction, target = _flat(prediction_mm, target_mm)
-    if compiled and compilable(prediction, target):
-        return _compiled(prediction, target)
     index = np.flatnonzero(object_mask(target))
-    measured = prediction.take(index)
-    errors = measured.astype(np.float64)
+    depths = prediction.take(index)
+    errors = depths.astype(np.float64)
     errors -= target.take(index)
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
-    return ObjectErrors(index, errors, measured <= 0, _background_stats(prediction, target, index))
-
-
-@np.errstate(over="ignore")
-def headline_stats(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> tuple[ErrorStats, ErrorStats]:
-    """Statistics of the object and of the background alone. Arguments and errors as `object_errors`."""
-    prediction, target = _flat(prediction_mm, target_mm)
-    if not (compiled and compilable(prediction, target)):
-        found = object_errors(prediction_mm, target_mm)
-        return stats_of(found.errors), found.background
-    from fpp_ml_bench.evaluation.object_kernel import headline_pass
-
-    sums = np.empty((-(-prediction.size // error_stats.BLOCK), 4))
-    inside = headline_pass(prediction, target, error_stats.BLOCK, sums)
-    absolute, squares, outside, outside_squares = sums.T.tolist()
-    return (
-        finish(inside, absolute, squares, lambda: _errors(prediction, target, object_mask(target))),
-        finish(prediction.size - inside, outside, outside_squares, lambda: _background(prediction, target)),
-    )
-
-
-def compilable(*images: NDArray[np.floating[Any]]) -> bool:
-    """Whether the compiled passes take these dtypes: not float16, and not another byte order."""
-    return all(image.dtype in _COMPILED_DTYPES for image in images)
+    return ObjectErrors(index, errors, depths <= 0, _background_stats(prediction, target, index))
 
 
 def _flat(
@@ -88,29 +52,9 @@ def _flat(
     return prediction_mm.ravel(), target_mm.ravel()
 
 
-def _compiled(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> ObjectErrors:
-    from fpp_ml_bench.evaluation.object_kernel import object_pass
-
-    size, block = prediction.size, error_stats.BLOCK
-    index, errors, missing = np.empty(size, np.intp), np.empty(size), np.empty(size, np.bool_)
-    blocks = -(-size // block)
-    absolute, squares = np.zeros(blocks), np.zeros(blocks)
-    found = object_pass(prediction, target, block, index, errors, missing, absolute, squares)
-    errors = errors[:found]
-    if not np.isfinite(errors).all():
-        raise PredictionError(NOT_FINITE)
-    background = finish(size - found, absolute.tolist(), squares.tolist(), lambda: _background(prediction, target))
-    return ObjectErrors(index[:found], errors, missing[:found], background)
-
-
-def _errors(
-    prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]], where: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    return prediction[where].astype(np.float64) - target[where]
-
-
 def _background(prediction: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    return _errors(prediction, target, ~object_mask(target))
+    outside = ~object_mask(target)
+    return prediction[outside].astype(np.float64) - target[outside]
 
 
 def _background_stats(
@@ -118,7 +62,7 @@ def _background_stats(
 ) -> ErrorStats:
     """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
 
-    Not overall minus object: that would leave rounding dust where the background is perfect.
+    Not overall minus object: that would leave rounding errors where the background is perfect.
     """
     pixels = prediction.size - index.size
     if pixels == 0:
@@ -133,14 +77,14 @@ def _background_stats(
     starts = range(0, prediction.size, step)
     cuts = [*np.searchsorted(index, list(starts)).tolist(), index.size]
     for number, start in enumerate(starts):
-        part = flat[: min(step, prediction.size - start)]
-        np.copyto(part, prediction[start : start + step])
+        errors = flat[: min(step, prediction.size - start)]
+        np.copyto(errors, prediction[start : start + step])
         if not target_is_zero:
-            part -= target[start : start + step]
-        part[index[cuts[number] : cuts[number + 1]] - start] = 0.0
-        flat[part.size :] = 0.0
+            errors -= target[start : start + step]
+        errors[index[cuts[number] : cuts[number + 1]] - start] = 0.0
+        flat[errors.size :] = 0.0
         squares += [float(block.dot(block)) for block in buffer]
         if signed:
             np.abs(buffer, out=buffer)
         absolute += buffer.sum(axis=1).tolist()
-    return finish(pixels, absolute, squares, lambda: _background(prediction, target))
+    return stats_of_sums(pixels, absolute, squares, lambda: _background(prediction, target))

@@ -1,4 +1,4 @@
-"""The bytes of one file from a stranger: a regular file of bounded size, reached through no link."""
+"""Reading a file of unknown origin: only a regular file of bounded size, and no link."""
 
 import os
 import stat
@@ -12,7 +12,10 @@ from fpp_ml_bench.errors import PredictionError
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """The file and its size in bytes. Raises PredictionError, without the file's name, for a link or no plain file."""
+    """The file and its size in bytes.
+
+    Raises PredictionError, without the file's name, for anything but a regular file.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
@@ -28,7 +31,7 @@ def opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def fill(stream: IO[Any], view: memoryview) -> int:
-    """Read into all of ``view``; the number of bytes there were."""
+    """Fill ``view`` from the stream; the number of bytes read, fewer where the stream ends early."""
     done = 0
     while done < len(view):
         count = stream.readinto(view[done:])  # type: ignore[attr-defined]
@@ -44,7 +47,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
         if size > limit:
             raise PredictionError(f"has {size} bytes, expected at most {limit} for a map of this size; write it again")
         content = bytearray(size)
-        got = fill(stream, memoryview(content))
-    if got != size:
-        raise PredictionError(f"ended early: expected {size} bytes, got {got}; write it again")
+        length = fill(stream, memoryview(content))
+    if length != size:
+        raise PredictionError(f"ended early: expected {size} bytes, got {length}; write it again")
     return bytes(content)

@@ -1,7 +1,7 @@
-"""What a Parquet file unpacks to, added up from its page headers before anything is unpacked.
+"""The unpacked size of a Parquet file, added up from its page headers before anything is unpacked.
 
-A file's footer says how large it is unpacked, and so does every page, and nothing makes the two agree: memory is taken
-by the page. So the pages' headers (Thrift, compact protocol) are walked first.
+The footer states an unpacked size, and so does every page. The two need not agree, and a reader allocates memory page
+by page. So the headers of all pages (Thrift, compact protocol) are read first.
 """
 
 import struct
@@ -15,7 +15,7 @@ _MAX_DEPTH = 8
 
 
 def check_pages(metadata: Any, content: bytes, largest_bytes: int, largest_values: int) -> None:
-    """Refuse (PredictionError) a file that says, in its footer or its pages, that it unpacks to more than this.
+    """Refuse (PredictionError) a file whose footer or pages state an unpacked size above these limits.
 
     ``metadata`` is pyarrow's ``FileMetaData`` of ``content``.
     """
@@ -24,22 +24,22 @@ def check_pages(metadata: Any, content: bytes, largest_bytes: int, largest_value
         for column in range(metadata.num_columns):
             chunk = metadata.row_group(group).column(column)
             starts = [chunk.data_page_offset, chunk.dictionary_page_offset]
-            start = min(offset for offset in starts if offset is not None)
+            start = min(position for position in starts if position is not None)
             stop = start + chunk.total_compressed_size
             if not 0 < start <= stop <= len(content):
                 raise PredictionError("is damaged: its columns lie outside of it; write it again with pyarrow")
-            found = _pages(content, start, stop)
-            total += max(chunk.total_uncompressed_size, found[0])
-            values += max(chunk.num_values, found[1])
+            page_bytes, page_values = _pages(content, start, stop)
+            total += max(chunk.total_uncompressed_size, page_bytes)
+            values += max(chunk.num_values, page_values)
     if total > largest_bytes or values > largest_values:
         raise PredictionError(
             f"would unpack to {total} bytes and {values} values, expected at most {largest_bytes} and "
-            f"{largest_values} for this split; write one float32 map a sample"
+            f"{largest_values} for this split; write one float32 map per sample"
         )
 
 
 def _pages(content: bytes, start: int, stop: int) -> tuple[int, int]:
-    """Bytes and values that the pages between two places unpack to."""
+    """Bytes and values that the pages from offset ``start`` to ``stop`` unpack to."""
     total = values = 0
     while start < stop:
         try:
@@ -52,63 +52,63 @@ def _pages(content: bytes, start: int, stop: int) -> tuple[int, int]:
         if min(unpacked, packed) < 0:
             raise PredictionError("has a damaged page header; write it again with pyarrow")
         total += unpacked
-        about = header.get(_HEADERS.get(kind, 0))
-        count = about.get(1) if isinstance(about, dict) else 0
+        page_header = header.get(_HEADERS.get(kind, 0))
+        count = page_header.get(1) if isinstance(page_header, dict) else 0
         if kind in (_DATA, _DATA_V2):
             values += max(count, 0) if isinstance(count, int) else 0
         start += packed
     return total, values
 
 
-def _struct(content: bytes, place: int, depth: int) -> tuple[dict[int, Any], int]:
-    """Fields of a compact-protocol struct by number, and the place after it."""
+def _struct(content: bytes, offset: int, depth: int) -> tuple[dict[int, Any], int]:
+    """Fields of a compact-protocol struct by number, and the offset after it."""
     if depth > _MAX_DEPTH:
         raise IndexError("nested too deeply")
     fields: dict[int, Any] = {}
     number = 0
     while True:
-        byte = content[place]
-        place += 1
+        byte = content[offset]
+        offset += 1
         if byte == 0:
-            return fields, place
+            return fields, offset
         step, kind = byte >> 4, byte & 0x0F
         if step:
             number += step
         else:
-            number, place = _zigzag(content, place)
-        fields[number], place = _value(content, place, kind, depth)
+            number, offset = _zigzag(content, offset)
+        fields[number], offset = _value(content, offset, kind, depth)
 
 
-def _value(content: bytes, place: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(content: bytes, offset: int, kind: int, depth: int) -> tuple[Any, int]:
     if kind in (1, 2):  # true, false: the type is the value
-        return kind == 1, place
+        return kind == 1, offset
     if kind == 3:
-        return content[place], place + 1
+        return content[offset], offset + 1
     if kind in (4, 5, 6):
-        return _zigzag(content, place)
+        return _zigzag(content, offset)
     if kind == 7:
-        return None, place + 8
+        return None, offset + 8
     if kind == 8:
-        length, place = _varint(content, place)
-        return None, place + length
+        length, offset = _varint(content, offset)
+        return None, offset + length
     if kind == 12:
-        return _struct(content, place, depth + 1)
+        return _struct(content, offset, depth + 1)
     raise IndexError("a type that no page header has")
 
 
-def _varint(content: bytes, place: int) -> tuple[int, int]:
+def _varint(content: bytes, offset: int) -> tuple[int, int]:
     value = shift = 0
     while True:
-        byte = content[place]
-        place += 1
+        byte = content[offset]
+        offset += 1
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return value, place
+            return value, offset
         shift += 7
         if shift > 63:
             raise IndexError("a number too long")
 
 
-def _zigzag(content: bytes, place: int) -> tuple[int, int]:
-    value, place = _varint(content, place)
-    return (value >> 1) ^ -(value & 1), place
+def _zigzag(content: bytes, offset: int) -> tuple[int, int]:
+    value, offset = _varint(content, offset)
+    return (value >> 1) ^ -(value & 1), offset

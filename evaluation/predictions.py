@@ -1,4 +1,4 @@
-"""What is in a prediction, checked before a number is computed from it."""
+"""Checks of a prediction's values before it is scored."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ from fpp_ml_bench.evaluation.protocol import LARGEST_MM, Units
 from fpp_ml_bench.evaluation.units import unit_problem
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
-"""Upper bound of what one declared unit is in mm: no working range is above 1 m, which bounds normalised depth too."""
+"""Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
 
 
 def value_problems(
     prediction: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], target_max_mm: float, units: Units
 ) -> list[str]:
-    """What is wrong with the values of a prediction (H, W) in ``units``; usually nothing.
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list.
 
     ``target_max_mm`` is the largest value of ``target_mm`` (H, W).
     """
@@ -26,10 +26,10 @@ def value_problems(
         nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
         counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
         problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; write 0 where nothing was measured")
-        kept = np.isfinite(prediction)
-        if not kept.any():
+        finite_pixels = np.isfinite(prediction)
+        if not finite_pixels.any():
             return problems
-        finite = np.where(kept, prediction, prediction.dtype.type(0))
+        finite = np.where(finite_pixels, prediction, prediction.dtype.type(0))
         low, high = float(finite.min()), float(finite.max())
     largest = LARGEST_MM / MM_PER_UNIT[units]
     if max(high, -low) > largest:

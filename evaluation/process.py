@@ -1,6 +1,6 @@
-"""What a command that scores sets up in its own process; together it halves the time of scoring a test split.
+"""Settings of a scoring command's own process, which save time.
 
-A library must not do this to its caller's process, so nothing here runs on import.
+A library must not change its caller's process like this, so nothing here runs on import.
 """
 
 import gc
@@ -14,10 +14,10 @@ _KEPT_BYTES = 1 << 30
 def prepare_process() -> None:
     """Keep freed memory, look for no pydantic plugins, and collect no cyclic garbage.
 
-    - glibc's allocator returns every freed array of an image's size to the system and fetches the next anew, page by
-      page, and the page faults take longer than the arithmetic. It is asked to keep up to 1 GiB. Linux only.
-    - pydantic reads the metadata of every installed package, in search of plugins that nobody here uses.
-    - The garbage collector walks over everything that was imported again and again; scoring leaves no cycles behind.
+    - glibc's allocator returns every freed array of an image's size to the system and requests new memory for the next
+      one; the page faults take longer than the arithmetic. It is told to keep up to 1 GiB. Linux only.
+    - pydantic searches the metadata of every installed package for plugins, and this package uses none.
+    - The garbage collector visits every imported object again and again; scoring leaves no reference cycles.
     """
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.disable()

@@ -1,18 +1,19 @@
-"""The scoring protocol's fixed points: version, metric names, limits. PROTOCOL.md says the same in prose.
+"""Constants of the scoring protocol: version, metric names, limits. PROTOCOL.md explains them.
 
-A change that can move any number in a result raises `PROTOCOL_VERSION`; a change of the file's form raises
+A change that can move any number in a result raises `PROTOCOL_VERSION`; a change of the file format raises
 `RESULT_SCHEMA_VERSION`. Results of different protocol versions are never ranked together.
 """
 
 from typing import Literal, get_args
 
 PROTOCOL_VERSION = "1.1.0"
-SchemaVersion = Literal["2.0.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.0.0"
+SchemaVersion = Literal["2.0.0", "2.1.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.1.0"
+"""What is written. 2.1.0 adds the optional ``dataset.benchmark``; files of every `SchemaVersion` are read."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]
-"""What of the ground truth of the very samples it is scored on a method was given; see PROTOCOL.md."""
+"""What a method was given of the ground truth of the scored samples; see PROTOCOL.md."""
 Mode = Literal["standard", "paper-individual"]
 Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)
@@ -38,7 +39,7 @@ BESIDE = (
     "object_missing_share",
     "object_interior_missing_share",
 )
-"""Reported beside the headline: the object away from and along depth edges, and what was not measured at all."""
+"""Reported beside the headline: the object away from and along depth edges, and the pixels that were not measured."""
 
 WITHIN_MM = (1, 2, 5, 10)
 WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
@@ -55,7 +56,7 @@ SPREAD_OF_ERROR = (
     "object_wide_interior_mae_mm",
     "object_wide_band_share",
 )
-"""How the error is distributed over the object set: order statistics, tolerances, bias, what is left without it."""
+"""How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset."""
 
 METRICS = HEADLINE + BESIDE + SPREAD_OF_ERROR
 HIGHER_IS_BETTER = WITHIN
@@ -69,7 +70,7 @@ MILLIMETRES_ABOVE = 1000.0
 METRES_AT_MOST = 100.0
 """A prediction in m whose median over the object is above this is in mm."""
 NORMALISED_AT_MOST = 1.2
-"""A normalised prediction whose median over the object is above this is no share of the sample's range."""
+"""A normalised prediction whose median over the object is above this can't be a share of the sample's range."""
 
 BOOTSTRAP_RESAMPLES = 10_000
 BOOTSTRAP_SEED = 20_250

@@ -1,4 +1,4 @@
-"""What a result was computed with: versions, the checkout's commit, a hash of the scoring's own source, the machine."""
+"""What a result was computed with: versions, the checkout's commit, a hash of the scoring source, the machine."""
 
 import hashlib
 import platform
@@ -15,8 +15,8 @@ from fpp_ml_bench.hardware import describe_hardware
 
 _HERE = Path(__file__).resolve().parent
 _SCORING = (
-    "error_stats.py", "object_pass.py", "object_kernel.py", "predictions.py", "protocol.py", "scores.py", "scoring.py",
-    "summary.py", "uncertainty.py", "units.py",
+    "error_stats.py", "object_pass.py", "predictions.py", "protocol.py", "scores.py", "scoring.py", "summary.py",
+    "uncertainty.py", "units.py",
 )  # fmt: skip
 _COMMIT = re.compile(r"[0-9a-f]{40,64}")
 
@@ -38,27 +38,29 @@ def environment() -> Environment:
 
 
 def checkout_commit(folder: Path) -> str | None:
-    """The commit that the checkout in ``folder`` stands on, read from its ``.git``; None where there is none.
+    """The commit of the checkout in ``folder``, read from its ``.git``; None where there is none.
 
     No ``git`` is run: starting it would take as long as scoring several samples, and it need not be installed.
     """
-    place = folder / ".git"
+    own_folder = folder / ".git"
     try:
-        if place.is_file():  # a worktree: the file says where its own HEAD lies
-            place = folder / place.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
-        head = (place / "HEAD").read_text(encoding="utf-8").strip()
+        if own_folder.is_file():  # a worktree: the file holds the path of its own git folder
+            own_folder = folder / own_folder.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
+        head = (own_folder / "HEAD").read_text(encoding="utf-8").strip()
         if not head.startswith("ref:"):
             return head if _COMMIT.fullmatch(head) else None
         name = head.removeprefix("ref:").strip()
-        common = place / "commondir"
-        homes = [place] + ([place / common.read_text(encoding="utf-8").strip()] if common.is_file() else [])
-        for home in homes:
-            if (home / name).is_file():
-                found = (home / name).read_text(encoding="utf-8").strip()
-                return found if _COMMIT.fullmatch(found) else None
-        for home in homes:
-            if (home / "packed-refs").is_file():
-                for line in (home / "packed-refs").read_text(encoding="utf-8").splitlines():
+        common = own_folder / "commondir"
+        git_folders = [own_folder] + (
+            [own_folder / common.read_text(encoding="utf-8").strip()] if common.is_file() else []
+        )
+        for git_folder in git_folders:
+            if (git_folder / name).is_file():
+                commit = (git_folder / name).read_text(encoding="utf-8").strip()
+                return commit if _COMMIT.fullmatch(commit) else None
+        for git_folder in git_folders:
+            if (git_folder / "packed-refs").is_file():
+                for line in (git_folder / "packed-refs").read_text(encoding="utf-8").splitlines():
                     commit, _, ref = line.partition(" ")
                     if ref == name and _COMMIT.fullmatch(commit):
                         return commit
@@ -69,7 +71,7 @@ def checkout_commit(folder: Path) -> str | None:
 
 @cache
 def scoring_code() -> str:
-    """SHA-256 over the files that numbers come from, 64 hex digits."""
+    """SHA-256 over the source files that compute scores, 64 hex digits."""
     digest = hashlib.sha256()
     for path in (*(_HERE / name for name in _SCORING), Path(pixel_sets.__file__)):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")

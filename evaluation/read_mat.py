@@ -19,8 +19,8 @@ _FILE_BYTES = 1 << 20
 def read_mat(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
     """The matrix ``depth`` (H, W) and the SHA-256 of the file; PredictionError as `read_prediction`.
 
-    Nothing is unpacked beyond what a float64 map of ``size`` and a header can take, and nothing outside the file is
-    followed (HDF5 knows links and storage in other files).
+    No more is unpacked than a float64 map of ``size`` and a header need, and HDF5 links and storage in other files are
+    refused.
     """
     largest = size[0] * size[1] * 8 + _FILE_BYTES
     content = read_bounded(path, largest)

@@ -24,30 +24,30 @@ def read_prediction(path: Path, size: tuple[int, int], buffer: bytearray | None 
     """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored.
 
     ``size`` is the expected (H, W). ``buffer`` (see `buffer_for`) is reused when given: the array is a view of it and
-    holds until the next read. Raises PredictionError, without the file's name, when the file is no plain .npy of that
+    valid until the next read. Raises PredictionError, without the file's name, for anything but a plain .npy of that
     size and a real float dtype.
     """
     buffer = buffer_for(size) if buffer is None else buffer
     view = memoryview(buffer)
     with opened(path) as (stream, length):
-        got = fill(stream, view[: min(HEADER_BYTES, length)])
-        dtype, fortran, start = check_header(bytes(view[:got]), size)
+        filled = fill(stream, view[: min(HEADER_BYTES, length)])
+        dtype, fortran, start = check_header(bytes(view[:filled]), size)
         expected = start + size[0] * size[1] * dtype.itemsize
         check_length(length, expected)
-        got += fill(stream, view[got:expected])
-        if got != expected:
-            raise PredictionError(f"ended early: expected {expected} bytes, got {got}; write it again")
+        filled += fill(stream, view[filled:expected])
+        if filled != expected:
+            raise PredictionError(f"ended early: expected {expected} bytes, got {filled}; write it again")
     digest = hashlib.sha256(view[:expected]).hexdigest()
     return array_in(buffer, size, dtype, fortran, start), digest
 
 
 def buffer_for(size: tuple[int, int]) -> bytearray:
-    """Room for the largest acceptable file of an (H, W) map: float64 and its header."""
+    """A buffer for the largest accepted file of an (H, W) map: float64 and its header."""
     return bytearray(largest_npy(size))
 
 
 def largest_npy(size: tuple[int, int]) -> int:
-    """Bytes of the largest acceptable .npy of an (H, W) map."""
+    """Bytes of the largest accepted .npy of an (H, W) map."""
     return HEADER_BYTES + size[0] * size[1] * 8
 
 
@@ -69,8 +69,8 @@ def array_in(
 def check_length(length: int, expected: int) -> None:
     """Refuse a file that is shorter or longer than its header says."""
     if length != expected:
-        what = "is truncated" if length < expected else "has foreign bytes after the array"
-        raise PredictionError(f"{what}: expected {expected} bytes, got {length}; write it again")
+        problem = "is truncated" if length < expected else "has foreign bytes after the array"
+        raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
 
 
 def check_header(head: bytes, size: tuple[int, int]) -> tuple[np.dtype[Any], bool, int]:
@@ -105,7 +105,7 @@ def check_header(head: bytes, size: tuple[int, int]) -> tuple[np.dtype[Any], boo
 
 
 def check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Refuse, by name, whatever is not a real float map of ``size``: objects, complex, whole numbers, other shapes."""
+    """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers, other shapes."""
     if dtype.hasobject:
         raise PredictionError("holds pickled Python objects, which are never opened; save a float32 array")
     if dtype.kind == "c":

@@ -1,4 +1,4 @@
-"""Predictions as ``.npz``: a zip archive with exactly one array, unpacked no further than such a map can need."""
+"""Predictions as ``.npz``: a zip archive with exactly one array, and no more is unpacked than such a map can need."""
 
 import hashlib
 import io
@@ -20,10 +20,10 @@ _ENCRYPTED = 0x1
 
 
 def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
-    """The one array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_prediction`.
+    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_prediction`.
 
-    The array may have any name. What the archive says of its size is checked before a byte is unpacked, and unpacking
-    stops where that is exceeded: an archive that lies unpacks no further than one that does not.
+    The array may have any name. The size that the archive declares is checked before a byte is unpacked, and unpacking
+    stops at the limit even where the archive declares a wrong size.
     """
     largest = largest_npy(size)
     content = read_bounded(path, largest + _ARCHIVE_BYTES)

@@ -1,8 +1,8 @@
 """Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (floats).
 
-``depth`` holds H lists of W values a row, or one list of H W values, of variable or fixed size, or tensors; float16,
-float32 or float64. What the file unpacks to is checked before it is unpacked: compressed Arrow buffers are refused, and
-a Parquet file's pages are added up first (`fpp_ml_bench.evaluation.parquet_pages`).
+Each row of ``depth`` holds H lists of W values, one list of H W values, or a tensor; float16, float32 or float64. The
+unpacked size is checked before anything is unpacked: compressed Arrow buffers are refused, and the sizes of a Parquet
+file's pages are added up first (`fpp_ml_bench.evaluation.parquet_pages`).
 """
 
 import hashlib
@@ -23,14 +23,15 @@ from fpp_ml_bench.evaluation.text import printable
 
 _ARROW_MAGIC, _PARQUET_MAGIC = b"ARROW1\0\0", b"PAR1"
 _FLOATS = {pa.float16(): np.float16, pa.float32(): np.float32, pa.float64(): np.float64}
-_SLACK_BYTES, _SLACK_A_SAMPLE = 1 << 20, 1 << 16
-_CURE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
+_SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
+_ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
 class TablePredictions:
-    """A reader (`fpp_ml_bench.evaluation.reading.Reader`) over one file; PredictionError, with its name, from here on.
+    """A reader (`fpp_ml_bench.evaluation.reading.Reader`) of a single file.
 
-    The whole file is held in memory, at most a float64 map a sample.
+    `__init__` raises PredictionError with the file's name. The whole file is held in memory: at most a float64 map per
+    sample.
     """
 
     def __init__(self, path: Path, samples: Sequence[str], size: tuple[int, int]) -> None:
@@ -49,11 +50,11 @@ class TablePredictions:
         with self._lock:
             column = self._table.column("depth").slice(self._rows[sample], 1).combine_chunks()
         values = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
-        return _map(values, self._size), self._digest
+        return _depth_map(values, self._size), self._digest
 
 
 def _read(path: Path, samples: int, size: tuple[int, int]) -> tuple[pa.Table, str]:
-    largest = samples * (size[0] * size[1] * 8 + size[0] * 16 + _SLACK_A_SAMPLE) + _SLACK_BYTES
+    largest = samples * (size[0] * size[1] * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
     content = read_bounded(path, largest)
     digest = hashlib.sha256(content).hexdigest()
     try:
@@ -70,7 +71,7 @@ def _read(path: Path, samples: int, size: tuple[int, int]) -> tuple[pa.Table, st
         if isinstance(error, PredictionError):
             raise
         reason = printable(str(error).split("\n")[0], 120)
-        raise PredictionError(f"can't be read as Arrow or Parquet ({reason}); {_CURE}") from None
+        raise PredictionError(f"can't be read as Arrow or Parquet ({reason}); {_ADVICE}") from None
     return table, digest
 
 
@@ -79,7 +80,7 @@ def _parquet(content: bytes, largest: int, samples: int, size: tuple[int, int]) 
 
     limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
     file = pq.ParquetFile(pa.py_buffer(content), **limits)
-    # Twice what is needed, so that a row too many is refused by its name and not by its size.
+    # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
     check_pages(file.metadata, content, 2 * largest, 2 * samples * (size[0] * size[1] + 1))
     _check_columns(file.schema_arrow)
     return file.read(use_threads=False)
@@ -88,22 +89,22 @@ def _parquet(content: bytes, largest: int, samples: int, size: tuple[int, int]) 
 def _check_columns(schema: pa.Schema) -> None:
     if sorted(schema.names) != ["depth", "sample"]:
         raise PredictionError(
-            f"holds the columns {printable(', '.join(schema.names), 120)}; expected sample and depth: {_CURE}"
+            f"holds the columns {printable(', '.join(schema.names), 120)}; expected sample and depth: {_ADVICE}"
         )
     if schema.field("sample").type not in (pa.string(), pa.large_string()):
-        raise PredictionError(f"column sample: expected text, got {schema.field('sample').type}; {_CURE}")
+        raise PredictionError(f"column sample: expected text, got {schema.field('sample').type}; {_ADVICE}")
     value = schema.field("depth").type
-    while (inner := _inside(value)) is not None:
+    while (inner := _item_type(value)) is not None:
         value = inner
     if value not in _FLOATS or value == schema.field("depth").type:
-        found = printable(str(schema.field("depth").type), 80)
+        depth_type = printable(str(schema.field("depth").type), 80)
         raise PredictionError(
-            f"column depth: expected lists of float16, float32 or float64, got {found}; whole numbers wrap around, "
-            f"anything else is no depth: {_CURE}"
+            f"column depth: expected lists of float16, float32 or float64, got {depth_type}; whole numbers wrap "
+            f"around, other types are not depth: {_ADVICE}"
         )
 
 
-def _inside(value: pa.DataType) -> pa.DataType | None:
+def _item_type(value: pa.DataType) -> pa.DataType | None:
     if isinstance(value, pa.BaseExtensionType):
         return value.storage_type
     if pa.types.is_list(value) or pa.types.is_large_list(value) or pa.types.is_fixed_size_list(value):
@@ -125,11 +126,11 @@ def _rows(table: pa.Table, samples: Sequence[str]) -> dict[str, int]:
     return rows
 
 
-def _map(column: pa.Array, size: tuple[int, int]) -> NDArray[Any]:
+def _depth_map(column: pa.Array, size: tuple[int, int]) -> NDArray[Any]:
     """The (H, W) map in a column of one row."""
     shape: list[int] = []
     values = column
-    while _inside(values.type) is not None:
+    while _item_type(values.type) is not None:
         if isinstance(values, pa.ExtensionArray):
             values = values.storage
             continue

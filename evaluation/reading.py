@@ -1,4 +1,4 @@
-"""One way into every accepted form of prediction: a reader that gives a sample's map and the hash of its file."""
+"""Readers of all accepted forms of predictions: each gives a sample's depth map and the hash of its file."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 from fpp_ml_bench.evaluation.listing import TABLES
 from fpp_ml_bench.evaluation.read_npy import buffer_for, read_prediction
 
-Read = tuple[NDArray[Any], str]
+MapAndHash = tuple[NDArray[Any], str]
 
 
 class Reader(Protocol):
-    """Called from several threads; ``memory`` is the calling thread's own, for buffers that are used again."""
+    """Called from several threads; ``memory`` is the calling thread's own, for buffers that it reuses."""
 
-    def __call__(self, sample: str, memory: local) -> Read: ...
+    def __call__(self, sample: str, memory: local) -> MapAndHash: ...
 
     def named(self, sample: str) -> str:
-        """What to call the sample's prediction in a message: its file."""
+        """The name of the sample's prediction in messages: its file."""
         ...
 
 
-class _Files:
-    def __init__(self, folder: Path, form: str, read: Callable[[Path, local], Read]) -> None:
+class _FilePerSample:
+    def __init__(self, folder: Path, form: str, read: Callable[[Path, local], MapAndHash]) -> None:
         self._folder, self._form, self._read = folder, form, read
 
     def named(self, sample: str) -> str:
         return f"{sample}{self._form}"
 
-    def __call__(self, sample: str, memory: local) -> Read:
+    def __call__(self, sample: str, memory: local) -> MapAndHash:
         return self._read(self._folder / self.named(sample), memory)
 
 
@@ -39,7 +39,7 @@ def reader_for(
 ) -> Reader:
     """The reader of ``form`` (of `fpp_ml_bench.evaluation.listing`) for maps of ``size`` (H, W).
 
-    Its calls raise PredictionError, without the file's name, for a file that can't be taken.
+    Its calls raise PredictionError, without the file's name, for a file that is refused.
     """
     if form in TABLES:
         from fpp_ml_bench.evaluation.read_table import TablePredictions
@@ -48,19 +48,19 @@ def reader_for(
     if form == ".npz":
         from fpp_ml_bench.evaluation.read_npz import read_npz
 
-        return _Files(folder, form, lambda path, memory: read_npz(path, size))
+        return _FilePerSample(folder, form, lambda path, memory: read_npz(path, size))
     if form == ".mat":
         from fpp_ml_bench.evaluation.read_mat import read_mat
 
-        return _Files(folder, form, lambda path, memory: read_mat(path, size))
+        return _FilePerSample(folder, form, lambda path, memory: read_mat(path, size))
     if form == ".png":
         from fpp_ml_bench.evaluation.read_png import read_png
 
-        return _Files(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
-    return _Files(folder, form, lambda path, memory: _read_npy(path, size, memory))
+        return _FilePerSample(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
+    return _FilePerSample(folder, form, lambda path, memory: _read_npy(path, size, memory))
 
 
-def _read_npy(path: Path, size: tuple[int, int], memory: local) -> Read:
+def _read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
     if not hasattr(memory, "buffer"):
         memory.buffer = buffer_for(size)
     return read_prediction(path, size, memory.buffer)

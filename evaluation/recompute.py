@@ -1,21 +1,21 @@
-"""Whether a result says what its predictions give: everything scored again, every difference named."""
+"""Whether a result follows from its predictions: everything is scored again, every difference is named."""
 
 from pathlib import Path
-from typing import Any
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.evaluator import ScoredDataset, evaluate
 from fpp_ml_bench.evaluation.protocol import METRICS, PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.result_checks import same
+from fpp_ml_bench.evaluation.result_models import SampleResult, dataset_identity
 from fpp_ml_bench.evaluation.text import printable
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
-"""`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions anyway."""
+"""`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
 
 
 def differences(result: Result, folder: Path, dataset: ScoredDataset) -> list[str]:
-    """What of ``result`` does not follow from the predictions in ``folder`` on ``dataset``, one line each; none: sound.
+    """What of ``result`` does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
 
     Time and place of scoring and the method's run time are not compared. Raises what `evaluate` raises, and
     SubmissionError for a result of another protocol version, which this version can't recompute.
@@ -27,53 +27,53 @@ def differences(result: Result, folder: Path, dataset: ScoredDataset) -> list[st
         )
     if result.dataset.fingerprint != dataset.fingerprint:
         return [
-            f"dataset.fingerprint: {result.dataset.fingerprint[:16]} in the result, {dataset.fingerprint[:16]} is what "
-            f"{printable(str(dataset.path), 200)} has"
+            f"dataset.fingerprint: {_value_text(result.dataset.identity)} in the result, "
+            f"{dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
         ]
-    again = evaluate(folder, dataset, result.dataset.split, result.target, result.edge_band_px, result.mode)
+    recomputed = evaluate(folder, dataset, result.dataset.split, result.target, result.edge_band_px, result.mode)
     problems = [
-        f"{name}: {_shown(one)} in the result, {_shown(two)} recomputed"
-        for name, one, two in (
-            ("dataset.size", result.dataset.size, again.dataset.size),
-            ("dataset.samples", result.dataset.samples, again.dataset.samples),
-            ("edge_jump_mm", result.edge_jump_mm, again.edge_jump_mm),
+        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} recomputed"
+        for name, stored, value in (
+            ("dataset.size", result.dataset.size, recomputed.dataset.size),
+            ("dataset.samples", result.dataset.samples, recomputed.dataset.samples),
+            ("edge_jump_mm", result.edge_jump_mm, recomputed.edge_jump_mm),
         )
-        if one != two
+        if stored != value
     ]
-    problems += _submission(result, again)
-    stored = {row.sample: row for row in result.per_sample}
-    if set(stored) != {row.sample for row in again.per_sample}:
+    problems += _submission_differences(result, recomputed)
+    stored_rows = {row.sample: row for row in result.per_sample}
+    if set(stored_rows) != {row.sample for row in recomputed.per_sample}:
         return [*problems, "per_sample: other samples than the split has"]
-    for row in again.per_sample:
-        problems += _sample(stored[row.sample], row)
+    for row in recomputed.per_sample:
+        problems += _sample_differences(stored_rows[row.sample], row)
     return problems
 
 
-def _submission(result: Result, again: Result) -> list[str]:
-    one, two = result.submission.model_dump(), again.submission.model_dump()
+def _submission_differences(result: Result, recomputed: Result) -> list[str]:
+    stored, described = result.submission.model_dump(), recomputed.submission.model_dump()
     return [
-        f"submission.{key}: {_shown(one.get(key))} in the result, {_shown(two.get(key))} in submission.yaml"
-        for key in dict.fromkeys((*one, *two))
-        if key not in _TIME_KEYS and one.get(key) != two.get(key)
+        f"submission.{key}: {_value_text(stored.get(key))} in the result, {_value_text(described.get(key))} in "
+        "submission.yaml"
+        for key in dict.fromkeys((*stored, *described))
+        if key not in _TIME_KEYS and stored.get(key) != described.get(key)
     ]
 
 
-def _sample(stored: Any, again: Any) -> list[str]:
+def _sample_differences(stored: SampleResult, recomputed: SampleResult) -> list[str]:
     exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
-    problems = [
-        f"{again.sample}: {key}: {_shown(getattr(stored, key))} in the result, {_shown(getattr(again, key))} recomputed"
-        for key in exact
-        if getattr(stored, key) != getattr(again, key)
-    ]
-    scale = again.object_mae_mm or 0.0
+    keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
+    object_mae_mm = recomputed.object_mae_mm or 0.0
     for key in METRICS:
-        one, two = getattr(stored, key), getattr(again, key)
-        # Signed means and what is left of a shift are small differences of large numbers.
-        dust = 1e-9 * scale if "bias" in key or "shift_free" in key else 0.0
-        if not same(one, two, dust):
-            problems.append(f"{again.sample}: {key}: {_shown(one)} in the result, {_shown(two)} recomputed")
-    return problems
+        # Signed means and the error without an offset are small differences of large numbers.
+        rounding_mm = 1e-9 * object_mae_mm if "bias" in key or "shift_free" in key else 0.0
+        if not same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
+            keys.append(key)
+    return [
+        f"{recomputed.sample}: {key}: {_value_text(getattr(stored, key))} in the result, "
+        f"{_value_text(getattr(recomputed, key))} recomputed"
+        for key in keys
+    ]
 
 
-def _shown(value: object) -> str:
+def _value_text(value: object) -> str:
     return printable(value if isinstance(value, str) else repr(value), 80)

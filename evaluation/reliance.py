@@ -1,6 +1,7 @@
-"""Phase reliance as part of a result: how far a method's answers follow the fringe's phase, by counterfactual scenes.
+"""Phase reliance as part of a result: how far a method's answers follow the phase of the fringes.
 
-``fpp_ml_bench.baselines.diagnostics.reliance`` defines and measures it; here is what a result file says of it.
+``fpp_ml_bench.baselines.diagnostics.reliance`` defines it and measures it on counterfactual scenes; this module is the
+form of its block in a result file.
 """
 
 from typing import Annotated, Literal
@@ -16,14 +17,15 @@ RELIANCE_VERSION: RelianceVersion = "1.0.0"
 
 
 class RelianceParts(StrictModel):
-    """What the score is made of, and what stands beside it; means over samples, null where there is nothing to say.
+    """The parts of the score, and further measurements; means over samples, null where a part can't be measured.
 
-    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline: ``phase``, where only
-    the phase is the moved surface's and every pixel keeps its brightness (the score's); ``light``, where only the
-    brightness is; ``both``, as it would be photographed; ``constant``, the phase alone, by one constant.
-    ``change_*``: how much the answer moves, in units of what the phase's moves ask: under another outline (the
-    score's), without fringes inside or outside the object, under the fringes of the other direction, of another pitch.
-    ``answered_*``: share of the object's pixels that have an answer there. ``order_free_*``: allowing whole periods.
+    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline. ``phase``: only the
+    phase is that of the moved surface, every pixel keeps its brightness (part of the score). ``light``: only the
+    brightness is. ``both``: both, as a camera would see it. ``constant``: the phase alone, moved by a constant.
+    ``change_*``: how much the answer changes, relative to the change that the phase asks for: with another outline
+    (part of the score), without fringes inside or outside the object, with fringes of the other direction or of
+    another pitch. ``answered_*``: share of the object's pixels that have an answer in that case. ``order_free_*``:
+    the same, allowing whole periods.
     """
 
     follows_phase: Share | None

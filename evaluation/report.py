@@ -1,4 +1,4 @@
-"""The report a person looks at: the errors' histogram, the scores, and samples from best to worst on one HTML page."""
+"""The report of a result: a histogram of the errors, the scores, and samples from best to worst on an HTML page."""
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator
@@ -26,7 +26,7 @@ from fpp_ml_bench.loaders.manifest import write_atomically
 Pair = tuple[NDArray[np.floating], NDArray[np.floating]]
 REPORT_FILE = "index.html"
 _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.25), ("Upper quartile", 0.75))
-"""The samples that are shown, in the order in which they claim one where there are few, and their place by error."""
+"""The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
 
 
 class ReportedDataset(Protocol):
@@ -50,11 +50,11 @@ def write_report(result: Result, dataset: ReportedDataset, predictions_folder: s
     The page is self-contained and loads nothing. Pixels of at most five samples are read, so memory does not grow with
     the number of samples.
 
-    Raises DatasetError when ``dataset`` is not the one that was scored, PredictionError for a prediction that can't be
-    read any more, and SubmissionError where the page can't be written.
+    Raises DatasetError when ``dataset`` is not the dataset that was scored, PredictionError for a prediction that can't
+    be read any more, and SubmissionError where the page can't be written.
     """
-    found = chosen_panels(result, dataset, Path(predictions_folder))
-    body = report_body(result, [_sample_html(*sample) for sample in found])
+    panels = chosen_panels(result, dataset, Path(predictions_folder))
+    body = report_body(result, [_sample_html(*sample) for sample in panels])
     path = Path(out) / REPORT_FILE
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,13 +66,13 @@ def write_report(result: Result, dataset: ReportedDataset, predictions_folder: s
 
 def chosen_samples(rows: Iterable[SampleResult]) -> list[tuple[str, SampleResult]]:
     """Best, median, worst and the quartiles by object MAE, each sample once, with the place it holds."""
-    known = sorted((row for row in rows if row.object_mae_mm is not None), key=_by_object_error)
+    scored = sorted((row for row in rows if row.object_mae_mm is not None), key=_by_object_error)
     chosen: dict[str, tuple[str, SampleResult]] = {}
     for title, share in _PLACES:
-        if known:
-            row = known[round(share * (len(known) - 1))]
+        if scored:
+            row = scored[round(share * (len(scored) - 1))]
             chosen.setdefault(row.sample, (title, row))
-    return sorted(chosen.values(), key=lambda found: _by_object_error(found[1]))
+    return sorted(chosen.values(), key=lambda place_and_row: _by_object_error(place_and_row[1]))
 
 
 def _by_object_error(row: SampleResult) -> tuple[float, str]:
@@ -84,7 +84,7 @@ def chosen_panels(
 ) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
     """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time.
 
-    Raises DatasetError when ``dataset`` is not the one that was scored.
+    Raises DatasetError when ``dataset`` is not the dataset that was scored.
     """
     if dataset.fingerprint != result.dataset.fingerprint:
         raise DatasetError(
@@ -129,7 +129,7 @@ def prediction_reader(result: Result, dataset: ReportedDataset, folder: Path) ->
 
 
 def _fringe(result: Result, dataset: ReportedDataset, sample: str) -> NDArray[np.uint8]:
-    """The first frame that the method used, or frame 0 for one that says it used none or is not stored here."""
+    """The first frame that the method used; frame 0 where it used none or that frame is not stored here."""
     used = [index for index in sorted(result.submission.frames_used) if index < len(dataset.sequence)]
     try:
         return dataset.frame(sample, used[0] if used else 0)
@@ -139,13 +139,17 @@ def _fringe(result: Result, dataset: ReportedDataset, sample: str) -> NDArray[np
 
 def report_body(result: Result, panels: list[str]) -> str:
     """The page below ``<body>``."""
-    about, submission = result.dataset, result.submission
-    taken = submission.seconds_per_sample
-    time = "unknown time" if taken is None else f"{seconds(taken)} s a sample ({submission.seconds_source})"
+    info, submission = result.dataset, result.submission
+    sample_seconds = submission.seconds_per_sample
+    time = (
+        "unknown time"
+        if sample_seconds is None
+        else f"{seconds(sample_seconds)} s per sample ({submission.seconds_source})"
+    )
     lines = [
-        f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
-        f"{about.size[1]} x {about.size[0]} px, against {result.target}, {result.track} track",
-        f"{len(submission.frames_used)} frames a sample; {time}; protocol {result.protocol_version}, scored "
+        f"{info.split} split of {printable(info.name)} ({printable(info.identity)}), {info.samples} samples of "
+        f"{info.size[1]} x {info.size[0]} px, against {result.target}, {result.track} track",
+        f"{len(submission.frames_used)} frames per sample; {time}; protocol {result.protocol_version}, scored "
         f"{result.created}",
     ]
     errors = [row.object_mae_mm for row in result.per_sample if row.object_mae_mm is not None]
@@ -169,8 +173,8 @@ def report_body(result: Result, panels: list[str]) -> str:
 
 def _missing(result: Result) -> str:
     parts = []
-    for what in ("object", "background"):
-        count = getattr(result, f"samples_without_{what}")
+    for pixels in ("object", "background"):
+        count = getattr(result, f"samples_without_{pixels}")
         if count:
-            parts.append(f"<p>{count} of {result.dataset.samples} samples have no {what} and no score of it.</p>")
+            parts.append(f"<p>{count} of {result.dataset.samples} samples have no {pixels} and no score of it.</p>")
     return "".join(parts)

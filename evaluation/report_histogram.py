@@ -13,7 +13,7 @@ _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 def nice_step(span: float, parts: int) -> float:
-    """The round number (1, 2, 2.5 or 5 x 10^k) nearest above ``span / parts``; 1 for no span to speak of."""
+    """The round number (1, 2, 2.5 or 5 x 10^k) next above ``span / parts``; 1 for a span of 0."""
     raw = span / parts
     if not raw > _LEAST:
         return 1.0
@@ -22,10 +22,10 @@ def nice_step(span: float, parts: int) -> float:
 
 
 def bins(values: Sequence[float]) -> tuple[list[float], list[int]]:
-    """Edges of equal bins at round numbers, and how many values lie in each; a value on an edge counts right of it."""
+    """Edges of equal bins at round numbers, and how many values lie in each; a value on an edge is right of it."""
     low, high = min(values), max(values)
-    # Twice the cube root of n bins (Rice's rule); values that are all the same get one bin around them.
-    # Where they differ in the last digits only, bins that narrow would have no numbers to tell them apart.
+    # Twice the cube root of n bins (Rice's rule); equal values get a single bin around them. Values that differ only
+    # in their last digits would need edges that no float64 can hold, so the bins stay wider than 1e-6 of the value.
     step = nice_step(max(high - low, 1e-6 * high) if high > low else high, max(4, round(2 * len(values) ** (1 / 3))))
     first, last = math.floor(low / step), math.floor(high / step) + 1
     counts = [0] * (last - first)
@@ -73,6 +73,6 @@ def histogram_svg(values: Sequence[float], mean: float, label: str) -> str:
         f'<text x="{_LEFT + width / 2:.1f}" y="{HEIGHT - 6}" text-anchor="middle" font-size="12">'
         f"{escaped(label)}, mm</text>"
     )
-    said = f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm"
-    attributes = f'class="histogram" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escaped(said)}"'
+    description = f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm"
+    attributes = f'class="histogram" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escaped(description)}"'
     return f"<svg {attributes}>{''.join(parts)}</svg>"

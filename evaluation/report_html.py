@@ -1,7 +1,7 @@
-"""Writing HTML in which text from a submission can only be text: escaping, and pages that load nothing.
+"""Writing HTML pages in which text from a submission stays text, and which load nothing.
 
-A page carries its style, its script and its pictures in itself. Its Content-Security-Policy names the hash of that
-style and that script and allows nothing else: no request leaves the page, and no injected script could run.
+A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
+the given hashes: the page sends no request, and an injected script can't run.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ _HERE = Path(__file__).resolve().parent
 
 
 def escaped(value: object, limit: int = NAME_LIMIT) -> str:
-    """``value`` as HTML text or attribute value that shows exactly it: at most ``limit`` characters, none special."""
+    """``value`` escaped as HTML text or attribute value, at most ``limit`` characters."""
     return html.escape(printable(value, limit), quote=True)
 
 
@@ -36,14 +36,14 @@ def page(title: str, body: str, style: str = "", script: str = "", description: 
     style = base_style() + style
     allowed = ["default-src 'none'", "img-src data:", f"style-src {_source(style)}", "base-uri 'none'"]
     allowed += ["form-action 'none'", *([f"script-src {_source(script)}"] if script else [])]
-    about = f'<meta name="description" content="{escaped(description, 300)}">\n' if description else ""
+    meta = f'<meta name="description" content="{escaped(description, 300)}">\n' if description else ""
     code = f"<script>{script}</script>\n" if script else ""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(allowed)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f'<title>{escaped(title)}</title>\n{about}<link rel="icon" href="data:,">\n<style>{style}</style>\n</head>\n'
+        f'<title>{escaped(title)}</title>\n{meta}<link rel="icon" href="data:,">\n<style>{style}</style>\n</head>\n'
         f'<body>\n<a class="skip" href="#main">Skip to the content</a>\n{body}\n{code}</body>\n</html>\n'
     )
 
@@ -53,7 +53,7 @@ def _source(text: str) -> str:
 
 
 def data_uri(png: bytes) -> str:
-    """A PNG as an address that an ``img`` shows without a request."""
+    """A PNG as a data URI, which an ``img`` shows without a request."""
     return "data:image/png;base64," + b64encode(png).decode("ascii")
 
 

@@ -1,6 +1,6 @@
 """The paper's four panels of a sample (fringe, truth, prediction, absolute error), and the signed error beside them.
 
-Pictures are thinned to `PANEL_PX` by leaving pixels out, never by averaging: a mean across a depth edge is no depth.
+Pictures are reduced to `PANEL_PX` by leaving pixels out, not by averaging: a mean across a depth edge is not a depth.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from fpp_ml_bench.pixel_sets import object_mask
 
 PANEL_PX = 320
 CLIP_PERCENTILE = 95
-"""Where the paper clips its error maps (figures of Section 6). Own choice: of the object pixels' errors."""
+"""Where the paper clips its error maps (figures of Section 6); here it is the percentile over the object pixels."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture as ``indices`` (0 is transparent) into a map of ``colours``, what it shows, its scale's ends."""
+    """A picture: ``indices`` (0 is transparent) into the colour map ``colours``, a description, its scale."""
 
     title: str
     indices: NDArray[np.uint8]
@@ -46,14 +46,14 @@ def sample_panels(
     """The five panels of a sample; all maps (H, W), depth in mm with 0 = background."""
     inside = object_mask(np.asarray(target_mm))
     error_mm = np.asarray(prediction_mm, np.float64) - target_mm
-    shown_depth = target_mm[inside] if inside.any() else np.zeros(1)
-    low, high = float(shown_depth.min()), float(shown_depth.max())
+    object_depth = target_mm[inside] if inside.any() else np.zeros(1)
+    low, high = float(object_depth.min()), float(object_depth.max())
     clip = float(np.percentile(np.abs(error_mm[inside if inside.any() else ...]), CLIP_PERCENTILE))
     predicted = np.asarray(prediction_mm) > 0
     ends = f"{low:.0f}", f"{high:.0f} mm"
     limit = f"{millimetres(clip)} mm"
     return [
-        Panel("Fringe", np.maximum(_thinned(fringe), 1), "gray", f"{sample}: the captured fringe image"),
+        Panel("Fringe", np.maximum(_subsampled(fringe), 1), "gray", f"{sample}: the captured fringe image"),
         _coloured(
             "Truth", target_mm, inside, "viridis", low, high, ends,
             f"{sample}: true depth, {ends[0]} to {ends[1]}",
@@ -74,7 +74,7 @@ def sample_panels(
 
 
 def panels_html(panels: list[Panel]) -> str:
-    """The panels side by side; each picture says in words what it shows."""
+    """The panels side by side; each picture has a description in words."""
     figures = []
     for panel in panels:
         scale = ""
@@ -99,7 +99,7 @@ def colour_table(name: str, levels: int = 255) -> NDArray[np.uint8]:
     return np.vstack([np.zeros((1, 3)), 255 * table]).round().astype(np.uint8)
 
 
-def _thinned(image: NDArray) -> NDArray:
+def _subsampled(image: NDArray) -> NDArray:
     step = max(1, -(-max(image.shape) // PANEL_PX))
     return image[::step, ::step]
 
@@ -107,15 +107,15 @@ def _thinned(image: NDArray) -> NDArray:
 def _coloured(
     title: str,
     values: NDArray,
-    shown: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     colours: str,
     low: float,
     high: float,
     ends: tuple[str, str],
     description: str,
 ) -> Panel:
-    """Values from ``low`` to ``high`` in colours, the ends' beyond them, transparent where not ``shown``."""
-    values, shown = _thinned(np.asarray(values, np.float64)), _thinned(shown)
+    """Values from ``low`` to ``high`` in colours, clipped at both ends, transparent where not ``visible``."""
+    values, visible = _subsampled(np.asarray(values, np.float64)), _subsampled(visible)
     share = np.clip((values - low) / (high - low), 0, 1) if high > low else np.zeros_like(values)
-    indices = np.where(shown, 1 + np.round(254 * share), 0).astype(np.uint8)
+    indices = np.where(visible, 1 + np.round(254 * share), 0).astype(np.uint8)
     return Panel(title, indices, colours, description, *ends)

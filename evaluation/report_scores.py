@@ -1,4 +1,4 @@
-"""Names of the scores for people, in the order in which a page shows them, and tables of them in HTML."""
+"""Titles of the scores in the order of a page, and HTML tables of scores."""
 
 from collections.abc import Callable, Sequence
 
@@ -40,12 +40,12 @@ _TITLES = {
 
 
 def metric_title(key: str) -> str:
-    """What ``key`` of `METRICS` is called on a page."""
+    """The title of ``key`` of `METRICS` on a page."""
     return _TITLES.get(key, key.removesuffix("_mm").replace("_", " ").capitalize())
 
 
 def shown_metrics() -> list[str]:
-    """Every key of `METRICS`: the known ones in the page's order, then any other."""
+    """Every key of `METRICS`: those with a title in the page's order, then all others."""
     return [*(key for key in _TITLES if key in METRICS), *(key for key in METRICS if key not in _TITLES)]
 
 
@@ -68,14 +68,14 @@ def interval_text(interval: tuple[float, float] | None) -> str:
 def html_table(
     caption: str, titles: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1, small: str = ""
 ) -> str:
-    """A table with a header a column and a row; every cell is text. The first ``text_columns`` stand on the left."""
+    """A table with column and row headers; every cell is text. The first ``text_columns`` are aligned left."""
     head = "".join(
-        f'<th scope="col"{_left(place < text_columns)}>{escaped(title)}</th>' for place, title in enumerate(titles)
+        f'<th scope="col"{_left(column < text_columns)}>{escaped(title)}</th>' for column, title in enumerate(titles)
     )
     body = "".join(
         "<tr>"
         + f'<th scope="row">{escaped(row[0])}</th>'
-        + "".join(f"<td{_left(place < text_columns)}>{escaped(cell)}</td>" for place, cell in enumerate(row[1:], 1))
+        + "".join(f"<td{_left(column < text_columns)}>{escaped(cell)}</td>" for column, cell in enumerate(row[1:], 1))
         + "</tr>\n"
         for row in rows
     )

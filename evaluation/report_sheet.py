@@ -17,7 +17,7 @@ TILE_PX, GAP_PX = 160, 8
 PLACES = ("Best", "Median", "Worst")
 _MAPS = ("gray", "viridis", "magma", "coolwarm")
 _LEVELS = 63
-"""Colours a map: four of them and the transparent index fit into the 256 of a PNG's palette."""
+"""Colours per map: four maps and the transparent index fit into a PNG's palette of 256."""
 
 
 def write_sheet(result: Result, dataset: ReportedDataset, predictions_folder: str | Path, path: Path) -> None:
@@ -42,7 +42,7 @@ def sheet_png(rows: list[list[Panel]]) -> bytes:
 def _tile(panel: Panel) -> NDArray[np.uint8]:
     """The panel's indices into the common palette at the tile's size, with the gap right of it and below.
 
-    Pixels are left out or repeated, never mixed.
+    Pixels are left out or repeated, never averaged.
     """
     height, width = panel.indices.shape
     side = max(height, width)

@@ -1,4 +1,4 @@
-"""``result.json``: one submission's scores on one split, as a strict model that checks itself.
+"""``result.json``: the scores of a submission on a split, as a strict model that checks itself.
 
 A result that was edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample
 scores whenever a file is read, and overall is checked against object and background in every sample.
@@ -41,7 +41,7 @@ from fpp_ml_bench.evaluation.uncertainty import intervals_over_objects
 
 
 class Result(StrictModel):
-    """Everything `fpp-eval` found out. Deterministic but for ``created`` and the machine in ``environment``."""
+    """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
 
     schema_version: SchemaVersion
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
@@ -67,7 +67,7 @@ class Result(StrictModel):
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Not written where it was not measured, so that files from before there was this key stay as they are.
+        # Absent where it was not measured, so that files without this key stay as they are.
         content: dict[str, Any] = handler(self)
         if self.reliance is None:
             content.pop("reliance", None)
@@ -79,7 +79,7 @@ class Result(StrictModel):
 
     @property
     def timing(self) -> Timing | None:
-        """What `fpp-bench time` measured, or what the submission says of itself; None when it says nothing."""
+        """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
         return self.submission.timing
 
     @field_validator("created")
@@ -118,7 +118,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     intervals = intervals_over_objects(rows, objects, HEADLINE)
     return {
         "metrics": mean_over_samples(rows),
-        "intervals": {key: [None, None] if found is None else list(found) for key, found in intervals.items()},
+        "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
         "median": median_over_samples(rows),
         "pooled": pooled_scores(inside, outside),
         "samples_without_object": sum(row.object_pixels == 0 for row in per_sample),
@@ -134,7 +134,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     }
 
 
-def result_from_rows(rows: list[dict[str, Any]], **about: Any) -> Result:
+def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
     """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
     per_sample = [SampleResult(**row) for row in rows]
-    return Result(schema_version=RESULT_SCHEMA_VERSION, per_sample=per_sample, **_derived(per_sample), **about)
+    return Result(schema_version=RESULT_SCHEMA_VERSION, per_sample=per_sample, **_derived(per_sample), **fields)

@@ -10,7 +10,7 @@ from fpp_ml_bench.evaluation.result_models import SampleResult
 from fpp_ml_bench.evaluation.submission import Submission
 
 AGREES = 1e-9
-"""Relative difference at which two computations of one average still count as the same number."""
+"""Relative difference up to which two computations of an average count as the same number."""
 
 
 def check_sample(row: SampleResult, pixels: int) -> None:
@@ -30,7 +30,7 @@ def check_sample(row: SampleResult, pixels: int) -> None:
 
 
 def check_reliance(reliance: Reliance, submission: Submission) -> None:
-    """Refuse (ValueError) a phase reliance that is of other weights or another output than was scored."""
+    """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
     weights = submission.settings.get("weights_sha256")
     if weights != reliance.weights_sha256:
         raise ValueError(
@@ -69,11 +69,11 @@ def check_same(name: str, stored: Any, computed: Any) -> None:
     elif isinstance(computed, list):
         if len(stored) != len(computed):
             raise ValueError(f"{name} holds {len(stored)} entries, per_sample makes {len(computed)}")
-        for place, (one, other) in enumerate(zip(stored, computed, strict=True)):
-            check_same(f"{name}.{place}", one, other)
+        for index, (stored_item, computed_item) in enumerate(zip(stored, computed, strict=True)):
+            check_same(f"{name}.{index}", stored_item, computed_item)
     elif isinstance(computed, float) or computed is None:
-        # A mean of signed values may cancel to dust, whose digits depend on the machine.
-        if not same(stored, computed, dust=1e-9 if name.endswith("bias_mm") else 0.0):
+        # A mean of signed values may cancel to rounding errors, which depend on the machine.
+        if not same(stored, computed, rounding=1e-9 if name.endswith("bias_mm") else 0.0):
             raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
     elif stored != computed:
         if name.startswith("samples_without_"):
@@ -81,8 +81,8 @@ def check_same(name: str, stored: Any, computed: Any) -> None:
         raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
 
 
-def same(one: float | None, other: float | None, dust: float = 0.0) -> bool:
-    """Whether two numbers agree to `AGREES`, or to ``dust``; None agrees with None only."""
-    if one is None or other is None:
-        return one is other
-    return math.isclose(one, other, rel_tol=AGREES, abs_tol=dust)
+def same(first: float | None, second: float | None, rounding: float = 0.0) -> bool:
+    """Whether two numbers differ by at most `AGREES` relatively, or ``rounding``; None equals None only."""
+    if first is None or second is None:
+        return first is second
+    return math.isclose(first, second, rel_tol=AGREES, abs_tol=rounding)

@@ -1,11 +1,11 @@
-"""Result files on disk: written complete or not at all, read as strictly as they are written."""
+"""Result files on disk: written complete or not at all, and read strictly."""
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION
+from fpp_ml_bench.evaluation.protocol import SchemaVersion
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.evaluation.text import printable
@@ -50,34 +50,34 @@ def read_result(path: Path) -> Result:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file from a stranger holds: bounded, no key twice, no NaN. SubmissionError names file and fault."""
-    shown = printable(str(path), 500)
+    """The content of a JSON file: of bounded size, no key twice, no NaN. SubmissionError names file and problem."""
+    file = printable(str(path), 500)
     try:
         if not path.is_file():
-            raise SubmissionError(f"{shown}: expected a result file of fpp-eval, found {_kind(path)}")
+            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {_kind(path)}")
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
-        raise SubmissionError(f"{shown} can't be read: {error.strerror}") from None
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
     if len(data) > MAX_BYTES:
-        raise SubmissionError(f"{shown}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
+        raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
     try:
         return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
     except UnicodeDecodeError:
-        raise SubmissionError(f"{shown}: expected UTF-8 text; write it again with fpp-eval --json") from None
+        raise SubmissionError(f"{file}: expected UTF-8 text; write it again with fpp-eval --json") from None
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
-        raise SubmissionError(f"{shown} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+        raise SubmissionError(f"{file} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
 
 
 def parse_result(content: Any, path: Path) -> Result:
     """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
-    shown = printable(str(path), 500)
+    file = printable(str(path), 500)
     version = content.get("schema_version") if isinstance(content, dict) else None
-    if version != RESULT_SCHEMA_VERSION:
-        came = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
+    if version not in get_args(SchemaVersion):
+        given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
         raise SubmissionError(
-            f"{shown}: expected a result file with schema_version {RESULT_SCHEMA_VERSION}, got {came}; "
+            f"{file}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}; "
             "score the predictions again with this version's fpp-eval"
         )
     result: Result = validate(Result, content, path, "result of fpp-eval")
@@ -88,7 +88,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for key, value in pairs:
         if key in content:
-            raise ValueError(f"key {printable(key, 60)!r} stands twice")
+            raise ValueError(f"key {printable(key, 60)!r} is given twice")
         content[key] = value
     return content
 

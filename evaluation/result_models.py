@@ -1,13 +1,14 @@
 """The parts of ``result.json`` as strict models: scores, samples, objects, data, and what was scored with what."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from fpp_ml_bench.evaluation.error_stats import ErrorStats
 from fpp_ml_bench.evaluation.protocol import METRICS
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Share, StrictModel, Text
 from fpp_ml_bench.evaluation.submission import HardwareInfo
+from fpp_ml_bench.loaders import benchmark as benchmarks
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
@@ -25,7 +26,7 @@ class Headline(StrictModel):
 
 
 class Metrics(Headline):
-    """The headline and what stands beside it: errors in mm, shares of the object's pixels. PROTOCOL.md defines each."""
+    """All scores: errors in mm, shares of the object's pixels. PROTOCOL.md defines each."""
 
     object_interior_mae_mm: NonNegative | None
     object_interior_rmse_mm: NonNegative | None
@@ -70,7 +71,7 @@ class SampleResult(Metrics):
 
 
 class ObjectResult(StrictModel):
-    """One object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
+    """An object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
 
     object: Text
     samples: Annotated[int, Field(gt=0)]
@@ -89,11 +90,11 @@ class Intervals(StrictModel):
     background_rmse_mm: Interval
 
     def __getitem__(self, key: str) -> list[float | None]:
-        found: list[float | None] = getattr(self, key)
-        return found
+        ends: list[float | None] = getattr(self, key)
+        return ends
 
     def of(self, key: str) -> tuple[float, float] | None:
-        """The interval of ``key``; None where there is none (another key than the headline's, too few objects)."""
+        """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
         low, high = getattr(self, key, (None, None))
         return None if low is None or high is None else (low, high)
 
@@ -107,21 +108,68 @@ class Bootstrap(StrictModel):
     confidence: Annotated[float, Field(gt=0, lt=1)]
 
 
+class BenchmarkInfo(StrictModel):
+    """Name and version of a benchmark; `fpp_ml_bench.loaders.benchmark` lists those that this package knows."""
+
+    name: Text
+    version: Count
+
+
 class DatasetInfo(StrictModel):
-    """What was scored on. ``fingerprint`` identifies the data to the byte; ``name`` is only the folder's name."""
+    """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
+
+    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version that this package knows
+    with another fingerprint, or a fingerprint that it knows under another name or version, is refused.
+    """
 
     name: Text
     fingerprint: Sha256
+    benchmark: BenchmarkInfo | None = None
     split: Literal["train", "validation", "test", "all"]
     size: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)]
     samples: Annotated[int, Field(gt=0)]
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        if self.benchmark is None:
+            content.pop("benchmark", None)
+        return content
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "DatasetInfo":
+        if self.benchmark is None:
+            return self
+        claim = self.benchmark.name, self.benchmark.version
+        claimed = next((b for b in benchmarks.BENCHMARKS if (b.name, b.version) == claim), None)
+        actual = benchmarks.benchmark_of(self.fingerprint)
+        if claimed != actual:
+            expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""
+            raise ValueError(
+                f"benchmark says {claim[0]} version {claim[1]}, but fingerprint {self.fingerprint[:16]} is "
+                f"{actual.title if actual else 'not that benchmark'}{expected}"
+            )
+        return self
+
+    @property
+    def identity(self) -> str:
+        """What identifies the data, for people: fingerprint, and name and version of the benchmark."""
+        if self.benchmark is None:
+            return dataset_identity(self.fingerprint)
+        return f"{self.benchmark.name} version {self.benchmark.version}, fingerprint {self.fingerprint[:8]}"
+
+
+def dataset_identity(fingerprint: str) -> str:
+    """`DatasetInfo.identity` of a dataset with this fingerprint."""
+    benchmark = benchmarks.benchmark_of(fingerprint)
+    return f"{benchmark.title if benchmark else 'no named benchmark'}, fingerprint {fingerprint[:8]}"
 
 
 class Environment(StrictModel):
     """Where and with what the scores were computed (not where the predictions were made: see ``submission``).
 
     ``git`` is the commit of the checkout this package ran from, null for an installed package. ``code_sha256`` covers
-    the source of the scoring itself and so tells an edited checkout from its commit.
+    the source of the scoring, so an edited checkout differs from its commit.
     """
 
     python: Text

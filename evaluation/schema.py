@@ -1,4 +1,4 @@
-"""Building blocks of the strict file models: text that is text, numbers that are numbers, errors a person reads."""
+"""Building blocks of the strict file models: types of text and numbers, and readable errors."""
 
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -34,7 +34,7 @@ class StrictModel(BaseModel):
 
 
 def problems_of(error: ValidationError) -> list[str]:
-    """One line a problem: where, what is wrong, what came; safe to print."""
+    """A line for each problem: the key, what is wrong, the value; safe to print."""
     lines = []
     for item in error.errors(include_url=False, include_context=False)[:MAX_PROBLEMS]:
         where = ".".join(printable(str(part), 60) for part in item["loc"]) or "the file as a whole"
@@ -50,10 +50,10 @@ def problems_of(error: ValidationError) -> list[str]:
     return lines
 
 
-def validate(model: type[Model], value: Any, path: Path, what: str) -> Model:
+def validate(model: type[Model], value: Any, path: Path, kind: str) -> Model:
     """``value`` as ``model``, or SubmissionError naming ``path`` and every key that is wrong."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
         lines = "\n  ".join(problems_of(error))
-        raise SubmissionError(f"{printable(str(path), 500)} is no valid {what}:\n  {lines}") from None
+        raise SubmissionError(f"{printable(str(path), 500)} is no valid {kind}:\n  {lines}") from None

@@ -1,7 +1,7 @@
 """Scores of one sample: MAE and RMSE over the pixel sets, and how the object's error is distributed, in float64.
 
 The overall score is composed of object and background, so that overall MAE = f object + (1 - f) background, with f the
-object's share of the pixels, holds by construction. How sums keep their digits: `fpp_ml_bench.evaluation.error_stats`.
+object's share of the pixels, holds by construction. Accurate sums: `fpp_ml_bench.evaluation.error_stats`.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.evaluation.error_stats import EMPTY as EMPTY
 from fpp_ml_bench.evaluation.error_stats import ErrorStats, combine, mean_of, stats_of
-from fpp_ml_bench.evaluation.object_pass import ObjectErrors, headline_stats, object_errors
+from fpp_ml_bench.evaluation.object_pass import ObjectErrors, object_errors
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN, WITHIN_MM
 from fpp_ml_bench.pixel_sets import object_near_edges
 
@@ -23,8 +23,7 @@ _EDGE, _WIDE, _MISSING = 1, 2, 4
 class Distribution:
     """The object's error in mm beyond its mean: order statistics of |e|, shares of pixels, signed means.
 
-    All None for an empty object. ``shift_free_mae_mm`` is the MAE left after the best single offset, the median of e,
-    has been taken off.
+    All None for an empty object. ``shift_free_mae_mm`` is the MAE after the median of e has been subtracted.
     """
 
     median_mm: float | None = None
@@ -93,7 +92,7 @@ class SampleScores:
         return combine(self.object, self.background)
 
     def metrics(self) -> dict[str, float | None]:
-        """The keys of ``protocol.METRICS``; None where the sample has no pixel to say anything about."""
+        """The keys of ``protocol.METRICS``; None where the pixel set is empty."""
         overall, whole, valid, inside = self.overall, self.object, self.valid, self.interior
         inside_valid, band, spread = self.interior_valid, self.wide_band, self.distribution
         return {
@@ -129,18 +128,16 @@ def _share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: `error_stats.finish` refuses it
+@np.errstate(over="ignore")  # an overflow is no warning here: `error_stats` refuses it
 def score_sample(
     prediction_mm: NDArray[np.floating[Any]],
     target_mm: NDArray[np.floating[Any]],
     edge_band_px: int = EDGE_BAND_PX,
-    compiled: bool = False,
 ) -> SampleScores:
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
     sets after paper Section 5.3.2 (`fpp_ml_bench.pixel_sets`): object where the target is above 0, else background.
-    ``compiled`` takes the numba pass over the image; the numbers agree to a few units in the last place.
 
     Raises PredictionError for shapes that differ, dtypes that are not real floats, and errors that are not finite.
 
@@ -149,31 +146,20 @@ def score_sample(
     >>> score_sample(target + 2.0, target).overall
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
-    found = object_errors(prediction_mm, target_mm, compiled)
-    if not found.pixels.size:
-        return SampleScores(found.background, {}, Distribution())
+    errors = object_errors(prediction_mm, target_mm)
+    if not errors.pixels.size:
+        return SampleScores(errors.background, {}, Distribution())
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
-    zone = near.ravel().take(found.pixels).view(np.uint8) * np.uint8(_EDGE)
-    zone |= wide.ravel().take(found.pixels).view(np.uint8) * np.uint8(_WIDE)
-    zone |= found.missing.view(np.uint8) * np.uint8(_MISSING)
+    zone = near.ravel().take(errors.pixels).view(np.uint8) * np.uint8(_EDGE)
+    zone |= wide.ravel().take(errors.pixels).view(np.uint8) * np.uint8(_WIDE)
+    zone |= errors.missing.view(np.uint8) * np.uint8(_MISSING)
     present = np.flatnonzero(np.bincount(zone)).tolist()
-    zones = {code: stats_of(found.errors[zone == code]) for code in present}
-    return SampleScores(found.background, zones, _distribution(found))
+    zones = {code: stats_of(errors.errors[zone == code]) for code in present}
+    return SampleScores(errors.background, zones, _distribution(errors))
 
 
-def headline_scores(
-    prediction_mm: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], compiled: bool = False
-) -> tuple[ErrorStats, ErrorStats, ErrorStats]:
-    """Overall, object and background of one sample alone: the six headline numbers, without zones and distribution.
-
-    Arguments and errors as `score_sample`.
-    """
-    inside, outside = headline_stats(prediction_mm, target_mm, compiled)
-    return combine(inside, outside), inside, outside
-
-
-def _distribution(found: ObjectErrors) -> Distribution:
-    errors = found.errors
+def _distribution(measured: ObjectErrors) -> Distribution:
+    errors = measured.errors
     magnitude = np.abs(errors)
     within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
     largest = float(magnitude.max())
@@ -188,7 +174,7 @@ def _distribution(found: ObjectErrors) -> Distribution:
         max_mm=largest,
         within=within,
         bias_mm=mean_of(errors),
-        valid_bias_mm=mean_of(errors[~found.missing] if found.missing.any() else errors),
+        valid_bias_mm=mean_of(errors[~measured.missing] if measured.missing.any() else errors),
         shift_free_mae_mm=mean_of(signed),
     )
 
@@ -196,16 +182,16 @@ def _distribution(found: ObjectErrors) -> Distribution:
 def _quantiles(values: NDArray[np.float64], *levels: float) -> list[float]:
     """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``.
 
-    One place at a time: NumPy's partition for a single place is vectorised, for several it is seven times slower.
+    One partition per quantile: NumPy's partition is vectorised for a single position, not for several.
     """
-    found, first = [], 0
+    quantiles, first = [], 0
     for level in levels:
-        place = level * (values.size - 1)
-        low = int(place)
-        rest = values[first:]
-        rest.partition(low - first)
+        position = level * (values.size - 1)
+        low = int(position)
+        upper = values[first:]
+        upper.partition(low - first)
         below = float(values[low])
         above = float(values[low + 1 :].min()) if low + 1 < values.size else below
-        found.append(below + (above - below) * (place - low))
+        quantiles.append(below + (above - below) * (position - low))
         first = low
-    return found
+    return quantiles

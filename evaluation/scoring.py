@@ -1,4 +1,4 @@
-"""Scoring every prediction of a folder: read, checked, scored, a few files at a time. Needs neither pydantic nor torch.
+"""Scoring every prediction of a folder: read, checked, scored, a few files at a time, without pydantic and torch.
 
 Memory does not grow with the number of samples, and nothing depends on the number of cores.
 """
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.listing import Listing
-from fpp_ml_bench.evaluation.object_pass import COMPILED_FROM_SAMPLES
 from fpp_ml_bench.evaluation.predictions import value_problems
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.reading import reader_for
@@ -23,7 +22,8 @@ from fpp_ml_bench.evaluation.units import scored_pair
 from fpp_ml_bench.hardware import usable_cores
 
 WORKERS = 4
-Found = tuple[list[str], list[dict[str, Any]]]
+Outcome = tuple[list[str], list[dict[str, Any]]]
+"""Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
 
 
 class Rules(NamedTuple):
@@ -42,18 +42,18 @@ def scored(
     rules: Rules,
     target_mm: Callable[[str], NDArray[np.float32]],
     release: Callable[[str], None] = lambda sample: None,
-) -> Iterator[Found]:
-    """Problems and the row of each sample that is there, in order. ``target_mm`` gives a sample's target (H, W), and
-    ``release`` is told when it is not needed any more.
+) -> Iterator[Outcome]:
+    """Problems and row of each sample that has a prediction, in order.
 
-    Work begins with this call, in threads, and not only when the first result is asked for.
+    ``target_mm`` gives a sample's target (H, W); ``release`` is called when it is not needed any more.
+
+    Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
-    compiled = _compiled(len(listing.present))
     read = reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
-    memory, looking_up = local(), Lock()
+    memory, dataset_lock = local(), Lock()
 
-    def work(sample: str) -> Found:
-        with looking_up:  # what opens the dataset's files need not be ready for several threads
+    def work(sample: str) -> Outcome:
+        with dataset_lock:  # reading the dataset need not be thread-safe
             target = target_mm(sample)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
@@ -65,10 +65,10 @@ def scored(
             problems = value_problems(values, target, high, rules.units)
             if not problems:
                 pair = scored_pair(values, target, rules.units, rules.mode, sample)
-                scores = score_sample(*pair, rules.edge_band_px, compiled)
+                scores = score_sample(*pair, rules.edge_band_px)
         except PredictionError as error:
             problems = [str(error)]
-        with looking_up:
+        with dataset_lock:
             release(sample)
         if problems:
             return [f"{read.named(sample)}: {problem}" for problem in problems], []
@@ -86,15 +86,9 @@ def scored(
     return _results(pool, [pool.submit(work, sample) for sample in listing.present])
 
 
-def _results(pool: ThreadPoolExecutor, waiting: list[Future[Found]]) -> Iterator[Found]:
+def _results(pool: ThreadPoolExecutor, futures: list[Future[Outcome]]) -> Iterator[Outcome]:
     try:
-        for future in waiting:
+        for future in futures:
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _compiled(samples: int) -> bool:
-    from fpp_ml_bench.acceleration import numba_enabled
-
-    return samples >= COMPILED_FROM_SAMPLES and numba_enabled()

@@ -1,4 +1,4 @@
-"""``submission.yaml``: what a submission says about itself, as a strict model."""
+"""``submission.yaml``: the description of a submission, as a strict model."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -18,8 +18,8 @@ class Submission(StrictModel):
 
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
-    on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (as a network is whose input is
-    blackened outside it); false is never written, so that files from before there was this key stay as they are.
+    on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
+    black outside the object); false is never written, so that files without this key stay as they are.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
     """
 
@@ -71,7 +71,7 @@ class Submission(StrictModel):
 
 
 def read_submission(folder: Path) -> Submission:
-    """The checked ``submission.yaml`` of a predictions folder; SubmissionError names the file, the key and the cure."""
+    """The checked ``submission.yaml`` of a predictions folder; SubmissionError names the file and the key."""
     return check_submission(folder, read_plain(folder))
 
 

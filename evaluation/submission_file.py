@@ -1,7 +1,7 @@
-"""``submission.yaml`` as plain keys and values, read from a stranger; what they mean is `submission`'s to check.
+"""``submission.yaml`` as plain keys and values; `submission` checks what they mean.
 
-The file is bounded in size, aliases (and with them "billion laughs") are refused, a key given twice is refused, and
-only plain YAML values are built.
+The file may come from anyone. Its size is bounded, aliases (and with them "billion laughs") and repeated keys are
+refused, and only plain YAML values are built.
 """
 
 import re
@@ -15,7 +15,7 @@ from fpp_ml_bench.evaluation.text import printable
 
 SUBMISSION_FILE = "submission.yaml"
 REPORTS_FILE = "per_sample.json"
-"""What a method may say of each sample, beside its predictions; it is not scored."""
+"""What a method may report of each sample beside its predictions; it is not scored."""
 MAX_BYTES = 65536
 
 
@@ -34,7 +34,7 @@ class _StrictLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 raise yaml.YAMLError(f"line {key.start_mark.line + 1}: a key must be plain text")
             if key.value in seen:
-                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} stands twice")
+                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} is given twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep=deep)
 
@@ -47,7 +47,7 @@ _StrictLoader.add_implicit_resolver(
 def read_plain(folder: Path) -> dict[Any, Any]:
     """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked.
 
-    SubmissionError names the file, what is wrong with it and the cure.
+    SubmissionError names the file, what is wrong with it and what to do.
     """
     path = folder / SUBMISSION_FILE
     if path.is_symlink() or not path.is_file():
@@ -62,22 +62,22 @@ def read_plain(folder: Path) -> dict[Any, Any]:
 def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
     """Keys and values of a YAML file, bounded and plain as this module says; ``example`` shows what a line looks like.
 
-    SubmissionError names the file, what is wrong with it and the cure.
+    SubmissionError names the file, what is wrong with it and what to do.
     """
-    shown = printable(str(path), 500)
+    file = printable(str(path), 500)
     try:
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
-            raise SubmissionError(f"{shown}: expected at most {MAX_BYTES} bytes; shorten names and settings")
+            raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; shorten names and settings")
         content = yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
     except OSError as error:
-        raise SubmissionError(f"{shown} can't be read: {error.strerror}") from None
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise SubmissionError(f"{shown}: expected UTF-8 text") from None
+        raise SubmissionError(f"{file}: expected UTF-8 text") from None
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
         reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
-        raise SubmissionError(f"{shown} is no plain YAML: {reason}") from None
+        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
     if not isinstance(content, dict):
-        raise SubmissionError(f"{shown}: expected keys and values like {example}, got {type(content).__name__}")
+        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
     return content

@@ -41,17 +41,22 @@ def _deviation(values: list[float]) -> float | None:
 
 def per_object(rows: Sequence[Scores], objects: Sequence[str]) -> list[dict[str, Any]]:
     """Each object's number of samples, mean and spread of every metric over its views, in order of appearance."""
-    found = []
+    summaries = []
     for name in dict.fromkeys(objects):
-        own = [row for row, owner in zip(rows, objects, strict=True) if owner == name]
-        found.append(
-            {"object": name, "samples": len(own), "metrics": mean_over_samples(own), "spread": spread_over_samples(own)}
+        views = [row for row, owner in zip(rows, objects, strict=True) if owner == name]
+        summaries.append(
+            {
+                "object": name,
+                "samples": len(views),
+                "metrics": mean_over_samples(views),
+                "spread": spread_over_samples(views),
+            }
         )
-    return found
+    return summaries
 
 
 def pooled(samples: Iterable[SampleScores]) -> Scores:
-    """The six headline errors over all pixels of all samples at once, each pixel counted alike."""
+    """The six headline errors over all pixels of all samples at once, every pixel with the same weight."""
     samples = list(samples)
     inside = combine(*(s.object for s in samples))
     outside = combine(*(s.background for s in samples))

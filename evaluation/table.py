@@ -1,4 +1,4 @@
-"""What `fpp-eval` prints: the three pixel sets, what edges and missing pixels add, and the samples it went worst on."""
+"""What `fpp-eval` prints: the three pixel sets, edges and missing pixels, the samples of largest error."""
 
 from typing import Any
 
@@ -21,11 +21,11 @@ def result_table(result: Result) -> Group:
 
 
 def _title(result: Result) -> Text:
-    about = result.dataset
+    info = result.dataset
     return Text(
         f"\n{printable(result.submission.name)}\n"
-        f"{about.split} split of {printable(about.name)} ({about.fingerprint[:8]}), {about.samples} samples of "
-        f"{about.size[1]}x{about.size[0]} px, against {result.target}, {result.track} track"
+        f"{info.split} split of {printable(info.name)} ({printable(info.identity)}),\n{info.samples} samples of "
+        f"{info.size[1]}x{info.size[0]} px, against {result.target}, {result.track} track"
         f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )
 
@@ -90,16 +90,20 @@ def _notes(result: Result) -> Text:
     if result.samples_without_background:
         lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
     if result.submission.uses_ground_truth_range:
-        lines.append("Oracle range: the method was given depth_min and depth_max of these very samples.")
+        lines.append("Oracle range: the method was given depth_min and depth_max of the scored samples.")
     if result.submission.uses_ground_truth_mask:
-        lines.append("Oracle mask: the method was given which pixels of these very samples are object.")
-    few = caution(len(result.per_object))
-    if few:
-        lines.append(few)
-    taken = result.submission.seconds_per_sample
+        lines.append("Oracle mask: the method was given which pixels of the scored samples are object.")
+    few_objects = caution(len(result.per_object))
+    if few_objects:
+        lines.append(few_objects)
+    sample_seconds = result.submission.seconds_per_sample
     frames = len(result.submission.frames_used)
-    time = "unknown time" if taken is None else f"{seconds(taken)} s ({result.submission.seconds_source})"
-    lines.append(f"Frames used: {frames}; {time} a sample.")
+    time = (
+        "unknown time"
+        if sample_seconds is None
+        else f"{seconds(sample_seconds)} s ({result.submission.seconds_source})"
+    )
+    lines.append(f"Frames used: {frames}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
 
@@ -111,12 +115,12 @@ def _worst(result: Result) -> Table | None:
     table.add_column("Sample")
     for title in ("Object MAE", "Object RMSE", "Background MAE", "Near edges", "Not measured"):
         table.add_column(title.replace(" ", "\n"), justify="right", no_wrap=True)
-    for row in sorted(rows, key=_badness)[:WORST]:
+    for row in sorted(rows, key=_largest_error_first)[:WORST]:
         cells: list[Any] = [millimetres(row.object_mae_mm), millimetres(row.object_rmse_mm)]
         cells += [millimetres(row.background_mae_mm), percent(row.object_edge_share), percent(row.object_missing_share)]
         table.add_row(Text(printable(row.sample)), *cells)
     return table
 
 
-def _badness(row: SampleResult) -> tuple[float, str]:
+def _largest_error_first(row: SampleResult) -> tuple[float, str]:
     return -(row.object_mae_mm or 0.0), row.sample

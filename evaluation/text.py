@@ -1,4 +1,4 @@
-"""Text that others wrote (names in submissions, file names, JSON values) is data: how it is checked and shown."""
+"""Text of unknown origin (names in submissions, file names, JSON values): how it is checked and printed."""
 
 import unicodedata
 
@@ -22,11 +22,10 @@ def text_problem(value: str, limit: int = NAME_LIMIT) -> str | None:
 
 
 def printable(value: object, limit: int = NAME_LIMIT) -> str:
-    """``value`` as text that can do nothing to a terminal: control characters escaped, cut at ``limit`` characters."""
+    """``value`` as text that is safe in a terminal: control characters escaped, cut at ``limit`` characters."""
     text = value if isinstance(value, str) else repr(value)
-    cut = text[:limit]
-    shown = "".join(
+    escaped = "".join(
         c if unicodedata.category(c) not in _FORBIDDEN else c.encode("unicode_escape", "backslashreplace").decode()
-        for c in cut
+        for c in text[:limit]
     )
-    return shown + ("..." if len(text) > limit else "")
+    return escaped + ("..." if len(text) > limit else "")

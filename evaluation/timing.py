@@ -1,6 +1,6 @@
 """Run time as part of a submission: the ``timing`` block of ``submission.yaml`` and ``result.json``.
 
-``fpp-bench time`` writes it with provenance ``measured``; who reports times of their own writes ``self-reported``.
+``fpp-bench time`` writes it with provenance ``measured``; times from elsewhere have provenance ``self-reported``.
 """
 
 from typing import Annotated, Literal
@@ -27,7 +27,7 @@ class Timing(StrictModel):
 
     Latency is that of one image at batch 1 after warm-up, frames in memory: the median, 5th and 95th percentile over
     ``repeats`` runs, in ms. Throughput is in images per second with ``batch`` images at once (``batched`` says whether
-    the method takes them at once or one after another). ``peak_memory_mib`` is the largest resident set of the whole
+    the method takes them together or one after another). ``peak_memory_mib`` is the largest resident set of the whole
     process, ``working_memory_mib`` what predicting one image adds to it, ``gpu_memory_mib`` the most that was allocated
     on the GPU; null where unknown. ``frames`` is the number of captures that one depth map costs.
     """

@@ -1,10 +1,10 @@
 """The evaluator's scores as a `torchmetrics.Metric`, for validation during training.
 
-Same rules and the same float64 arithmetic as `fpp_ml_bench.evaluation.scores`: every sample is scored on its own, and
-`compute` is the plain mean over samples. The state is a sum and a count for each score, so any split into batches, any
-order, device or number of processes gives the same numbers up to the rounding of adding a few hundred float64 values.
-A sampler that repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes what is
-averaged; give each process its own samples instead.
+The rules and the float64 arithmetic are those of `fpp_ml_bench.evaluation.scores`: every sample is scored separately,
+and `compute` is the plain mean over samples. The state is a sum and a count for each score. Any batches, order, device
+or number of processes therefore give the same numbers, up to the rounding of adding a few hundred float64 values. A
+sampler that repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean;
+give each process its own samples instead.
 
 Not included: the scores of edge bands, which need the depth edges of every target.
 """
@@ -34,18 +34,18 @@ KEYS = (
 )
 
 SQUARES_VANISH = 1e-140
-"""Errors below this have squares that are no normal float64 any more."""
+"""Errors below this have squares below the smallest normal float64."""
 
 
 class DepthScores(Metric):
     """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
 
-    ``update(prediction_mm, target_mm)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background, on any one
-    device. ``compute()`` gives a dict of float64 scalars, NaN where no sample had the pixels for a score (as a flag for
-    loggers, which know no null; such samples are left out of the mean and never count as 0).
+    ``update(prediction_mm, target_mm)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background, on any
+    device. ``compute()`` gives a dict of float64 scalars, NaN where no sample has the pixels for a score. Samples
+    without these pixels are left out of the mean and never count as 0.
 
-    The scores do not steer training (``is_differentiable`` is False) and are lower when better, but for shares within
-    a tolerance. ``half()`` and ``float()`` leave the state in float64.
+    The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
+    tolerance. ``half()`` and ``float()`` leave the state in float64.
     """
 
     is_differentiable = False
@@ -63,16 +63,16 @@ class DepthScores(Metric):
     def update(self, prediction_mm: Tensor, target_mm: Tensor) -> None:
         """Add a batch. Raises PredictionError for other shapes or dtypes, and for errors that are not finite."""
         prediction, target = _maps(prediction_mm, target_mm)
-        for one, truth in zip(prediction, target, strict=True):
-            scores = sample_scores(one, truth)
-            known = torch.tensor([scores[key] is not None for key in KEYS], device=self.sums.device)
-            values = torch.stack([_or_zero(scores[key], one.device) for key in KEYS]).to(self.sums.device)
+        for predicted, truth in zip(prediction, target, strict=True):
+            scores = sample_scores(predicted, truth)
+            present = torch.tensor([scores[key] is not None for key in KEYS], device=self.sums.device)
+            values = torch.stack([_or_zero(scores[key], predicted.device) for key in KEYS]).to(self.sums.device)
             self.sums += values
-            self.counts += known.to(torch.float64)
+            self.counts += present.to(torch.float64)
 
     def compute(self) -> dict[str, Tensor]:
         """Mean over the samples so far, of all processes, of every key."""
-        means = self.sums / self.counts  # 0 / 0 is the NaN that says there was none
+        means = self.sums / self.counts  # 0 / 0 is NaN: no sample had the pixels
         return dict(zip(KEYS, means, strict=True))
 
 
@@ -89,7 +89,7 @@ def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
     if target_mm.dim() != 3 or target_mm[:1].numel() == 0:
         raise PredictionError(f"expected (B, H, W) or (B, 1, H, W), got {shape}")
     prediction, target = prediction_mm.detach(), target_mm.detach()
-    if prediction.device.type == "mps":  # Apple's GPUs know no float64
+    if prediction.device.type == "mps":  # Apple's GPUs have no float64
         prediction, target = prediction.cpu(), target.cpu()
     return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
 
@@ -100,31 +100,31 @@ def sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | N
     if not bool(torch.isfinite(error.square().sum())):
         raise PredictionError(NOT_FINITE)
     inside = target > 0
-    found: dict[str, Tensor | None] = dict.fromkeys(KEYS)
+    scores: dict[str, Tensor | None] = dict.fromkeys(KEYS)
     for name, part in (("overall", error.flatten()), ("object", error[inside]), ("background", error[~inside])):
         if part.numel():
-            found[f"{name}_mae_mm"] = part.abs().mean()
-            found[f"{name}_rmse_mm"] = _root_mean_square(part)
+            scores[f"{name}_mae_mm"] = part.abs().mean()
+            scores[f"{name}_rmse_mm"] = _root_mean_square(part)
     if not bool(inside.any()):
-        return found
+        return scores
     errors, measured = error[inside], prediction[inside] > 0
     valid = errors[measured]
     ascending = errors.abs().sort().values
     offset = _quantile(errors.sort().values, 0.5)
-    found["object_missing_share"] = 1.0 - measured.to(torch.float64).mean()
+    scores["object_missing_share"] = 1.0 - measured.to(torch.float64).mean()
     if valid.numel():
-        found["object_valid_mae_mm"], found["object_valid_bias_mm"] = valid.abs().mean(), valid.mean()
-    found["object_median_mm"], found["object_p95_mm"] = _quantile(ascending, 0.5), _quantile(ascending, 0.95)
-    found["object_max_mm"] = ascending[-1]
+        scores["object_valid_mae_mm"], scores["object_valid_bias_mm"] = valid.abs().mean(), valid.mean()
+    scores["object_median_mm"], scores["object_p95_mm"] = _quantile(ascending, 0.5), _quantile(ascending, 0.95)
+    scores["object_max_mm"] = ascending[-1]
     for key, limit in zip(WITHIN, WITHIN_MM, strict=True):
-        found[key] = (ascending <= limit).to(torch.float64).mean()
-    found["object_bias_mm"] = errors.mean()
-    found["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
-    return found
+        scores[key] = (ascending <= limit).to(torch.float64).mean()
+    scores["object_bias_mm"] = errors.mean()
+    scores["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
+    return scores
 
 
 def _root_mean_square(errors: Tensor) -> Tensor:
-    """Root mean square; errors whose squares would vanish are squared as parts of the largest."""
+    """Root mean square; errors whose squares would underflow are divided by the largest first."""
     largest = errors.abs().max()
     scale = torch.where((largest > 0) & (largest < SQUARES_VANISH), largest, torch.ones_like(largest))
     return (errors / scale).square().mean().sqrt() * scale
@@ -132,10 +132,10 @@ def _root_mean_square(errors: Tensor) -> Tensor:
 
 def _quantile(ascending: Tensor, level: float) -> Tensor:
     """Linear interpolation between order statistics, as in `scores`."""
-    place = level * (ascending.numel() - 1)
-    low = int(place)
+    position = level * (ascending.numel() - 1)
+    low = int(position)
     below, above = ascending[low], ascending[min(low + 1, ascending.numel() - 1)]
-    return below + (above - below) * (place - low)
+    return below + (above - below) * (position - low)
 
 
 def _or_zero(value: Tensor | None, device: torch.device) -> Tensor:

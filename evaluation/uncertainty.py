@@ -1,9 +1,9 @@
-"""How sure a mean over samples is: bootstrap over objects, and ranks that say so.
+"""Intervals of means over samples by a bootstrap over objects, and ranks with ties.
 
-Views of one object are not independent, so whole objects are resampled, and a resample's figure is the plain mean over
-the samples of the objects drawn. With few objects the plain percentile interval is too short (it treats the spread of
-five objects as if it were known); the levels are therefore widened as Hesterberg's expanded percentile interval does
-(The American Statistician 69:371, 2015): alpha' / 2 = Phi(-sqrt(n / (n - 1)) t_{alpha / 2, n - 1}).
+Views of the same object are not independent, so whole objects are resampled, and the mean of a resample is the plain
+mean over the samples of the objects drawn. With few objects the plain percentile interval is too short, because it
+takes the spread of five objects as exact. The levels are therefore widened as in Hesterberg's expanded percentile
+interval (The American Statistician 69:371, 2015): alpha' / 2 = Phi(-sqrt(n / (n - 1)) t_{alpha / 2, n - 1}).
 """
 
 import math
@@ -20,7 +20,7 @@ Interval = tuple[float, float]
 
 
 def object_interval(values: Sequence[float | None], objects: Sequence[Hashable]) -> Interval | None:
-    """The 95% interval of the mean of ``values`` (one a sample, None left out), resampled over ``objects``.
+    """The 95% interval of the mean of ``values`` (one per sample, None left out), resampled over ``objects``.
 
     Deterministic: fixed seed, and a generator whose stream does not change between versions of NumPy. Objects count in
     the order in which they first appear. None with fewer than two objects that have a value.
@@ -31,14 +31,14 @@ def object_interval(values: Sequence[float | None], objects: Sequence[Hashable])
             sums.setdefault(name, []).append(value)
     if len(sums) < 2:
         return None
-    totals = np.array([math.fsum(part) for part in sums.values()])
-    counts = np.array([len(part) for part in sums.values()], dtype=np.float64)
+    totals = np.array([math.fsum(group) for group in sums.values()])
+    counts = np.array([len(group) for group in sums.values()], dtype=np.float64)
     drawn = _draws(len(sums))
     if (counts == counts[0]).all():
-        figures = totals.take(drawn).mean(axis=1) / counts[0]
+        means = totals.take(drawn).mean(axis=1) / counts[0]
     else:
-        figures = totals.take(drawn).sum(axis=1) / counts.take(drawn).sum(axis=1)
-    low, high = np.quantile(figures, _levels(len(sums)))
+        means = totals.take(drawn).sum(axis=1) / counts.take(drawn).sum(axis=1)
+    low, high = np.quantile(means, _levels(len(sums)))
     return float(low), float(high)
 
 
@@ -87,10 +87,10 @@ def _student_cdf(t: float, freedom: int) -> float:
 
 
 def caution(objects: int) -> str | None:
-    """What to say of an interval over so few objects that no resampling can cover the truth in 95% of cases.
+    """A warning about an interval over so few objects that resampling can't cover the truth in 95% of cases, or None.
 
-    An interval of resampled means lies between the smallest and the largest object; the truth (the median, for a
-    spread without skew) lies outside of all n objects in 2^(1 - n) of cases.
+    An interval of resampled means is between the smallest and the largest object; the truth (the median, for a
+    symmetric spread) is outside of all n objects in 2^(1 - n) of cases.
     """
     if objects < 2 or (reach := 1 - 2.0 ** (1 - objects)) >= 0.9:
         return None
@@ -105,11 +105,10 @@ def intervals_over_objects(
 
 
 def ranks_with_ties(values: Sequence[float | None], intervals: Sequence[Interval | None]) -> list[int | None]:
-    """Rank of each entry where smaller is better: 1 and the number of entries that are surely better.
+    """Rank of each entry where smaller is better: 1 plus the number of entries that are clearly better.
 
-    Surely better means that the other's interval ends below this one's start; entries with one rank can't be told
-    apart from the best of them. An entry without interval counts as its bare value, one without value has no rank.
-    The order of the entries changes nothing.
+    An entry is clearly better when its interval ends below the start of the other interval. An entry without interval
+    counts with its value alone; an entry without value has no rank. The order of the entries does not matter.
 
     >>> ranks_with_ties([1.0, 1.2, 3.0, None], [(0.8, 1.3), (1.1, 1.4), (2.5, 3.5), None])
     [1, 1, 3, None]
@@ -118,5 +117,5 @@ def ranks_with_ties(values: Sequence[float | None], intervals: Sequence[Interval
         None if value is None else (interval if interval is not None else (value, value))
         for value, interval in zip(values, intervals, strict=True)
     ]
-    known = [span for span in spans if span is not None]
-    return [None if span is None else 1 + sum(other[1] < span[0] for other in known) for span in spans]
+    ends = [span[1] for span in spans if span is not None]
+    return [None if span is None else 1 + sum(end < span[0] for end in ends) for span in spans]

@@ -1,4 +1,4 @@
-"""From what a submission declares (mm, m, normalised) to what is scored, and whether the declaration can be true."""
+"""From declared units (mm, m, normalised) to the depth in mm that is scored, and checks of the declared units."""
 
 from typing import Any
 
@@ -23,8 +23,8 @@ Depth = NDArray[np.floating[Any]]
 def unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
     """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can.
 
-    Metres or a share of the range where mm are declared show in the largest value. Where the declared unit is the
-    larger one, a single stray pixel must not decide, so the median over the object does.
+    Where mm are declared, the largest value shows whether the values are metres or shares of the range. Where m or
+    normalised depth is declared, a single stray pixel must not decide, so the median over the object is compared.
     """
     if units == "mm":
         if 0 < high < METRES_BELOW and target_max_mm > MILLIMETRES_ABOVE:
@@ -33,11 +33,11 @@ def unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, tar
                 f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
             )
         return None
-    found = values[object_mask(target_mm)]
-    found = found[found > 0]
-    if not found.size:
+    depths = values[object_mask(target_mm)]
+    depths = depths[depths > 0]
+    if not depths.size:
         return None
-    typical = float(np.median(found))
+    typical = float(np.median(depths))
     if units == "m" and typical > METRES_AT_MOST:
         return (
             f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
@@ -60,11 +60,11 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
 
     ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
-    D = v (D_max - D_min) + D_min, but for an exact 0, which stays 0: background, or not measured.
+    D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
 
     ``paper-individual`` (paper Section 5.3.2, individual normalisation): the target is normalised first, its mask is
-    D_norm > 0, and prediction and target go through that one affine map everywhere. D_min cancels in every difference,
-    so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and taking away
+    D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in every difference,
+    so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and subtracting
     1.7 m. Only for normalised values.
 
     Raises DatasetError where the target has no range to normalise by.

@@ -1,8 +1,8 @@
 """Scores on every (view, frame) pair of a condition's test set, as in the paper's multi-frame table (Section 5.4).
 
 The paper averages over all pairs. Here each sample's score is the mean over its frames, and the headline the mean over
-samples: the same number, because every sample has the same frames, and the interval can then be taken over objects. The
-rules are the evaluator's own (`scored_pair`, `headline_scores`).
+samples: the same number, for every sample has the same frames, and the interval can then be taken over objects. The
+rules are the evaluator's own (`scored_pair`, `score_sample`).
 """
 
 import statistics
@@ -16,11 +16,11 @@ from pydantic import Field
 
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, PIXEL_SETS, PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.result_io import read_json, write_json
 from fpp_ml_bench.evaluation.result_models import Headline, Intervals, Sha256
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
-from fpp_ml_bench.evaluation.scores import headline_scores
+from fpp_ml_bench.evaluation.scores import score_sample
 from fpp_ml_bench.evaluation.uncertainty import intervals_over_objects
 from fpp_ml_bench.evaluation.units import scored_pair
 from fpp_ml_bench.loaders.store import DatasetFolder
@@ -83,12 +83,8 @@ def score_all_frames(
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
             pair = scored_pair(values, target_mm, units, mode, sample)
-            pixel_stats = headline_scores(*pair)
-            scores[sample, frame] = {
-                f"{name}_{error}_mm": value
-                for name, stats in zip(PIXEL_SETS, pixel_stats, strict=True)
-                for error, value in (("mae", stats.mae_mm), ("rmse", stats.rmse_mm))
-            }
+            metrics = score_sample(*pair).metrics()
+            scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
     rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends: dict[str, list[float | None]] = {

@@ -1,4 +1,4 @@
-"""Every accepted form of prediction gives the same numbers, and every broken one is refused by name with a cure."""
+"""Every accepted form of prediction gives the same numbers, and every broken file is refused by name, with advice."""
 
 import io
 import json
@@ -33,12 +33,12 @@ def dataset(tmp_path_factory):
 
 
 def maps(dataset, step_mm=LEVEL_MM):
-    """Depth in whole steps of 1/20 mm, so that the coarsest form, PNG, holds it too."""
-    found = {}
+    """Depth in whole steps of 1/20 mm, which the coarsest form, PNG, can store."""
+    depths = {}
     for number, sample in enumerate(dataset.samples("test")):
         noise = np.random.default_rng(number).normal(0, 2, SIZE)
-        found[sample] = np.round(np.abs(dataset.depth_mm(sample) + noise) / step_mm) * step_mm
-    return found
+        depths[sample] = np.round(np.abs(dataset.depth_mm(sample) + noise) / step_mm) * step_mm
+    return depths
 
 
 def npz_bytes(**arrays):
@@ -146,16 +146,16 @@ FORMS = {
 def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     depths = maps(dataset)
     plain = write_each(tmp_path / "npy", ".npy", depths, npy_bytes)
-    other = FORMS[form](tmp_path / "other", depths)
+    converted = FORMS[form](tmp_path / "converted", depths)
     results = []
-    for number, folder in enumerate((plain, other)):
+    for number, folder in enumerate((plain, converted)):
         path = tmp_path / f"{number}.json"
         assert main([str(folder), "--dataset", str(dataset.path), "--json", str(path)]) == 0
         results.append(json.loads(path.read_text()))
-    one, two = (result["metrics"] for result in results)
-    for key, value in one.items():
+    plain_metrics, metrics = (result["metrics"] for result in results)
+    for key, value in plain_metrics.items():
         exact = value if value is None or form != "png" else pytest.approx(value, rel=1e-9, abs=1e-9)
-        assert two[key] == exact, key
+        assert metrics[key] == exact, key
     hashes = {row["prediction_sha256"] for row in results[1]["per_sample"]}
     assert len(hashes) == (1 if "arrow" in form or "parquet" in form else 4)
 
@@ -171,7 +171,7 @@ ZEROS = np.zeros((1000, 1000))
 DEPTH = np.full(SIZE, 1800.0)
 
 
-def lying_zip():
+def zip_of_wrong_size():
     """A member that says it is small and unpacks to 8 MB."""
     content = bytearray(zip_bytes({"depth.npy": npy_bytes(ZEROS)}))
     true = struct.pack("<I", len(npy_bytes(ZEROS)))
@@ -220,7 +220,7 @@ PER_SAMPLE = {
     "npz of two": (".npz", npz_bytes(a=DEPTH, b=DEPTH), r"holds 2 arrays \(a.npy, b.npy\), expected one"),
     "npz of none": (".npz", zip_bytes({}), "holds 0 arrays"),
     "npz bomb": (".npz", zip_bytes({"depth.npy": npy_bytes(ZEROS)}), "would unpack to 8000128 bytes"),
-    "npz that lies": (".npz", lying_zip(), "unpacks to more than|is no .npz|is truncated|foreign"),
+    "npz of a wrong size": (".npz", zip_of_wrong_size(), "unpacks to more than|is no .npz|is truncated|foreign"),
     "npz path": (".npz", zip_bytes({"../depth.npy": npy_bytes(DEPTH)}), "leads out of the archive"),
     "npz absolute path": (".npz", zip_bytes({"/tmp/depth.npy": npy_bytes(DEPTH)}), "leads out of the archive"),
     "npz of text": (".npz", zip_bytes({"readme.txt": b"x"}), "expected one .npy array"),
@@ -247,7 +247,7 @@ PER_SAMPLE = {
     "mat v7.3 virtual": (".mat", mat73_bytes(virtual), "stored in other files"),
     "mat v7.3 chunk": (".mat", mat73_bytes(huge_chunk), "too large for a depth map"),
     "mat v7.3 cut off": (".mat", mat73_bytes(lambda h: h.create_dataset("depth", data=DEPTH.T))[:900], "can't be read"),
-    "png 8 bit": (".png", png_bytes(np.zeros(SIZE, np.uint8)), "has 8 bits a channel"),
+    "png 8 bit": (".png", png_bytes(np.zeros(SIZE, np.uint8)), "has 8 bits per channel"),
     "png colour": (".png", png_bytes(np.zeros((*SIZE, 3), np.uint16)), "colour type 2"),
     "png shape": (".png", png_bytes(np.zeros((40, 32), np.uint16)), r"got \(40, 32\)"),
     "png full": (".png", png_bytes(np.full(SIZE, 65535, np.uint16)), "where depth above 3276.75 mm is cut off"),
@@ -261,7 +261,7 @@ PER_SAMPLE = {
 
 
 @pytest.mark.parametrize("case", PER_SAMPLE)
-def test_broken_file_is_refused_by_name_with_a_cure(case, capsys, dataset, tmp_path):
+def test_broken_file_is_refused_by_name_with_advice(case, capsys, dataset, tmp_path):
     suffix, content, message = PER_SAMPLE[case]
     depths = maps(dataset)
     encode = {
@@ -275,8 +275,8 @@ def test_broken_file_is_refused_by_name_with_a_cure(case, capsys, dataset, tmp_p
     error = refused(capsys, dataset, folder)
     line = re.search(rf"^\s*{re.escape(SAMPLE + suffix)}: .*", error, flags=re.MULTILINE)
     assert line and re.search(message, line[0]), error
-    cure = "write|save|use|predict at|give"
-    assert re.search(cure, line[0]), f"no cure in {line[0]}"
+    advice = "write|save|use|predict at|give"
+    assert re.search(advice, line[0]), f"no advice in {line[0]}"
 
 
 def renamed(name, column):
@@ -359,9 +359,9 @@ def test_page_headers_that_contradict_the_footer_count():
     place = chunk.data_page_offset
     assert content[place : place + 3] == b"\x15\x00\x15"  # field 1 is the page type, field 2 the unpacked size
     assert content[place + 3] >= 0x80 > content[place + 4]  # a number of two bytes; the largest such is 8191
-    lying = content[: place + 3] + b"\xfe\x7f" + content[place + 5 :]
+    wrong = content[: place + 3] + b"\xfe\x7f" + content[place + 5 :]
     with pytest.raises(PredictionError, match="would unpack to"):
-        check_pages(metadata, lying, 7_000, 1281)
+        check_pages(metadata, wrong, 7_000, 1281)
     with pytest.raises(PredictionError, match="damaged page header"):
         check_pages(metadata, content[:place] + b"\x1b" * (len(content) - place), 7_000, 1281)
 

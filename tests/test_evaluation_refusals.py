@@ -42,10 +42,10 @@ def refused(capsys, tmp_path: Path, dataset, predictions: Path, *arguments: str)
 
 
 def rewrite(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    def act(folder: Path) -> None:
+    def change_file(folder: Path) -> None:
         np.save(folder / FILE, change(np.load(folder / FILE)))
 
-    return act
+    return change_file
 
 
 def with_value(value: float, count: int = 1) -> Callable[[Path], None]:
@@ -93,7 +93,7 @@ def replace_by_pipe(folder: Path) -> None:
     os.mkfifo(folder / FILE)
 
 
-CURE = r"\b(write|save|use|predict|give|convert|put|copy|remove|replace|check)\b"
+ADVICE = r"\b(write|save|use|predict|give|convert|put|copy|remove|replace|check)\b"
 FILES = {
     "missing": (lambda f: (f / FILE).unlink(), "is missing"),
     "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
@@ -137,14 +137,14 @@ FILES = {
 
 @pytest.mark.parametrize("case", FILES)
 def test_bad_prediction_file_is_refused_by_name(case, capsys, tmp_path, dataset, predictions):
-    act, message = FILES[case]
-    act(predictions)
+    change_folder, message = FILES[case]
+    change_folder(predictions)
     if case == "symbolic link":
         (tmp_path / "elsewhere.npy").rename(predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy")
     error = refused(capsys, tmp_path, dataset, predictions)
-    found = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
-    assert found, error
-    assert re.search(CURE, found[0]), f"no cure in {found[0]}"
+    line = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
+    assert line, error
+    assert re.search(ADVICE, line[0]), f"no advice in {line[0]}"
 
 
 def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions):
@@ -237,7 +237,7 @@ TEXTS = {
     "empty": ("", "expected keys and values"),
     "a list": ("- 1\n- 2\n", "expected keys and values like .*got list"),
     "no YAML": ("name: [", "is no plain YAML"),
-    "key twice": ("name: a\nname: b\n", "'name' stands twice"),
+    "key twice": ("name: a\nname: b\n", "'name' is given twice"),
     "alias": ("a: &x [1]\nb: *x\n", "uses an alias"),
     "Python object": ("name: !!python/object/apply:os.system [echo]\n", "is no plain YAML"),
     "list as key": ("? [1]\n: 2\n", "a key must be plain text"),
@@ -272,7 +272,7 @@ def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predic
         (["nowhere", "--dataset", "{data}"], "expected a folder of predictions"),
         (["{pred}", "--dataset", "nowhere"], "no such folder"),
         (["{pred}", "--dataset", "{pred}"], "no dataset of fpp-ml-bench"),
-        (["{pred}", "--dataset", "{data}", "--json", "{pred}/result.json"], "lies among the predictions"),
+        (["{pred}", "--dataset", "{data}", "--json", "{pred}/result.json"], "is inside the predictions folder"),
         (["{pred}", "--dataset", "{data}", "--json", "{pred}"], "found a folder"),
         (["{pred}", "--dataset", "{data}", "--json", "no/such/result.json"], "does not exist"),
         (["{pred}", "--dataset", "{data}", "--split", "train"], "bowl_A0.npy: is missing"),

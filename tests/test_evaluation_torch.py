@@ -34,9 +34,9 @@ def scored(batches, kind=np.float32, order=None):
     return {key: float(value) for key, value in metric.compute().items()}
 
 
-def assert_same(found, expected, relative=1e-12):
+def assert_same(scores, expected, relative=1e-12):
     for key in KEYS:
-        assert found[key] == pytest.approx(expected[key], rel=relative, abs=1e-13), key
+        assert scores[key] == pytest.approx(expected[key], rel=relative, abs=1e-13), key
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
@@ -56,15 +56,15 @@ def _process(rank, address, folder):
     dist.init_process_group("gloo", init_method=address, rank=rank, world_size=2)
     prediction, target = data()
     metric = DepthScores()
-    own = range(7) if rank == 0 else range(7, SAMPLES)  # unequal shares
-    for index in own:
+    indices = range(7) if rank == 0 else range(7, SAMPLES)  # unequal shares
+    for index in indices:
         metric.update(torch.from_numpy(prediction[index : index + 1]), torch.from_numpy(target[index : index + 1]))
-    found = {key: float(value) for key, value in metric.compute().items()}
-    metric.reset()  # a process that has seen nothing, as in a short last epoch
+    scores = {key: float(value) for key, value in metric.compute().items()}
+    metric.reset()  # rank 1 gets no sample, as in a short last epoch
     if rank == 0:
         metric.update(torch.from_numpy(prediction), torch.from_numpy(target))
-    again = {key: float(value) for key, value in metric.compute().items()}
-    torch.save([found, again], f"{folder}/{rank}.pt")
+    scores_of_rank_0 = {key: float(value) for key, value in metric.compute().items()}
+    torch.save([scores, scores_of_rank_0], f"{folder}/{rank}.pt")
     dist.destroy_process_group()
 
 
@@ -72,9 +72,9 @@ def test_two_processes_give_the_same_numbers(tmp_path):
     spawning.spawn(_process, args=(f"file://{tmp_path}/meet", str(tmp_path)), nprocs=2)
     expected = scored(1)
     for rank in (0, 1):
-        found, again = torch.load(tmp_path / f"{rank}.pt")
-        assert_same(found, expected)
-        assert_same(again, expected)
+        scores, scores_of_rank_0 = torch.load(tmp_path / f"{rank}.pt")
+        assert_same(scores, expected)
+        assert_same(scores_of_rank_0, expected)
 
 
 def test_state_is_declared_and_stays_in_float64():
@@ -92,8 +92,8 @@ def test_state_is_declared_and_stays_in_float64():
 def test_an_empty_set_is_no_score_and_never_zero():
     metric = DepthScores()
     metric.update(torch.ones(1, 4, 5), torch.zeros(1, 4, 5))
-    found = metric.compute()
-    assert float(found["background_mae_mm"]) == 1.0 and torch.isnan(found["object_mae_mm"])
+    scores = metric.compute()
+    assert float(scores["background_mae_mm"]) == 1.0 and torch.isnan(scores["object_mae_mm"])
 
 
 def test_forward_gives_the_batch_and_keeps_the_whole():

@@ -24,13 +24,13 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture
 def make(tmp_path, dataset):
-    def act(file, **changes):
+    def write(file, **changes):
         folder = write_predictions(tmp_path / file, dataset, **changes)
         path = tmp_path / f"{file}.json"
         write_result(evaluate(folder, dataset), path)
         return path
 
-    return act
+    return write
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 49])
@@ -92,7 +92,7 @@ def test_too_few_objects_for_95_percent_are_said():
 def test_ranks_with_ties():
     spans = [(1.0, (0.8, 1.2)), (1.1, (0.9, 1.3)), (1.25, (1.21, 1.4)), (9.0, (8.0, 10.0))]
     values, intervals = zip(*spans, strict=True)
-    # The third is surely worse than the first, not than the second: two are not surely better, so it is second.
+    # The third overlaps the second but not the first: a single entry is clearly better, so its rank is 2.
     assert ranks_with_ties(values, intervals) == [1, 1, 2, 4]
     assert ranks_with_ties(values[::-1], intervals[::-1]) == [4, 2, 1, 1]
     assert ranks_with_ties([2.0, 1.0, 2.0, None], [None] * 4) == [2, 1, 2, None]
@@ -147,41 +147,41 @@ def test_edited_result_contradicts_itself(path, value, message, make):
 
 
 def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
-    one, two = make("one", noise_mm=2.0, name="One"), make("two", noise_mm=1.0, name="Two")
-    found = compare(read_result(one), read_result(two))
-    rows = [row.differences["object_mae_mm"] for row in found.per_sample]
-    a, b = (json.loads(p.read_text())["per_sample"] for p in (one, two))
-    assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(a, b, strict=True)]
-    main_difference = found.differences["object_mae_mm"]
+    first, second = make("one", noise_mm=2.0, name="One"), make("two", noise_mm=1.0, name="Two")
+    comparison = compare(read_result(first), read_result(second))
+    rows = [row.differences["object_mae_mm"] for row in comparison.per_sample]
+    first_rows, second_rows = (json.loads(p.read_text())["per_sample"] for p in (first, second))
+    assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(first_rows, second_rows, strict=True)]
+    main_difference = comparison.differences["object_mae_mm"]
     assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
     assert main_difference.told_apart
-    assert found.sentence.startswith("Two has a lower object MAE than One, by 0.8")
-    assert "lower in 4 of 4 samples" in found.sentence
-    assert main(["compare", str(one), str(two), "--json", str(tmp_path / "d.json")]) == 0
-    shown = capsys.readouterr().out
-    assert "Two has a lower object MAE than One" in " ".join(shown.split())
+    assert comparison.sentence.startswith("Two has a lower object MAE than One, by 0.8")
+    assert "lower in 4 of 4 samples" in comparison.sentence
+    assert main(["compare", str(first), str(second), "--json", str(tmp_path / "d.json")]) == 0
+    printed = capsys.readouterr().out
+    assert "Two has a lower object MAE than One" in " ".join(printed.split())
     assert json.loads((tmp_path / "d.json").read_text())["differences"]["object_mae_mm"]["lower"] == 4
 
 
-def test_comparison_that_tells_nothing(make, dataset, tmp_path):
-    one = make("one", noise_mm=1.0, name="One")
+def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
+    first = make("one", noise_mm=1.0, name="One")
     folder = write_predictions(tmp_path / "two", dataset, noise_mm=1.0, name="Two")
-    for number, sample in enumerate(dataset.samples("test")):  # better on one object, worse on the other
+    for number, sample in enumerate(dataset.samples("test")):  # better on an object, worse on the other
         depth = np.load(folder / f"{sample}.npy")
         np.save(folder / f"{sample}.npy", depth + np.float32(1.0 if number < 2 else -0.5))
     write_result(evaluate(folder, dataset), tmp_path / "two.json")
-    found = compare(read_result(one), read_result(tmp_path / "two.json"))
-    assert not found.differences["object_mae_mm"].told_apart
-    assert "can't be told apart" in found.sentence and "holds 0" in found.sentence
-    assert "the same object MAE in all 4 samples" in compare(read_result(one), read_result(one)).sentence
+    comparison = compare(read_result(first), read_result(tmp_path / "two.json"))
+    assert not comparison.differences["object_mae_mm"].told_apart
+    assert "can't be told apart" in comparison.sentence and "holds 0" in comparison.sentence
+    assert "the same object MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
 
 
 def test_results_of_other_data_are_not_compared(make, dataset, tmp_path, capsys):
-    one = make("one")
-    other = tmp_path / "oracle.json"
+    first = make("one")
+    second = tmp_path / "oracle.json"
     folder = write_predictions(tmp_path / "two", dataset, uses_ground_truth_range=True)
-    write_result(evaluate(folder, dataset, target="depth_exact"), other)
-    assert main(["compare", str(one), str(other)]) == 2
+    write_result(evaluate(folder, dataset, target="depth_exact"), second)
+    assert main(["compare", str(first), str(second)]) == 2
     message = capsys.readouterr().err
     assert "target: depth against depth_exact" in message and "track: metric against oracle range" in message
 
@@ -195,23 +195,23 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     depth = np.load(folder / f"{sample}.npy")
     np.save(folder / f"{sample}.npy", depth + np.float32(0.001))
     assert main(command) == 1
-    shown = capsys.readouterr().out
-    assert shown.startswith("not verified: ") and f"{sample}: prediction_sha256" in shown
-    assert f"{sample}: object_mae_mm" in shown
+    printed = capsys.readouterr().out
+    assert printed.startswith("not verified: ") and f"{sample}: prediction_sha256" in printed
+    assert f"{sample}: object_mae_mm" in printed
     np.save(folder / f"{sample}.npy", depth)
     assert main(command) == 0
     write_predictions(folder, dataset, noise_mm=2.0, name="Another name", frames_used=[0, 1])
     capsys.readouterr()
     assert main(command) == 1
-    assert "submission.name" in (shown := capsys.readouterr().out) and "submission.frames_used" in shown
+    assert "submission.name" in (printed := capsys.readouterr().out) and "submission.frames_used" in printed
     (folder / f"{sample}.npy").unlink()
     assert main(command) == 2
 
 
 def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys):
-    other = make_dataset(tmp_path / "other", size=(40, 32))
+    other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
     file = make("p", noise_mm=2.0)
-    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(other.path)]) == 1
+    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(other_dataset.path)]) == 1
     assert "dataset.fingerprint" in capsys.readouterr().out
     file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
     assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(dataset.path)]) == 2

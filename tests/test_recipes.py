@@ -105,7 +105,7 @@ def test_a_recipe_of_yours(tmp_path):
         ("extends: 3", "expected a recipe's name"),
         ("extends: loss/l2", "no recipe 'loss/l2'; near it: loss/l1"),
         ("- a\n- list", "expected keys and values like 'normalisation: raw'"),
-        ("batch: 4\nbatch: 5", "stands twice"),
+        ("batch: 4\nbatch: 5", "is given twice"),
     ],
 )
 def test_refused(tmp_path, text, said):

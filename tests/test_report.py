@@ -52,9 +52,9 @@ def test_page_shows_the_best_the_median_and_the_worst(dataset, scored, tmp_path)
     assert path == tmp_path / "out" / "index.html"
     text = path.read_text()
     samples = dataset.samples("all")
-    shown = re.findall(r"<h3>(.*?): (.*?)</h3>", text)
-    assert shown[0] == ("Best", samples[0]) and shown[-1] == ("Worst", samples[-1])
-    assert ("Median", samples[round(0.5 * 7)]) in shown and len(shown) == 5
+    headings = re.findall(r"<h3>(.*?): (.*?)</h3>", text)
+    assert headings[0] == ("Best", samples[0]) and headings[-1] == ("Worst", samples[-1])
+    assert ("Median", samples[round(0.5 * 7)]) in headings and len(headings) == 5
     assert len(re.findall(r'<img src="data:image/png;base64,[^"]+" alt="[^"]{20,}"', text)) == 5 * 5
     assert "A &lt;b&gt;method&lt;/b&gt;" in text and "<b>" not in text
     assert f"mean {statistics.fmean(range(1, 9)):.3f} mm" in text
@@ -92,15 +92,15 @@ def test_panels_show_the_errors_they_claim():
         ("Signed error", "coolwarm", ((prediction - target) / clip + 1) / 2),
     ):
         image = decoded(panels[title].png)
-        shown = (target > 0) | (prediction > 0)
-        np.testing.assert_array_equal(image[..., 3] > 0, shown)  # a ghost in the background is shown too
+        visible = (target > 0) | (prediction > 0)
+        np.testing.assert_array_equal(image[..., 3] > 0, visible)  # a pixel predicted in the background is visible too
         expected = 255 * matplotlib.colormaps[colours](np.clip(value, 0, 1))[..., :3]
-        assert np.abs(image[..., :3].astype(float) - expected)[shown].max() <= 6  # one level of the map
+        assert np.abs(image[..., :3].astype(float) - expected)[visible].max() <= 6  # one level of the map
     np.testing.assert_array_equal(decoded(panels["Truth"].png)[..., 3] > 0, target > 0)
     assert np.abs(decoded(panels["Fringe"].png)[..., 0].astype(int) - np.maximum(fringe, 1)).max() <= 2
 
 
-def test_large_images_are_thinned_not_averaged():
+def test_large_images_are_subsampled_not_averaged():
     target = np.zeros((960, 960), np.float32)
     target[::2] = 1500
     target[1::2] = 2000
@@ -162,9 +162,9 @@ def test_only_shown_samples_are_read(dataset, scored, tmp_path):
 
 def test_what_was_not_scored_is_not_reported(dataset, scored, tmp_path):
     folder, result = scored
-    other = make_dataset(tmp_path / "other", size=(40, 40))
+    other_dataset = make_dataset(tmp_path / "other", size=(40, 40))
     with pytest.raises(DatasetError, match="which was scored"):
-        write_report(result, other, folder, tmp_path / "out")
+        write_report(result, other_dataset, folder, tmp_path / "out")
     copy = write_predictions(tmp_path / "changed", dataset, "all", offset_mm=3.0)
     with pytest.raises(PredictionError, match="is not the file that was scored"):
         write_report(result, dataset, copy, tmp_path / "out")

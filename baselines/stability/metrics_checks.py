@@ -9,7 +9,7 @@ from fpp_ml_bench.baselines.stability.case import Outcome, worst
 from fpp_ml_bench.baselines.stability.roundoff import U64, gamma, high_precision
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.error_stats import BLOCK, EMPTY, ErrorStats, combine, mean_of, stats_of
-from fpp_ml_bench.evaluation.scores import headline_scores, score_sample
+from fpp_ml_bench.evaluation.scores import score_sample
 
 _STREAM_BLOCK = 1_000_000
 _STREAM_KINDS = 20
@@ -88,7 +88,7 @@ def one_large(large_mm: float) -> Outcome:
     return _compared(stats_of(errors), _exact([(errors, 1)]), BLOCK)
 
 
-def sample(scale_mm: float, code: str, stored: str) -> Outcome:
+def sample(scale_mm: float, stored: str) -> Outcome:
     """A whole sample through the evaluator: object and background, errors of one magnitude."""
     rng = np.random.default_rng(5)
     errors = scale_mm * rng.integers(1, 1000, (SIDE, SIDE))
@@ -96,12 +96,12 @@ def sample(scale_mm: float, code: str, stored: str) -> Outcome:
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
     try:
-        found = headline_scores(prediction, target, compiled=code == "compiled")
+        found = score_sample(prediction, target)
     except PredictionError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     outcomes = []
     inside = target > 0
-    for stats, where in zip(found[1:], (inside, ~inside), strict=True):
+    for stats, where in zip((found.object, found.background), (inside, ~inside), strict=True):
         if not where.any():  # a target of 1e-160 mm is 0 in float32
             outcomes.append(Outcome(0.0 if stats == EMPTY else math.inf, 0.0))
             continue
@@ -181,7 +181,8 @@ def flawless() -> Outcome:
     """A perfect prediction scores exactly 0, and an empty set nothing, never 0."""
     target = np.zeros((64, 64), np.float32)
     target[10:40, 10:40] = 1234.567
-    overall, inside, outside = headline_scores(target, target)
-    empty = headline_scores(np.zeros((4, 4)), np.zeros((4, 4)))[1]
-    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in (overall, inside, outside)) and empty == EMPTY
+    found = score_sample(target, target)
+    empty = score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
+    parts = found.overall, found.object, found.background
+    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == EMPTY
     return Outcome(0.0 if good else math.inf, 0.0)

@@ -221,8 +221,8 @@ class _Training:
 
     def _finish_epoch(self, losses: dict[str, float], began: float) -> None:
         """Validate, set the rate of the next epoch, keep the best weights, save everything."""
-        mine = validate(self.bare["network"], self.objective, self.validation, self.recipe, self.accelerator, self.out)
-        scores = mine.mean(gather_object(mine.rows) if self.accelerator.num_processes > 1 else mine.rows)
+        network = self.bare["network"]
+        scores = validate(network, self.objective, self.validation, self.recipe, self.accelerator, self.out)
         self._check_validation(scores["validation_loss"])
         rate = self.schedule.rate
         loss = losses.pop("loss")

@@ -13,7 +13,12 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
-    parser.add_argument("second", type=Path, metavar="B.json", help="another: same data, split, target and track")
+    parser.add_argument(
+        "second",
+        type=Path,
+        metavar="B.json",
+        help="a result of another method on the same data, split, target and track",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
 
 
@@ -24,8 +29,8 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.evaluation.console import show
     from fpp_ml_bench.evaluation.result_io import read_result, write_json
 
-    found = compare(read_result(args.first), read_result(args.second))
+    comparison = compare(read_result(args.first), read_result(args.second))
     if args.json is not None:
-        write_json(found.model_dump(mode="json"), args.json)
-    show(comparison_table(found))
+        write_json(comparison.model_dump(mode="json"), args.json)
+    show(comparison_table(comparison))
     return 0

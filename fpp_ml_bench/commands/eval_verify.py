@@ -24,14 +24,14 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     result = read_result(args.result)
-    found = differences(result, args.folder, DatasetFolder(args.dataset))
-    shown = printable(str(args.result), 500)
-    if not found:
-        print(f"verified: {shown} is what {len(result.per_sample)} predictions give")
+    problems = differences(result, args.folder, DatasetFolder(args.dataset))
+    file = printable(str(args.result), 500)
+    if not problems:
+        print(f"verified: {file} is what {len(result.per_sample)} predictions give")
         return 0
-    print(f"not verified: {shown} differs from what the predictions give in {len(found)} places")
-    for line in found[:LISTED]:
+    print(f"not verified: {file} differs from what the predictions give in {len(problems)} places")
+    for line in problems[:LISTED]:
         print(f"  {line}")
-    if len(found) > LISTED:
-        print(f"  ... and {len(found) - LISTED} more")
+    if len(problems) > LISTED:
+        print(f"  ... and {len(problems) - LISTED} more")
     return CHECK_FAILED

@@ -1,4 +1,4 @@
-"""``fpp-eval``: score a folder of predictions against one split of a dataset; and what can be done with its results."""
+"""``fpp-eval``: score a folder of predictions against one split of a dataset; its subcommands work on results."""
 
 import argparse
 import sys
@@ -20,7 +20,7 @@ EXAMPLES = (
     "fpp-eval schema",
 )
 SUBCOMMANDS = {"compare": "eval_compare", "verify": "eval_verify", "schema": "eval_schema"}
-"""First words that mean another command. A folder of that name is given as ./compare."""
+"""First words that select a subcommand. A folder of such a name is given as ./compare."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder",
         type=Path,
         metavar="DIR",
-        help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png a sample, or one "
+        help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
         "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
-        "whatever is wrong with it is listed file by file, and no JSON is written",
+        "every problem is listed by file, and then no JSON is written",
     )
     parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
     parser.add_argument(
@@ -72,7 +72,7 @@ def _band(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score, write the JSON if asked to, print the table. Raises FppBenchError for anything that can't be scored."""
+    """Score, write the JSON if requested, print the table. Raises FppBenchError for anything that can't be scored."""
     with as_asked(args):
         return _run(args)
 
@@ -105,6 +105,11 @@ def _run(args: argparse.Namespace) -> int:
     for written in (args.json, args.report):
         if written is not None:
             print(f"Written: {written}")
+    from fpp_ml_bench.loaders.benchmark import benchmark_sentence
+
+    has_expected_bytes, sentence = benchmark_sentence(dataset.manifest)
+    if not has_expected_bytes:
+        print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
     if args.explain or args.explain_json:
         from fpp_ml_bench.evaluation.explain_eval import explain_eval
 
@@ -117,14 +122,14 @@ def _import_output() -> None:
 
 
 def _check_output(path: Path, folder: Path) -> None:
-    """Refuse, before any work, a JSON file that can't be written or would make the predictions unscorable."""
+    """Refuse, before any work, a JSON file that can't be written or would be an extra file among the predictions."""
     if path.is_dir():
         raise SubmissionError(f"--json {path}: expected a file to write, found a folder")
     if not path.absolute().parent.is_dir():
         raise SubmissionError(f"--json {path}: the folder {path.parent} does not exist; make it first")
     if path.absolute().parent.resolve() == folder.resolve():
         raise SubmissionError(
-            f"--json {path}: lies among the predictions, where it would be an extra file; move it out"
+            f"--json {path}: is inside the predictions folder, where it would be an extra file; move it out"
         )
 
 
@@ -132,7 +137,9 @@ def _check_report(path: Path, folder: Path) -> None:
     if path.is_file():
         raise SubmissionError(f"--report {path}: expected a folder to write into, found a file")
     if path.resolve().is_relative_to(folder.resolve()):
-        raise SubmissionError(f"--report {path}: lies among the predictions, where it would be an extra file; move it")
+        raise SubmissionError(
+            f"--report {path}: is inside the predictions folder, where it would be an extra file; move it"
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
