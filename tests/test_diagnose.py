@@ -2,7 +2,9 @@
 
 import json
 import re
+from copy import deepcopy
 
+import numpy as np
 import pytest
 import torch
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
@@ -13,6 +15,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSetti
 from fpp_ml_bench.baselines.diagnostics.probe import spread as spread_over
 from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names
 from fpp_ml_bench.baselines.diagnostics.subject import subject
+from fpp_ml_bench.baselines.stability.roundoff import U32
 from fpp_ml_bench.baselines.weights_file import save_weights
 from fpp_ml_bench.commands import main
 from fpp_ml_bench.errors import DiagnosisError
@@ -230,6 +233,17 @@ def test_probes_by_name_and_samples_evenly():
 # ---- subjects
 
 
+def float32_tolerance(network, values):
+    """How far the float32 output of ``network`` may be from ``values``, its exact output, on any processor.
+
+    Processors add the products of a convolution in different orders: n terms are off by n u at most, relative to the
+    sum of their magnitudes. Normalisation keeps the maps between convolutions at one scale, so the errors of the
+    convolutions in a row add up, relative to the largest output.
+    """
+    sums = [layer.weight[0].numel() for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)]
+    return float(len(sums) * max(sums) * U32 * np.abs(values).max())
+
+
 def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_path):
     network = tiny_network("unet", width=4, seed=3)
     path = tmp_path / "net.safetensors"
@@ -244,9 +258,14 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     assert found.units == "mm" and found.direction == "horizontal" and found.uses_ground_truth_mask
     assert not frames[0][~inside].any() and frames[0][inside].any() and frames[1] is None
     with torch.inference_mode():
-        expected = network(found.input_tensor(frames))[0, 0].numpy()
-    assert found.represent(frames) == pytest.approx(expected, abs=1e-4)
-    assert found.predict(frames) == pytest.approx(expected, abs=1e-4)
+        expected = deepcopy(network).double()(found.input_tensor(frames).double())[0, 0].numpy()
+    tolerance = float32_tolerance(network, expected)
+    with torch.inference_mode():
+        changed = deepcopy(network)
+        changed.head.weight.mul_(1.01)  # a layer that is wrong by 1% must show
+        assert np.abs(changed(found.input_tensor(frames))[0, 0].numpy() - expected).max() > 4 * tolerance
+    assert found.represent(frames) == pytest.approx(expected, abs=tolerance)
+    assert found.predict(frames) == pytest.approx(expected, abs=tolerance)
     again, other = found.untrained(3), found.untrained(4)
     assert torch.equal(next(again.parameters()), next(network.parameters()))  # seed 3 is what made the network
     assert not torch.equal(next(other.parameters()), next(again.parameters()))
@@ -263,8 +282,10 @@ def test_units_of_a_users_module_turn_its_output_into_mm(opened, mine):
     frames = opened.frames(opened.samples("test")[0], range(1))
     normalised, metres, mm = (subject(f"{mine}:make", opened, units=units) for units in ("normalised", "m", "mm"))
     assert (normalised.units, metres.units, mm.units) == ("normalised", "mm", "mm")
-    assert metres.predict(frames) == pytest.approx(1000 * mm.predict(frames), rel=1e-5)
-    assert mm.predict(frames) == pytest.approx(normalised.predict(frames))
+    expected = mm.predict(frames)
+    tolerance = float32_tolerance(mm.network, expected)
+    assert metres.predict(frames) == pytest.approx(1000 * expected, abs=1000 * tolerance)
+    assert normalised.predict(frames) == pytest.approx(expected, abs=tolerance)
     assert len({one.sha256 for one in (normalised, metres, mm)}) == 3
     assert subject(f"{mine}:make", opened, units="mm").sha256 == mm.sha256  # drawn weights are the same every time
     assert mm.layer_names == ("encoder", "decoder", "head", "unused")
