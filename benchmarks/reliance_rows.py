@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneBook
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneSet
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
 from fpp_ml_bench.baselines.inference import fringe_batch, probed, represent
 from fpp_ml_bench.baselines.methods import METHODS, Method, method
@@ -95,11 +95,11 @@ class Bench:
     """Datasets, weights and scenes, each opened once."""
 
     def __init__(self, data: list[Path], runs: list[Path], views: int) -> None:
-        self.books = [SceneBook(DatasetFolder(folder), views) for folder in data]
+        self.books = [SceneSet(DatasetFolder(folder), views) for folder in data]
         self.weights = weights_by_hash(runs)
         self._pass: tuple[str, OnePass] | None = None
 
-    def book_of(self, entry: Entry, anywhere: bool) -> SceneBook:
+    def book_of(self, entry: Entry, anywhere: bool) -> SceneSet:
         """The scenes of the row's own data; of the first dataset where it is not given and ``anywhere`` will do."""
         wanted = entry.result.dataset.fingerprint
         for book in self.books:
@@ -109,7 +109,7 @@ class Bench:
             raise FppBenchError(f"its data {wanted[:8]} is not among --data")
         return self.books[0]
 
-    def method_of(self, entry: Entry) -> tuple[Method, SceneBook]:
+    def method_of(self, entry: Entry) -> tuple[Method, SceneSet]:
         """The row's method, made again, and the scenes to ask it about. Raises FppBenchError where it can't be."""
         about = entry.result.submission
         if about.method in METHODS:

@@ -11,7 +11,7 @@ from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines.diagnostics import diagnosis
 from fpp_ml_bench.baselines.diagnostics.page import report_page
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Table, kept_finding, save_finding
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Table, load_finding, save_finding
 from fpp_ml_bench.baselines.diagnostics.probe import spread as spread_over
 from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names
 from fpp_ml_bench.baselines.diagnostics.subject import subject
@@ -74,11 +74,11 @@ def call(*arguments):
 
 def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, mine, tmp_path, capsys, monkeypatch):
     out = tmp_path / "report"
-    asked = (f"{mine}:make", tiny, "--out", out, "--layers", "encoder", "decoder", "--quick", "--samples", 4)
-    assert call(*asked, "--probe", "linear", "--threads", 1) == 0
-    assert call(*asked, "--probe", "grad-cam", "--threads", 1) == 0
-    said = capsys.readouterr().out
-    assert "kept" in said  # the linear probe joined the second report
+    arguments = (f"{mine}:make", tiny, "--out", out, "--layers", "encoder", "decoder", "--quick", "--samples", 4)
+    assert call(*arguments, "--probe", "linear", "--threads", 1) == 0
+    assert call(*arguments, "--probe", "grad-cam", "--threads", 1) == 0
+    printed = capsys.readouterr().out
+    assert "reused" in printed  # the linear probe joined the second report
     content = json.loads((out / "diagnose.json").read_text())
     assert set(content["findings"]) == {"linear", "grad-cam"}
     assert content["subject"]["layers"] == ["encoder", "decoder"]
@@ -96,8 +96,8 @@ def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, mine,
     def never(*args):
         raise AssertionError("run again")
 
-    monkeypatch.setattr(diagnosis, "_asked", never)
-    assert call(*asked, "--probe", "linear", "--probe", "grad-cam", "--threads", 1) == 0
+    monkeypatch.setattr(diagnosis, "_run_probe", never)
+    assert call(*arguments, "--probe", "linear", "--probe", "grad-cam", "--threads", 1) == 0
     assert (out / "index.html").read_text().count("data:image/png") == 4
 
 
@@ -105,8 +105,8 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
     out = tmp_path / "report"
     assert call("classical", tiny, "--out", out, "--probe", "linear", "--probe", "grad-cam") == 0
     content = json.loads((out / "diagnose.json").read_text())
-    assert all("without a network" in found["skipped"] for found in content["findings"].values())
-    assert "Not asked: classical is a method without a network" in (out / "index.html").read_text()
+    assert all("without a network" in finding["skipped"] for finding in content["findings"].values())
+    assert "Not run: classical is a method without a network" in (out / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
         ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
         ("MINE:make", ("--frame", "99"), "expected 0 to 51"),
         ("MINE:nothing", (), "holds no function 'nothing'"),
-        ("MINE:shape", (), "expected an output of shape (1, 1, 176, 176), one depth a pixel, got (1, 1, 88, 176)"),
+        ("MINE:shape", (), "expected an output of shape (1, 1, 176, 176), one depth per pixel, got (1, 1, 88, 176)"),
         ("MINE:nan", (), "30976 of 30976 values of its output are NaN"),
         ("MINE:several", (), "got tuple"),
         ("MINE:fails", (), "on fringes of shape (1, 1, 176, 176) it failed"),
@@ -135,8 +135,8 @@ def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, mine, tmp_pat
     (mine.parent / "broken.py").write_text("import a_package_that_there_is_not\n")
     model = model.replace("MINE", str(mine)).replace("FOLDER", str(mine.parent))
     assert call(model, tiny, "--out", tmp_path / "report", *options) == 2
-    said = capsys.readouterr().err
-    assert says in said and "Traceback" not in said
+    printed = capsys.readouterr().err
+    assert says in printed and "Traceback" not in printed
     assert not (tmp_path / "report" / "index.html").exists()
 
 
@@ -157,10 +157,10 @@ class Counted:
     def __init__(self) -> None:
         self.runs = 0
 
-    def applies_to(self, found):
+    def applies_to(self, model):
         return None
 
-    def run(self, found, dataset, settings, folder, progress):
+    def run(self, model, dataset, settings, folder, progress):
         self.runs += 1
         if settings.samples == 13:
             raise KeyboardInterrupt
@@ -168,13 +168,13 @@ class Counted:
 
 
 def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_path, monkeypatch):
-    one = Counted()
-    monkeypatch.setattr(diagnosis, "probe", lambda name: one)
+    counted = Counted()
+    monkeypatch.setattr(diagnosis, "probe", lambda name: counted)
     classical, phase = subject("classical", opened), subject("phase", opened)
 
     def ask(model, settings):
         diagnosis.diagnose(model, opened, ["linear"], settings, tmp_path / "out", lambda probe: lambda *told: None)
-        return one.runs
+        return counted.runs
 
     assert ask(classical, ProbeSettings()) == 1
     assert ask(classical, ProbeSettings()) == 1
@@ -183,7 +183,7 @@ def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_pat
     with pytest.raises(KeyboardInterrupt):
         ask(phase, ProbeSettings(samples=13))
     assert ask(phase, ProbeSettings(seeds=3)) == 4  # what the stopped run did not replace is still there
-    one.version = 2
+    counted.version = 2
     assert ask(phase, ProbeSettings(seeds=3)) == 5
 
 
@@ -194,14 +194,14 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
     )  # fmt: skip
     (tmp_path / "f.png").write_bytes(b"png")
     save_finding(tmp_path, "key", finding, 1.25)
-    again, seconds = kept_finding(tmp_path, "linear", "key")
-    assert seconds == 1.25 and again.values == finding.values and again.figures == finding.figures
-    assert [list(row) for row in again.tables[0].rows] == [["a", 1.5], ["b", None]]
-    assert kept_finding(tmp_path, "linear", "other") is None and kept_finding(tmp_path, "absent", "key") is None
+    stored, seconds = load_finding(tmp_path, "linear", "key")
+    assert seconds == 1.25 and stored.values == finding.values and stored.figures == finding.figures
+    assert [list(row) for row in stored.tables[0].rows] == [["a", 1.5], ["b", None]]
+    assert load_finding(tmp_path, "linear", "other") is None and load_finding(tmp_path, "absent", "key") is None
     (tmp_path / "f.png").unlink()
-    assert kept_finding(tmp_path, "linear", "key") is None
+    assert load_finding(tmp_path, "linear", "key") is None
     (tmp_path / "linear.json").write_text('{"key": "key"')
-    assert kept_finding(tmp_path, "linear", "key") is None
+    assert load_finding(tmp_path, "linear", "key") is None
     with pytest.raises(ValueError, match="Out of range float"):
         save_finding(tmp_path, "key", Finding("x", "", "", {"a": float("nan")}), 0.0)
     with pytest.raises(ValueError, match="3 cells"):
@@ -209,13 +209,13 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
 
 
 def test_text_of_a_finding_can_only_be_text(tmp_path):
-    about = {
+    context = {
         "subject": {"name": "<b>x</b>", "title": "t", "frames_used": [0], "direction": "both", "layers": []},
         "dataset": {"name": "d", "fingerprint": "0" * 64, "size": [4, 4], "samples": {"test": 1}},
         "settings": {"samples": None}, "software": {}, "command": "fpp-bench <i>", "hardware": {"cpu": "c", "cores": 1},
     }  # fmt: skip
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
-    page = report_page(about, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
+    page = report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page
@@ -250,30 +250,38 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     save_weights(
         path, network, config_of(network, image_size=opened.size, normalisation="raw", background_removed=True)
     )
-    found = subject(str(path), opened)
+    weights_subject = subject(str(path), opened)
     sample = opened.samples("test")[0]
-    frames = found.captured(opened, sample)
+    frames = weights_subject.captured(opened, sample)
     inside = object_mask(opened.depth_mm(sample))
-    assert found.layer_names[0] == "enc1" and found.layer_names[-1] == "dec1" and len(found.layer_names) == 9
-    assert found.units == "mm" and found.direction == "horizontal" and found.uses_ground_truth_mask
+    assert (
+        weights_subject.layer_names[0] == "enc1"
+        and weights_subject.layer_names[-1] == "dec1"
+        and len(weights_subject.layer_names) == 9
+    )
+    assert (
+        weights_subject.units == "mm"
+        and weights_subject.direction == "horizontal"
+        and weights_subject.uses_ground_truth_mask
+    )
     assert not frames[0][~inside].any() and frames[0][inside].any() and frames[1] is None
     with torch.inference_mode():
-        expected = deepcopy(network).double()(found.input_tensor(frames).double())[0, 0].numpy()
+        expected = deepcopy(network).double()(weights_subject.input_tensor(frames).double())[0, 0].numpy()
     tolerance = float32_tolerance(network, expected)
     with torch.inference_mode():
         changed = deepcopy(network)
         changed.head.weight.mul_(1.01)  # a layer that is wrong by 1% must show
-        assert np.abs(changed(found.input_tensor(frames))[0, 0].numpy() - expected).max() > 4 * tolerance
-    assert found.represent(frames) == pytest.approx(expected, abs=tolerance)
-    assert found.predict(frames) == pytest.approx(expected, abs=tolerance)
-    again, other = found.untrained(3), found.untrained(4)
-    assert torch.equal(next(again.parameters()), next(network.parameters()))  # seed 3 is what made the network
-    assert not torch.equal(next(other.parameters()), next(again.parameters()))
-    assert list(found.layers_of(other)) == list(found.layer_names)
-    part = subject(str(path), opened, layers=["dec1", "enc1"])
-    assert part.layer_names == ("enc1", "dec1") and part.sha256 == found.sha256
+        assert np.abs(changed(weights_subject.input_tensor(frames))[0, 0].numpy() - expected).max() > 4 * tolerance
+    assert weights_subject.represent(frames) == pytest.approx(expected, abs=tolerance)
+    assert weights_subject.predict(frames) == pytest.approx(expected, abs=tolerance)
+    same_seed, other_seed = weights_subject.untrained(3), weights_subject.untrained(4)
+    assert torch.equal(next(same_seed.parameters()), next(network.parameters()))  # seed 3 is what made the network
+    assert not torch.equal(next(other_seed.parameters()), next(same_seed.parameters()))
+    assert list(weights_subject.layers_of(other_seed)) == list(weights_subject.layer_names)
+    two_layers = subject(str(path), opened, layers=["dec1", "enc1"])
+    assert two_layers.layer_names == ("enc1", "dec1") and two_layers.sha256 == weights_subject.sha256
     with pytest.raises(DiagnosisError, match="frame 0, which is missing"):
-        found.input_tensor([None])
+        weights_subject.input_tensor([None])
     with pytest.raises(DiagnosisError, match="no network"):
         subject("classical", opened).represent(frames)
 
@@ -286,7 +294,7 @@ def test_units_of_a_users_module_turn_its_output_into_mm(opened, mine):
     tolerance = float32_tolerance(mm.network, expected)
     assert metres.predict(frames) == pytest.approx(1000 * expected, abs=1000 * tolerance)
     assert normalised.predict(frames) == pytest.approx(expected, abs=tolerance)
-    assert len({one.sha256 for one in (normalised, metres, mm)}) == 3
+    assert len({module_subject.sha256 for module_subject in (normalised, metres, mm)}) == 3
     assert subject(f"{mine}:make", opened, units="mm").sha256 == mm.sha256  # drawn weights are the same every time
     assert mm.layer_names == ("encoder", "decoder", "head", "unused")
     assert subject(f"{mine}:make", opened, layers=["decoder.0"]).layer_names == ("decoder.0",)
