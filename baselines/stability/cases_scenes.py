@@ -10,7 +10,8 @@ def cases() -> list[Case]:
     return [
         *family(
             group, "wall edge-on", check.edge_on, {"off_deg": (90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0)},
-            computes="depth of a wall this far from the line of sight", reference="ray and plane in 80-bit arithmetic",
+            computes="depth of a wall at this angle to the line of sight",
+            reference="ray and plane in 80-bit arithmetic",
             predicts="264 u kappa, kappa = sum |n d| over |n . d|; never beyond the wall's own extent", unit="m",
             expects=lambda off_deg: "number" if off_deg >= 1 else "either",
         ),
@@ -24,7 +25,7 @@ def cases() -> list[Case]:
             group, "broken mesh", check.broken,
             {"kind": ("degenerate triangles", "collinear triangles", "flipped triangles", "every triangle twice",
                       "non-manifold fin", "loose vertices", "open back")},
-            computes="outline, depth and normals of a ball with that fault", reference="the ball without it",
+            computes="outline, depth and normals of a ball with this defect", reference="the ball without it",
             predicts="same outline; depth 16 x 2^-24 x 1.8 m where a ray meets an edge of two facets", unit="m",
         ),
         *family(
@@ -34,7 +35,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "number of triangles", check.triangles, {"count": (1.0, 1e2, 1e4, 1e6, 1e7)},
-            computes="depth of a paraboloid of so many triangles", reference="the paraboloid, closed form",
+            computes="depth of a paraboloid of this number of triangles", reference="the paraboloid, closed form",
             predicts="chord error 1.3 step^2 / 2 and 32 x 2^-24 x 1.8 m at edges; one triangle: 64 u", unit="m",
             heavy=lambda count: count > 1e6,
         ),
