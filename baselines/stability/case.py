@@ -60,8 +60,8 @@ class Case:
     """An ill-conditioned or extreme case.
 
     ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts`` describe in a line each what is
-    computed, what it is compared with, and how the bound is derived. ``expects``: a number, a refusal, or either. ``heavy``
-    cases take seconds or gigabytes and are left out of a quick run.
+    computed, its reference, and how the bound is derived. ``expects``: a number, a refusal, or either. ``heavy`` cases
+    take seconds or gigabytes and are left out of a quick run.
     """
 
     group: str

@@ -44,7 +44,7 @@ def cases() -> list[Case]:
             group, "flipped bit, both directions", check.flipped_bit_both,
             {"direction": ("vertical", "horizontal"), "bit": tuple(range(7))},
             computes="depth of a plane with one Gray bit inverted in the whole image", reference="the plane, 1800 mm",
-            predicts="8-bit frames, by rig.md's slope; all slipped pixels flagged: 18 px are 11 px off the epipolar line",
+            predicts="8-bit frames, by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line",
             unit="mm", expects="either",
         ),
         *family(
