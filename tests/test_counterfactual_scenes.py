@@ -125,7 +125,7 @@ def test_samples_are_spread_over_objects_and_views(opened):
     assert [sample for sample, _ in chosen] == [
         "bowl_A0", "bowl_A120", "bowl_A240", "cork_A120", "cork_A240", "cork_A60",
     ]  # fmt: skip
-    assert all(others and others[0].split("_")[0] != sample.split("_")[0] for sample, others in chosen)
+    assert all(outlines and outlines[0].split("_")[0] != sample.split("_")[0] for sample, outlines in chosen)
     with pytest.raises(DiagnosisError, match="no sample with an object"):
         chosen_samples_of_nothing(opened)
 

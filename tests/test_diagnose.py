@@ -56,8 +56,8 @@ def number(): return 3
 
 
 @pytest.fixture(scope="module")
-def mine(tmp_path_factory):
-    path = tmp_path_factory.mktemp("mine") / "my_net.py"
+def module_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("module") / "my_net.py"
     path.write_text(NETWORK)
     return path
 
@@ -72,9 +72,9 @@ def call(*arguments):
 # ---- the command
 
 
-def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, mine, tmp_path, capsys, monkeypatch):
+def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, module_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "report"
-    arguments = (f"{mine}:make", tiny, "--out", out, "--layers", "encoder", "decoder", "--quick", "--samples", 4)
+    arguments = (f"{module_file}:make", tiny, "--out", out, "--layers", "encoder", "decoder", "--quick", "--samples", 4)
     assert call(*arguments, "--probe", "linear", "--threads", 1) == 0
     assert call(*arguments, "--probe", "grad-cam", "--threads", 1) == 0
     printed = capsys.readouterr().out
@@ -131,16 +131,16 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
         ("unet-individual-rmse", (), "was trained at (224, 224) px"),
     ],
 )
-def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, mine, tmp_path, capsys, model, options, says):
-    (mine.parent / "broken.py").write_text("import a_package_that_there_is_not\n")
-    model = model.replace("MINE", str(mine)).replace("FOLDER", str(mine.parent))
+def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, module_file, tmp_path, capsys, model, options, says):
+    (module_file.parent / "broken.py").write_text("import a_package_that_there_is_not\n")
+    model = model.replace("MINE", str(module_file)).replace("FOLDER", str(module_file.parent))
     assert call(model, tiny, "--out", tmp_path / "report", *options) == 2
     printed = capsys.readouterr().err
     assert says in printed and "Traceback" not in printed
     assert not (tmp_path / "report" / "index.html").exists()
 
 
-def test_a_folder_with_something_else_in_it_is_not_written_into(tiny, mine, tmp_path, capsys):
+def test_a_folder_with_something_else_in_it_is_not_written_into(tiny, module_file, tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("x")
     assert call("classical", tiny, "--out", tmp_path) == 2
     assert "holds thesis.tex" in capsys.readouterr().err
@@ -173,7 +173,7 @@ def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_pat
     classical, phase = subject("classical", opened), subject("phase", opened)
 
     def ask(model, settings):
-        diagnosis.diagnose(model, opened, ["linear"], settings, tmp_path / "out", lambda probe: lambda *told: None)
+        diagnosis.diagnose(model, opened, ["linear"], settings, tmp_path / "out", lambda probe: lambda *progress: None)
         return counted.runs
 
     assert ask(classical, ProbeSettings()) == 1
@@ -286,15 +286,19 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
         subject("classical", opened).represent(frames)
 
 
-def test_units_of_a_users_module_turn_its_output_into_mm(opened, mine):
+def test_units_of_a_users_module_turn_its_output_into_mm(opened, module_file):
     frames = opened.frames(opened.samples("test")[0], range(1))
-    normalised, metres, mm = (subject(f"{mine}:make", opened, units=units) for units in ("normalised", "m", "mm"))
+    normalised, metres, mm = (
+        subject(f"{module_file}:make", opened, units=units) for units in ("normalised", "m", "mm")
+    )
     assert (normalised.units, metres.units, mm.units) == ("normalised", "mm", "mm")
     expected = mm.predict(frames)
     tolerance = float32_tolerance(mm.network, expected)
     assert metres.predict(frames) == pytest.approx(1000 * expected, abs=1000 * tolerance)
     assert normalised.predict(frames) == pytest.approx(expected, abs=tolerance)
     assert len({module_subject.sha256 for module_subject in (normalised, metres, mm)}) == 3
-    assert subject(f"{mine}:make", opened, units="mm").sha256 == mm.sha256  # drawn weights are the same every time
+    assert (
+        subject(f"{module_file}:make", opened, units="mm").sha256 == mm.sha256
+    )  # drawn weights are the same every time
     assert mm.layer_names == ("encoder", "decoder", "head", "unused")
-    assert subject(f"{mine}:make", opened, layers=["decoder.0"]).layer_names == ("decoder.0",)
+    assert subject(f"{module_file}:make", opened, layers=["decoder.0"]).layer_names == ("decoder.0",)

@@ -42,7 +42,7 @@ def test_the_exact_decoder_finds_every_plane(decoded):
 
 
 def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(flat_plane, "draw", lambda *given: [])
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
     background = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
     finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), tmp_path, silent)
     assert all(row["collapsed_share"] == 1 for row in finding.values["planes"])

@@ -78,10 +78,10 @@ class Case:
     @property
     def name(self) -> str:
         """``family, parameter value, ...``"""
-        return ", ".join([self.family, *(f"{key} {shown(value)}" for key, value in self.parameters.items())])
+        return ", ".join([self.family, *(f"{key} {parameter_text(value)}" for key, value in self.parameters.items())])
 
 
-def shown(value: Scalar) -> str:
+def parameter_text(value: Scalar) -> str:
     """A parameter as text: six digits where they are exact, else all digits."""
     if not isinstance(value, float):
         return str(value)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fpp_ml_bench.baselines.stability.case import Verdict, shown
+from fpp_ml_bench.baselines.stability.case import Verdict, parameter_text
 from fpp_ml_bench.baselines.stability.heat import LEVELS, families, figure, level
 from fpp_ml_bench.baselines.stability.run import Row
 from fpp_ml_bench.evaluation.report_html import escaped, page
@@ -134,7 +134,7 @@ def _family(name: str, members: Sequence[Row]) -> str:
 
 def _line(row: Row, keys: Sequence[str]) -> str:
     outcome = row.outcome
-    cells = "".join(f"<td>{escaped(shown(row.case.parameters[key]))}</td>" for key in keys)
+    cells = "".join(f"<td>{escaped(parameter_text(row.case.parameters[key]))}</td>" for key in keys)
     bound = None if outcome.error is None else outcome.bound
     for value in (outcome.error, bound, outcome.ratio):
         cells += f"<td>{figure(value)}</td>"
