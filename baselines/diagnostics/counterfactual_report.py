@@ -34,7 +34,7 @@ def summary(reliance: Reliance) -> str:
     low, high = reliance.interval
     interval = f" (95% interval {low:.2f} to {high:.2f})" if low is not None and high is not None else ""
     order_free = (
-        f"; {reliance.order_free_score:.2f} where whole periods are forgiven"
+        f"; {reliance.order_free_score:.2f} ignoring errors of whole periods"
         if reliance.order_free_score is not None
         else ""
     )
