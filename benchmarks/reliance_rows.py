@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneBook
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneSet
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
 from fpp_ml_bench.baselines.inference import fringe_batch, probed, represent
 from fpp_ml_bench.baselines.methods import METHODS, Method, method
@@ -95,11 +95,11 @@ class Materials:
     """Datasets, weights and scenes, each opened once."""
 
     def __init__(self, data: list[Path], runs: list[Path], views: int) -> None:
-        self.scenes = [SceneBook(DatasetFolder(folder), views) for folder in data]
+        self.scenes = [SceneSet(DatasetFolder(folder), views) for folder in data]
         self.weights = weights_by_hash(runs)
         self._pass: tuple[str, SharedAnswers] | None = None
 
-    def scenes_of(self, entry: Entry, anywhere: bool) -> SceneBook:
+    def scenes_of(self, entry: Entry, anywhere: bool) -> SceneSet:
         """The scenes of the row's own data; with ``anywhere``, of the first dataset where its own is not given."""
         fingerprint = entry.result.dataset.fingerprint
         for scenes in self.scenes:
@@ -109,7 +109,7 @@ class Materials:
             raise FppBenchError(f"its data {fingerprint[:8]} is not among --data")
         return self.scenes[0]
 
-    def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneBook]:
+    def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneSet]:
         """The row's method, built again, and the scenes to measure it on. FppBenchError where it can't be built."""
         about = entry.result.submission
         if about.method in METHODS:

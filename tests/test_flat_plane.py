@@ -11,6 +11,7 @@ from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
 from fpp_ml_bench.baselines.diagnostics.subject import subject_of_method
 from fpp_ml_bench.baselines.methods import method
+from fpp_ml_bench.baselines.stability.roundoff import U32
 
 
 def answering(dataset, answer, units="mm"):
@@ -28,30 +29,31 @@ def decoded(opened, tmp_path_factory):
 
 
 def test_the_exact_decoder_finds_every_plane(decoded):
-    found, folder = decoded
-    planes = found.values["planes"]
+    finding, folder = decoded
+    planes = finding.values["planes"]
     assert {row["distance_m"] for row in planes} == {1.6, 1.8, 2.0}
     assert {row["outline"] for row in planes} == {"fills the frame", "rectangle", "power_drill_A0"}
     for row in planes:
         assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
-    assert found.values["objects"]["collapsed_share"] <= 0.02 and found.values["range_mm"] is None
-    assert all((folder / figure.file).stat().st_size > 5000 for figure in found.figures)
-    save_finding(folder, "key", found, 1.0)
+    assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
+    assert all((folder / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    save_finding(folder, "key", finding, 1.0)
 
 
 def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(flat_plane, "draw", lambda *given: [])
-    nothing = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
-    found = FlatPlane().run(nothing, opened, ProbeSettings(quick=True), tmp_path, silent)
-    assert all(row["collapsed_share"] == 1 for row in found.values["planes"])
-    low, high = found.values["range_mm"]
-    about = [opened.measured(sample) for sample in opened.samples("test")]
-    assert low == pytest.approx(np.mean([one["depth_min_mm"] for one in about]))
-    assert high == pytest.approx(np.mean([one["depth_max_mm"] for one in about]))
-    assert found.values["planes"][0]["mean_mm"] == pytest.approx(low + 0.05 * (high - low), abs=0.01)
-    assert found.values["objects"]["collapsed_share"] == 1 > found.values["objects"]["collapsed_share_true"]
-    assert "100% of a rectangular plane" in found.summary
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
+    background = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
+    finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), tmp_path, silent)
+    assert all(row["collapsed_share"] == 1 for row in finding.values["planes"])
+    low, high = finding.values["range_mm"]
+    records = [opened.measured(sample) for sample in opened.samples("test")]
+    assert low == pytest.approx(np.mean([record["depth_min_mm"] for record in records]))
+    assert high == pytest.approx(np.mean([record["depth_max_mm"] for record in records]))
+    # The answer 0.05 is rounded to float32 once.
+    assert finding.values["planes"][0]["mean_mm"] == pytest.approx(low + 0.05 * (high - low), abs=U32 * (high - low))
+    assert finding.values["objects"]["collapsed_share"] == 1 > finding.values["objects"]["collapsed_share_true"]
+    assert "100% of a rectangular plane" in finding.summary
 
 
 def test_collapse_is_nearer_to_background_than_to_any_object():
@@ -63,15 +65,15 @@ def test_collapse_is_nearer_to_background_than_to_any_object():
 
 
 def test_who_is_told_the_mask_is_not_asked(opened):
-    told = answering(opened, lambda frames: frames[51])
-    told.uses_ground_truth_mask = True
-    assert "told the object's mask" in FlatPlane().applies_to(told) and Counterfactual().applies_to(told) is None
+    masked = answering(opened, lambda frames: frames[51])
+    masked.uses_ground_truth_mask = True
+    assert "uses the object's mask" in FlatPlane().applies_to(masked) and Counterfactual().applies_to(masked) is None
 
 
 def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
     still = answering(opened, lambda frames: np.full(frames[51].shape, 1800.0))
-    found = Counterfactual().run(still, opened, ProbeSettings(quick=True), tmp_path, silent)
-    assert found.values["reliance"]["score"] == 0
-    assert "does not follow the phase" in found.summary
-    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in found.figures)
-    save_finding(tmp_path, "key", found, 1.0)
+    finding = Counterfactual().run(still, opened, ProbeSettings(quick=True), tmp_path, silent)
+    assert finding.values["reliance"]["score"] == 0
+    assert "does not follow the phase" in finding.summary
+    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    save_finding(tmp_path, "key", finding, 1.0)

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneBook
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
 from fpp_ml_bench.baselines.diagnostics.reliance import (
     Change,
     follows,
     order_free,
     order_free_follows,
     relative_change,
-    rms_asked,
+    rms_expected,
     sample_score,
 )
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
@@ -23,9 +23,9 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.uncertainty import object_interval
 
 
-def change(asked, made, answered=True):
-    asked, made = np.asarray(asked, dtype=float), np.asarray(made, dtype=float)
-    return Change(asked, made, np.broadcast_to(answered, asked.shape))
+def change(expected, actual, answered=True):
+    expected, actual = np.asarray(expected, dtype=float), np.asarray(actual, dtype=float)
+    return Change(expected, actual, np.broadcast_to(answered, expected.shape))
 
 
 RAMP = np.linspace(-1, 1, 101)
@@ -34,7 +34,7 @@ ACROSS -= RAMP * (ACROSS @ RAMP) / (RAMP @ RAMP)
 
 
 @pytest.mark.parametrize(
-    "made, expected",
+    "actual, expected",
     [
         (RAMP, 1.0),
         (0 * RAMP, 0.0),
@@ -46,9 +46,9 @@ ACROSS -= RAMP * (ACROSS @ RAMP) / (RAMP @ RAMP)
         (RAMP + ACROSS, np.sqrt(RAMP @ RAMP / (RAMP @ RAMP + ACROSS @ ACROSS))),
     ],
 )
-def test_follows_is_purity_times_gain(made, expected):
-    assert follows([change(RAMP, made)]) == pytest.approx(expected, abs=1e-12)
-    parts = [change(RAMP[::2], made[::2]), change(RAMP[1::2], made[1::2])]
+def test_follows_is_purity_times_gain(actual, expected):
+    assert follows([change(RAMP, actual)]) == pytest.approx(expected, abs=1e-12)
+    parts = [change(RAMP[::2], actual[::2]), change(RAMP[1::2], actual[1::2])]
     assert follows(parts) == pytest.approx(expected, abs=1e-12)
 
 
@@ -60,7 +60,7 @@ def test_nothing_asked_is_no_score():
 
 
 def test_a_change_with_the_outline_counts_in_units_of_what_the_phase_asks():
-    unit = rms_asked([change(RAMP, RAMP)])
+    unit = rms_expected([change(RAMP, RAMP)])
     assert unit == pytest.approx(np.sqrt(np.mean(RAMP**2)))
     assert relative_change([change(0 * RAMP, 0.25 * RAMP)], unit) == pytest.approx(0.25)
     # Moving with the range of a normalised answer and standing still are both no change.
@@ -71,10 +71,10 @@ def test_a_change_with_the_outline_counts_in_units_of_what_the_phase_asks():
 
 def test_an_answer_of_zero_mm_is_none():
     before, after = np.array([[0.0, 5.0, 5.0]]), np.array([[7.0, 0.0, 7.0]])
-    where, asked = np.ones((1, 3), dtype=bool), np.full((1, 3), 2.0)
-    found = Change.of(before, after, asked, where, zero_is_none=True)
-    assert found.made.tolist() == [0, 0, 2] and found.answered.tolist() == [False, False, True]
-    assert Change.of(before, after, asked, where, zero_is_none=False).made.tolist() == [7, -5, 2]
+    where, expected = np.ones((1, 3), dtype=bool), np.full((1, 3), 2.0)
+    zero_change = Change.of(before, after, expected, where, zero_is_none=True)
+    assert zero_change.actual.tolist() == [0, 0, 2] and zero_change.answered.tolist() == [False, False, True]
+    assert Change.of(before, after, expected, where, zero_is_none=False).actual.tolist() == [7, -5, 2]
 
 
 def test_order_free_forgives_periods_and_credits_no_chance():
@@ -113,17 +113,17 @@ def template(frames):
 
 
 def normalised(depth_mm):
-    seen = depth_mm > 0
+    inside = depth_mm > 0
     return (
-        (np.where(seen, depth_mm, depth_mm[seen].min()) - depth_mm[seen].min()) / np.ptp(depth_mm[seen])
-        if (seen.any())
+        (np.where(inside, depth_mm, depth_mm[inside].min()) - depth_mm[inside].min()) / np.ptp(depth_mm[inside])
+        if (inside.any())
         else depth_mm
     )
 
 
 @pytest.fixture(scope="module")
-def book(opened):
-    return SceneBook(opened, views=1, split="train")
+def scene_set(opened):
+    return SceneSet(opened, views=1, split="train")
 
 
 @pytest.fixture(scope="module")
@@ -132,24 +132,28 @@ def exact(opened):
 
 
 @pytest.mark.parametrize("units", ["mm", "normalised"])
-def test_the_exact_decoder_is_a_pure_phase_reader(units, book, exact):
+def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
     def answer(frames):
         depth_mm = exact.predict(frames)
         return depth_mm if units == "mm" else normalised(depth_mm)
 
-    found, samples = measure(Reader(answer, exact.frames_used, units), book)
-    assert found.score >= 0.98
-    assert found.parts.follows_light is not None and found.parts.follows_light <= 0.02
-    assert found.parts.change_outline <= 0.02 and found.parts.change_no_fringe_outside <= 0.02
-    assert found.units == units and found.objects == 2 and found.dataset_fingerprint == book.dataset.fingerprint
-    interval = object_interval([one.score for one in samples], [one.object for one in samples])
-    assert found.interval == pytest.approx(list(np.clip(interval, 0, 1)))
+    reliance, samples = measure(Reader(answer, exact.frames_used, units), scene_set)
+    assert reliance.score >= 0.98
+    assert reliance.parts.follows_light is not None and reliance.parts.follows_light <= 0.02
+    assert reliance.parts.change_outline <= 0.02 and reliance.parts.change_no_fringe_outside <= 0.02
+    assert (
+        reliance.units == units
+        and reliance.objects == 2
+        and reliance.dataset_fingerprint == scene_set.dataset.fingerprint
+    )
+    interval = object_interval([sample.score for sample in samples], [sample.object for sample in samples])
+    assert reliance.interval == pytest.approx(list(np.clip(interval, 0, 1)))
     if units == "mm":
-        assert found.order_free_score >= 0.98 and found.parts.follows_constant >= 0.98
-        assert found.parts.answered_no_fringe_inside <= 0.02
-        assert found.parts.change_other_direction is None or found.parts.change_other_direction > 1
+        assert reliance.order_free_score >= 0.98 and reliance.parts.follows_constant >= 0.98
+        assert reliance.parts.answered_no_fringe_inside <= 0.02
+        assert reliance.parts.change_other_direction is None or reliance.parts.change_other_direction > 1
     else:
-        assert found.order_free_score is None and found.parts.follows_constant is None
+        assert reliance.order_free_score is None and reliance.parts.follows_constant is None
 
 
 @pytest.mark.parametrize(
@@ -165,26 +169,26 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, book, exact):
     ],
     ids=["edges of the fringe", "edges in mm", "edges of the mask", "template", "constant", "brightness", "no answer"],
 )  # fmt: skip
-def test_readers_of_shape_have_no_phase_reliance(reader, book):
-    found, _ = measure(reader, book)
-    assert 0 <= found.score <= 0.02
-    assert found.order_free_score is None or found.order_free_score <= 0.02
+def test_readers_of_shape_have_no_phase_reliance(reader, scene_set):
+    reliance, _ = measure(reader, scene_set)
+    assert 0 <= reliance.score <= 0.02
+    assert reliance.order_free_score is None or reliance.order_free_score <= 0.02
 
 
-def test_half_a_phase_reader_has_half_the_score(book, exact):
+def test_half_a_phase_reader_has_half_the_score(scene_set, exact):
     def answer(frames):
         return 900 + 0.5 * exact.predict(frames)
 
-    found, _ = measure(Reader(answer, exact.frames_used), book)
-    assert found.score == pytest.approx(0.5, abs=0.02)
+    reliance, _ = measure(Reader(answer, exact.frames_used), scene_set)
+    assert reliance.score == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_shape_reader_changes_with_the_outline_alone(book):
-    found, _ = measure(Reader(template, (51,)), book)
-    assert found.parts.change_outline > 0.1
-    assert found.parts.follows_phase == 0 and found.parts.change_other_pitch == 0
+def test_a_shape_reader_changes_with_the_outline_alone(scene_set):
+    reliance, _ = measure(Reader(template, (51,)), scene_set)
+    assert reliance.parts.change_outline > 0.1
+    assert reliance.parts.follows_phase == 0 and reliance.parts.change_other_pitch == 0
 
 
-def test_units_that_have_no_truth_are_refused(book):
+def test_units_that_have_no_truth_are_refused(scene_set):
     with pytest.raises(DiagnosisError, match="'m'"):
-        measure(Reader(lambda frames: frames[0], units="m"), book)
+        measure(Reader(lambda frames: frames[0], units="m"), scene_set)

@@ -24,9 +24,9 @@ QUICK = {
 
 
 def cases_of(group, *families):
-    found = [case for case in all_cases([group]) if case.family in families]
-    assert {case.family for case in found} == set(families)
-    return found
+    cases = [case for case in all_cases([group]) if case.family in families]
+    assert {case.family for case in cases} == set(families)
+    return cases
 
 
 def failing(rows):
@@ -69,8 +69,8 @@ def case(run, expects="number"):
     ],
 )
 def test_the_verdict(outcome, expects, verdict, says):
-    found, against = judge(case(lambda: outcome, expects), outcome)
-    assert found is verdict and says in against
+    judged, against = judge(case(lambda: outcome, expects), outcome)
+    assert judged is verdict and says in against
 
 
 def test_the_worst_element_is_the_one_nearest_to_its_bound_and_nan_beats_them_all():
@@ -117,7 +117,7 @@ def break_triangulation(monkeypatch):
         return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
 
     monkeypatch.setattr("fpp_ml_bench.baselines.stability.triangulation_checks.depth_from_coordinate", in_single)
-    return [one for one in cases_of("triangulation", "baseline") if one.parameters["direction"] == "vertical"]
+    return [member for member in cases_of("triangulation", "baseline") if member.parameters["direction"] == "vertical"]
 
 
 def break_normalisation(monkeypatch):
@@ -151,7 +151,7 @@ def break_guard(monkeypatch):
 def break_lens(monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.lens._radial_start", lambda x, y, _: (x.copy(), y.copy()))
     missed = {"k1": 0.6, "k2": 0.9, "k3": -0.3}
-    return [one for one in cases_of("rig", "lens inverse, several terms") if one.parameters == missed]
+    return [member for member in cases_of("rig", "lens inverse, several terms") if member.parameters == missed]
 
 
 @pytest.mark.parametrize(
@@ -166,12 +166,12 @@ def test_code_that_is_broken_on_purpose_fails(broken, monkeypatch):
 
 
 def test_every_group_has_cases_that_say_what_they_are():
-    found = all_cases()
-    assert {one.group for one in found} == set(GROUPS)
-    assert len({(one.group, one.name) for one in found}) == len(found)
-    for one in found:
-        assert one.computes and one.reference and one.predicts and one.unit
-    assert any(one.heavy for one in found) and not any(one.heavy for one in all_cases(quick=True))
+    cases = all_cases()
+    assert {member.group for member in cases} == set(GROUPS)
+    assert len({(member.group, member.name) for member in cases}) == len(cases)
+    for member in cases:
+        assert member.computes and member.reference and member.predicts and member.unit
+    assert any(member.heavy for member in cases) and not any(member.heavy for member in all_cases(quick=True))
     with pytest.raises(StabilityError, match="unknown group 'chance'"):
         all_cases(["chance"])
 

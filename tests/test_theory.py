@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
-from fpp_ml_bench.baselines.diagnostics.synth import Darkroom
+from fpp_ml_bench.baselines.diagnostics.synth import SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.theory import (
     Theory,
     depth_error_mm,
@@ -18,24 +18,24 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.rig import paper_rig
 
 
-@pytest.mark.parametrize("direction, other", [("horizontal", 18), ("vertical", 0)])
-def test_two_depths_give_the_same_bytes(direction, other, opened):
-    twins = twins_of(opened, Darkroom.of(opened), direction)
-    seen = twins.depths_mm[0] > 0
-    apart = np.abs(twins.depths_mm[1] - twins.depths_mm[0])[seen]
-    assert apart.min() > 150 and ((twins.depths_mm[1] > 0) == seen).all()
+@pytest.mark.parametrize("direction, other_frame", [("horizontal", 18), ("vertical", 0)])
+def test_two_depths_give_the_same_bytes(direction, other_frame, opened):
+    twins = twins_of(opened, SceneRenderer.of(opened), direction)
+    inside = twins.depths_mm[0] > 0
+    distance_mm = np.abs(twins.depths_mm[1] - twins.depths_mm[0])[inside]
+    assert distance_mm.min() > 150 and ((twins.depths_mm[1] > 0) == inside).all()
     np.testing.assert_array_equal(twins.frames[0], twins.frames[1])
     np.testing.assert_array_equal(twins.noiseless[0], twins.noiseless[1])
-    assert twins.other_frame == other and (twins.others[0] != twins.others[1]).mean() > 0.01
+    assert twins.other_frame == other_frame and (twins.other_frames[0] != twins.other_frames[1]).mean() > 0.01
     assert (twins.frames[0] != twins.noiseless[0]).any()  # the noise is there
     assert 0 < twins.paint.min() <= twins.paint.max() <= 1
 
 
 def test_no_room_for_a_period_is_said(opened):
-    room = Darkroom.of(opened)
-    room.rig = replace(room.rig, working_range_mm=(1700.0, 1900.0))
+    renderer = SceneRenderer.of(opened)
+    renderer.rig = replace(renderer.rig, working_range_mm=(1700.0, 1900.0))
     with pytest.raises(DiagnosisError, match="no test object fits twice"):
-        twins_of(opened, room)
+        twins_of(opened, renderer)
 
 
 @pytest.mark.parametrize("direction, baseline_m", [("horizontal", 0.1), ("vertical", 0.125)])
@@ -63,8 +63,8 @@ def test_the_exponent_is_two_where_the_mistake_is_small_and_the_baseline_thin():
 
 
 def test_the_probe_needs_no_model(opened, tmp_path):
-    found = Theory().run(None, opened, ProbeSettings(), tmp_path, silent)
+    finding = Theory().run(None, opened, ProbeSettings(), tmp_path, silent)
     assert Theory().applies_to(None) is None
-    assert found.values["twins"]["differing_pixels"] == 0
-    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in found.figures)
-    assert "0 of the image's pixels differ" in found.summary
+    assert finding.values["twins"]["differing_pixels"] == 0
+    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    assert "0 of the image's pixels differ" in finding.summary

@@ -1,5 +1,5 @@
-"""What did a model read, the fringes' phase or the object's shape: the paper's probes (Section 7), and more.
+"""Whether a model reads the fringe's phase or the object's shape: the paper's probes (Section 7) and further ones.
 
-A `Subject` is what is diagnosed, a `Probe` asks it one question, a `Finding` is the answer; ``fpp-bench diagnose`` puts
-them on one page. Importing this package imports neither numpy nor torch.
+A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
+``fpp-bench diagnose`` puts them on one page. Importing this package imports neither numpy nor torch.
 """

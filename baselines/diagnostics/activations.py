@@ -1,4 +1,4 @@
-"""Looking into a frozen network batch by batch: every layer's activations are reduced as they come, and let go."""
+"""Activations of a frozen network, batch by batch: each layer's are reduced as soon as they exist and not kept."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,46 +16,48 @@ if TYPE_CHECKING:
 
 BATCH = 8
 PIXELS_AT_ONCE = BATCH * 224 * 224
-"""Images in a batch at most, and their pixels: a full-width network at 960 px is looked into one image at a time."""
+"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
 INPUT = "input"
-"""The raw input as a layer of its own: the control that every layer is measured against."""
+"""Name of the raw input, which is probed like a layer as a control."""
 
 
 @contextmanager
-def tapped(layers: dict[str, nn.Module], take: Callable[[Tensor], Tensor]) -> Iterator[dict[str, Tensor]]:
-    """Inside this block each forward pass leaves ``take(activations)`` of every layer, by name, in what is yielded.
+def tapped(layers: dict[str, nn.Module], reduce: Callable[[Tensor], Tensor]) -> Iterator[dict[str, Tensor]]:
+    """Yields a dict that each forward pass in this block fills with ``reduce(activations)`` of every layer, by name.
 
-    ``take`` is called while the layer's output is as the layer made it (a later layer may work in place on it), and its
-    result must not be a view of that. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w).
+    ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
+    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w).
     """
-    caught: dict[str, Tensor] = {}
+    activations: dict[str, Tensor] = {}
 
     def hook(name: str) -> Any:
-        def catch(module: nn.Module, inputs: object, output: object) -> None:
+        def record(module: nn.Module, inputs: object, output: object) -> None:
             if not isinstance(output, Tensor) or output.dim() != 4:
                 shape = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
                 raise DiagnosisError(f"layer {name!r}: expected activations (B, C, h, w), got {shape}; leave it out")
-            caught[name] = take(output.float())
+            activations[name] = reduce(output.float())
 
-        return catch
+        return record
 
     handles = [layer.register_forward_hook(hook(name)) for name, layer in layers.items()]
     try:
-        yield caught
+        yield activations
     finally:
         for handle in handles:
             handle.remove()
 
 
-def run(network: nn.Module, fringe: Tensor, layers: Sequence[str], caught: dict[str, Tensor], name: str) -> None:
-    """One forward pass that fills ``caught``. Raises `DiagnosisError` for an output that is no depth map, and for a
-    layer that the pass does not go through."""
-    caught.clear()
+def run(network: nn.Module, fringe: Tensor, layers: Sequence[str], activations: dict[str, Tensor], name: str) -> None:
+    """One forward pass that fills ``activations``.
+
+    Raises `DiagnosisError` for an output that is not a depth map, and for a layer that the pass does not reach.
+    """
+    activations.clear()
     with torch.no_grad():
         checked_output(network(fringe), fringe, name)
-    silent = [layer for layer in layers if layer not in caught]
-    if silent:
-        raise DiagnosisError(f"{name}: layer {silent[0]!r} takes no part in a forward pass; leave it out")
+    unreached = [layer for layer in layers if layer not in activations]
+    if unreached:
+        raise DiagnosisError(f"{name}: layer {unreached[0]!r} takes no part in a forward pass; leave it out")
 
 
 def batches(
@@ -69,12 +71,12 @@ def batches(
 
 
 def batch_size(subject: Subject) -> int:
-    """Images in a batch, for networks that keep what they compute."""
+    """Images in a batch, so that memory stays bounded."""
     return max(1, min(BATCH, PIXELS_AT_ONCE // (subject.image_size[0] * subject.image_size[1])))
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) as (B, C, *side), a new tensor: mean over areas where finer, bilinear where coarser."""
+    """Activations (B, C, h, w) resized to a new tensor (B, C, *side): area means to shrink, bilinear to enlarge."""
     if tuple(features.shape[2:]) == side:
         return features.clone()
     if features.shape[2] >= side[0] and features.shape[3] >= side[1]:
@@ -83,16 +85,16 @@ def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
 
 
 def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) at image ``pixels`` (B, P), flat places in an image of ``size``: (B, P, C).
+    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, P, C).
 
-    The layer's own value where it has a pixel for each of the image's, else bilinear between its pixel centres.
+    A layer as large as the image is read directly; others are interpolated bilinearly between their pixel centres.
     """
     if tuple(features.shape[2:]) == size:
         flat = features.flatten(2)
         return flat.gather(2, pixels[:, None].expand(-1, flat.shape[1], -1)).transpose(1, 2)
     rows, columns = pixels // size[1], pixels % size[1]
-    place = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
-    found = functional.grid_sample(
-        features, place[:, None], mode="bilinear", padding_mode="border", align_corners=False
+    position = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
+    values = functional.grid_sample(
+        features, position[:, None], mode="bilinear", padding_mode="border", align_corners=False
     )
-    return found[:, :, 0].transpose(1, 2)
+    return values[:, :, 0].transpose(1, 2)

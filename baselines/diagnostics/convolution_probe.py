@@ -1,11 +1,11 @@
 """The paper's spatial probe: four convolutions trained on frozen activations, at one resolution for every layer.
 
-The paper (Section 7.1) says "four convolutional layers" and no more; the rest is ours. 1 x 1 to `WIDTH` channels, two
-of 3 x 3, 1 x 1 to the target, ReLU between: the first is narrow so that layers of 8 and of 1024 channels get probes of
-about the same power, and the reach is 5 x 5 grid points. Activations are brought to a grid of a quarter of the image's
-sides (`grid_step`): mean over areas where finer, bilinear where coarser; targets too. Channels get mean 0 and spread 1
-over the training samples. Adam, cosine decay. All probes learn from one pass of the network over a batch, so that no
-activation is kept.
+The paper (Section 7.1) gives only "four convolutional layers"; the other choices are ours. A 1 x 1 convolution to
+`WIDTH` channels, two of 3 x 3, and a 1 x 1 to the target, with ReLU between them. The first is narrow so that layers of
+8 and of 1024 channels get probes of similar capacity. The receptive field is 5 x 5 grid points. Activations and targets
+are resized to a grid of a quarter of the image's sides (`grid_step`): area means to shrink, bilinear to enlarge.
+Channels are standardised over the training samples. Adam with cosine decay. All probes learn from one forward pass of
+the network over a batch, so no activations are stored.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 WIDTH = 16
 SHARE, LONGEST = 4, 120
-"""Image px a grid step, and grid points along a side at most, above which a step holds more px."""
+"""Image px per grid step, and the most grid points along a side; for larger images the step grows."""
 LEARNING_RATE = 3e-3
 EPOCHS = 6
 BATCH = 4
@@ -24,20 +24,20 @@ _LEAST_SPREAD = 1e-6
 
 
 def grid_step(size: tuple[int, int]) -> int:
-    """Image px a grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
+    """Image px per grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
     return max(SHARE, -(-max(size) // LONGEST))
 
 
 @dataclass
 class Moments:
-    """Mean and spread of each channel, summed up batch by batch in float64."""
+    """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
 
     count: int = 0
     total: Tensor | None = None
     square: Tensor | None = None
 
     def add(self, features: Tensor) -> None:
-        """Take (B, C, h, w) in."""
+        """Add a batch (B, C, h, w)."""
         flat = features.double().transpose(0, 1).flatten(1)
         total, square = flat.sum(1), flat.square().sum(1)
         self.count += flat.shape[1]
@@ -45,9 +45,9 @@ class Moments:
         self.square = square if self.square is None else self.square + square
 
     def standard(self) -> tuple[Tensor, Tensor]:
-        """Mean and 1 / spread, float32 (C,); a constant channel gets 0, so that it says nothing."""
+        """Mean and 1 / standard deviation, float32 (C,); 0 for a constant channel, which removes it."""
         if self.total is None or self.square is None:
-            raise ValueError("moments of nothing")
+            raise ValueError("moments need at least one batch")
         mean = self.total / self.count
         spread = (self.square / self.count - mean * mean).clamp(min=0).sqrt()
         factor = torch.where(spread > _LEAST_SPREAD * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
@@ -55,7 +55,7 @@ class Moments:
 
 
 class ConvolutionProbe(nn.Module):
-    """Four convolutions from activations (B, C, h, w) to one target (B, 1, h, w); starts at ``target_mean``."""
+    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``."""
 
     mean: Tensor
     factor: Tensor
@@ -80,9 +80,9 @@ class ConvolutionProbe(nn.Module):
 
 
 class ProbeSet:
-    """Probes that learn side by side: one for each (features, target, seed), by those three names.
+    """Probes that are trained together, one for each (features, target, seed).
 
-    ``seeds``: how many of each features; ``steps``: how many steps there will be.
+    ``seeds``: number of seeds by features; ``steps``: number of training steps, for the learning rate schedule.
     """
 
     def __init__(
@@ -100,10 +100,10 @@ class ProbeSet:
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, max(1, steps))
 
     def step(self, features: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> None:
-        """One step of every probe on a batch: activations and targets by name, (B, C, h, w) and (B, 1, h, w)."""
+        """One training step of every probe on a batch: activations (B, C, h, w) and targets (B, 1, h, w) by name."""
         self._optimiser.zero_grad(set_to_none=True)
         for (source, target, _), probe in self.probes.items():
-            # One probe after the other: a graph of all of them would hold every intermediate map at once.
+            # One backward pass per probe: a graph of all probes would hold every intermediate map at once.
             nn.functional.mse_loss(probe(features[source]), targets[target]).backward()
         self._optimiser.step()
         self._schedule.step()
@@ -113,8 +113,8 @@ class ProbeSet:
         self, features: Mapping[str, Tensor], targets: Mapping[str, Tensor]
     ) -> dict[tuple[str, str, int], list[float]]:
         """Mean squared error of every probe on each sample of a batch."""
-        found = {}
+        errors = {}
         for (source, target, seed), probe in self.probes.items():
-            miss = (probe(features[source]) - targets[target]).double().square().mean((1, 2, 3))
-            found[source, target, seed] = miss.tolist()
-        return found
+            squared = (probe(features[source]) - targets[target]).double().square().mean((1, 2, 3))
+            errors[source, target, seed] = squared.tolist()
+        return errors

@@ -1,15 +1,16 @@
-"""Counterfactual scenes (own probe): does the answer follow the fringe's phase, or the object's outline?
+"""Counterfactual scenes (own probe): does the predicted depth follow the fringe's phase, or the object's outline?
 
-Each test object is photographed again with one thing changed: its phase but not its outline or brightness, its outline
-but not its phase, no fringes inside or outside it, fringes of the other direction or of another pitch. What the answer
-should do is known, and one number says whether it does: `fpp_ml_bench.baselines.diagnostics.reliance`.
+Each test object is rendered again with a single property changed: its phase but not its outline or brightness, its
+outline but not its phase, no fringes inside or outside it, fringes of the other direction or of another pitch. The
+correct change of depth is known for each scene. A score compares it with the change of the prediction
+(`fpp_ml_bench.baselines.diagnostics.reliance`).
 """
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_report import draw, summary, tables
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneBook
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneSet
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
 from fpp_ml_bench.baselines.diagnostics.subject import Subject
@@ -21,11 +22,11 @@ MOST_VIEWS = 6
 
 
 class Counterfactual:
-    """Every counterfactual scene of every test object, the phase-reliance score, and what the answers look like."""
+    """The phase-reliance score over the counterfactual scenes of all test objects, with its parts and pictures."""
 
     name = "counterfactual"
     title = "Counterfactual scenes"
-    question = "Does the answer follow the fringe's phase, or the object's outline?"
+    question = "Does the predicted depth follow the fringe's phase, or the object's outline?"
     version = 1
 
     def applies_to(self, subject: Subject) -> str | None:
@@ -38,19 +39,19 @@ class Counterfactual:
         if settings.samples is not None:
             objects = len({dataset.measured(sample)["object"] for sample in dataset.samples("test")})
             views = min(max(settings.samples // max(objects, 1), 1), MOST_VIEWS)
-        book = SceneBook(dataset, views)
-        found, samples = measure(subject, book, subject.weights_sha256, progress)
+        scene_set = SceneSet(dataset, views)
+        reliance, samples = measure(subject, scene_set, subject.weights_sha256, progress)
         return Finding(
             self.name,
             self.title,
-            summary(found),
+            summary(reliance),
             {
-                "reliance": found.model_dump(mode="json"),
+                "reliance": reliance.model_dump(mode="json"),
                 "per_sample": {
-                    one.sample: {"score": one.score, "order_free_score": one.order_free_score, **one.parts}
-                    for one in samples
+                    sample.sample: {"score": sample.score, "order_free_score": sample.order_free_score, **sample.parts}
+                    for sample in samples
                 },
             },
-            tables(found, samples),
-            draw(subject, book, found, samples, folder),
+            tables(reliance, samples),
+            draw(subject, scene_set, reliance, samples, folder),
         )

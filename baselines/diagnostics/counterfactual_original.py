@@ -1,11 +1,11 @@
-"""A dataset's sample as a scene that can be changed, and what a change of its outline is."""
+"""A dataset's sample as a scene that can be changed, and the same sample under another outline."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.synth import Darkroom, Scene
+from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, surface_of_sample
 from fpp_ml_bench.loaders.store import DatasetFolder
 from fpp_ml_bench.pixel_sets import object_mask
@@ -13,8 +13,8 @@ from fpp_ml_bench.pixel_sets import object_mask
 
 @dataclass(frozen=True)
 class Original:
-    """A sample as it is: ``surface`` and ``scene``, ``target`` bool (H, W) (pixels with a decoded depth, those that are
-    scored), exact ``depth_mm`` float64 (H, W), and its object."""
+    """An unchanged sample: its ``object``, ``surface`` and ``scene``, exact ``depth_mm`` float64 (H, W), and ``target``
+    bool (H, W): the pixels with a decoded depth, which are scored."""
 
     sample: str
     object: str
@@ -25,19 +25,20 @@ class Original:
 
 
 @dataclass(frozen=True)
-class Recut:
-    """The same phase under another outline; ``keeps`` bool (H, W): target pixels that are object before and after."""
+class OutlineChange:
+    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
+    after."""
 
     name: str
     scene: Scene
-    keeps: NDArray[np.bool_]
+    unchanged: NDArray[np.bool_]
     depth_mm: NDArray[np.float64]
 
 
-def original(dataset: DatasetFolder, room: Darkroom, sample: str) -> Original:
-    """The sample as the dataset shows it."""
-    about, surface = dataset.measured(sample), surface_of_sample(dataset, sample)
+def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Original:
+    """``sample`` as the dataset shows it."""
+    record, surface = dataset.measured(sample), surface_of_sample(dataset, sample)
     target = object_mask(dataset.depth_mm(sample))
-    stream = (dataset.manifest.settings.get("seed", 0), about["object"], about["view"])
-    scene = Scene(surface.pixels.astype(np.uint32), room.light(surface), target, stream)
-    return Original(sample, about["object"], surface, scene, target, surface.depth_mm(room.shape))
+    stream = (dataset.manifest.settings.get("seed", 0), record["object"], record["view"])
+    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), target, stream)
+    return Original(sample, record["object"], surface, scene, target, surface.depth_mm(renderer.shape))

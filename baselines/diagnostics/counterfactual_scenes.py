@@ -1,8 +1,8 @@
-"""Scenes that differ from a dataset's sample in one thing: the phase, the outline, or where and what fringes there are.
+"""Scenes that differ from a dataset's sample in a single property: its phase, its outline, or its fringes.
 
-What moves the phase are smooth shifts over the object: ramps and a bump, and for who puts out mm also a constant. They
-reach up to 0.4 of a period, as far as the working range allows: less than half, so that a shift can't be taken for one
-the other way.
+The phase is moved by smooth shifts over the object: ramps and a bump, and for methods that predict mm also a constant.
+The shifts reach up to 0.4 of a period, or as far as the working range allows. They stay below half a period so that a
+shift can't be confused with the opposite one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, Recut, original
-from fpp_ml_bench.baselines.diagnostics.counterfactual_outlines import recuts
-from fpp_ml_bench.baselines.diagnostics.synth import Darkroom, Projected, Scene
+from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, OutlineChange, original
+from fpp_ml_bench.baselines.diagnostics.counterfactual_outlines import outline_changes
+from fpp_ml_bench.baselines.diagnostics.synth import Projected, Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Field, Surface, moved
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
@@ -25,19 +25,19 @@ from fpp_ml_bench.pixel_sets import object_mask
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU
-"""A shift that the working range holds below this says nothing; the move is left out."""
+"""Where the working range allows only smaller shifts, the move is left out."""
 REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "other direction", "other pitch")
 VIEWS_PER_OBJECT = 2
-_KEPT_PX = 300
-"""Scenes of images up to this wide are kept in memory; larger ones are made again for each method."""
+_STORED_PX = 300
+"""Scenes of images up to this width are kept in memory; larger ones are made again for each method."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """The surface moved so that its phase changes by ``amplitude_rad`` times the field ``name``; its ``depth_mm``.
+    """The surface moved to ``depth_mm``, so that its phase changes by ``amplitude_rad`` times the field ``name``.
 
-    ``phase``: only the phase is the moved surface's, every pixel keeps its brightness. ``light``: only the brightness
-    is. ``both``: the moved surface as it would be photographed.
+    ``phase``: the phase of the moved surface with the brightness of the original. ``light``: the brightness of the
+    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed.
     """
 
     name: str
@@ -50,41 +50,47 @@ class Move:
 
 @dataclass(frozen=True)
 class Counterfactuals:
-    """All that is asked of one sample. ``direction``: of the phase that moves."""
+    """All scenes of a sample. ``direction``: fringe direction whose phase is moved."""
 
     original: Original
     direction: Direction
     layer: CalibrationLayer
     moves: tuple[Move, ...]
-    recuts: tuple[Recut, ...]
+    outline_changes: tuple[OutlineChange, ...]
     reprojected: dict[str, Scene]
 
     def moves_within(self) -> tuple[Move, ...]:
-        """Those that vary over the object."""
+        """Moves that vary over the object, so all but the constant."""
         return tuple(move for move in self.moves if move.name != "constant")
 
 
 def counterfactuals(
-    dataset: DatasetFolder, room: Darkroom, sample: str, direction: Direction, others: Sequence[str] = ()
+    dataset: DatasetFolder,
+    renderer: SceneRenderer,
+    sample: str,
+    direction: Direction,
+    outline_samples: Sequence[str] = (),
 ) -> Counterfactuals:
-    """Every scene of ``sample``; ``others`` are samples whose outlines it may be cut to. Raises `DiagnosisError` for a
-    sample without an object."""
-    outlines = [object_mask(dataset.depth_mm(other)) for other in others]
-    found = original(dataset, room, sample)
-    if not found.target.any():
-        raise DiagnosisError(f"{dataset.path}: {sample} shows no object; choose samples with one")
+    """Every scene of ``sample``, which may be cut to the outlines of ``outline_samples``.
+
+    Raises `DiagnosisError` for a sample without an object.
+    """
+    outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
+    sample_scene = original(dataset, renderer, sample)
+    if not sample_scene.target.any():
+        raise DiagnosisError(f"{dataset.path}: {sample} shows no object; choose samples that do")
     return Counterfactuals(
-        original=found,
+        original=sample_scene,
         direction=direction,
-        layer=CalibrationLayer.of(room.rig, direction),
-        moves=tuple(_moves(found, room, direction)),
-        recuts=tuple(recuts(found, room, outlines)),
-        reprojected={name: replace(found.scene, projected=name) for name in REPROJECTED},
+        layer=CalibrationLayer.of(renderer.rig, direction),
+        moves=tuple(_moves(sample_scene, renderer, direction)),
+        outline_changes=tuple(outline_changes(sample_scene, renderer, outlines)),
+        reprojected={name: replace(sample_scene.scene, projected=name) for name in REPROJECTED},
     )
 
 
 def fields(surface: Surface) -> dict[str, Field]:
-    """Shifts of largest size 1 over the object's box: constant, ramps across and down, a bump in the middle."""
+    """Shifts of at most 1 over the object's bounding box: constant, ramps across and down, a bump in the centre."""
     middle = [(axis.min() + axis.max()) / 2 for axis in (surface.x, surface.y)]
     half = [max((axis.max() - axis.min()) / 2, 1e-9) for axis in (surface.x, surface.y)]
 
@@ -103,31 +109,33 @@ def _times(field: Field, amplitude: float, x: NDArray[np.float64], y: NDArray[np
     return amplitude * field(x, y)
 
 
-def _moves(found: Original, room: Darkroom, direction: Direction) -> Iterator[Move]:
-    surface = found.surface
+def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> Iterator[Move]:
+    surface = sample.surface
     for name, field in fields(surface).items():
         for sign in (1.0, -1.0):
-            amplitude = sign * _room_for(surface, room, direction, field, sign)
+            amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
-            there = moved(surface, room.rig, direction, partial(_times, field, amplitude))
-            lit = room.light(there)
-            before = found.scene.lit
+            moved_surface = moved(surface, renderer.rig, direction, partial(_times, field, amplitude))
+            lit = renderer.light(moved_surface)
+            before = sample.scene.lit
             yield Move(
                 name,
                 amplitude,
-                phase=replace(found.scene, lit=replace(lit, gain=before.gain, ambient=before.ambient)),
-                light=replace(found.scene, lit=replace(before, gain=lit.gain, ambient=lit.ambient)),
-                both=replace(found.scene, lit=lit),
-                depth_mm=there.depth_mm(room.shape),
+                phase=replace(sample.scene, lit=replace(lit, gain=before.gain, ambient=before.ambient)),
+                light=replace(sample.scene, lit=replace(before, gain=lit.gain, ambient=lit.ambient)),
+                both=replace(sample.scene, lit=lit),
+                depth_mm=moved_surface.depth_mm(renderer.shape),
             )
 
 
-def _room_for(surface: Surface, room: Darkroom, direction: Direction, field: Field, sign: float) -> float:
-    """The largest shift, up to `LARGEST_SHIFT_RAD`, that leaves every pixel within the working range."""
-    layer = CalibrationLayer.of(room.rig, direction, (surface.x, surface.y))
-    here = layer.absolute_phase(surface.depth_m * MM_PER_M)
-    ends = [layer.absolute_phase(end) - here for end in room.rig.working_range_mm]
+def _largest_shift_rad(
+    surface: Surface, renderer: SceneRenderer, direction: Direction, field: Field, sign: float
+) -> float:
+    """The largest shift, up to `LARGEST_SHIFT_RAD`, that keeps every pixel within the working range."""
+    layer = CalibrationLayer.of(renderer.rig, direction, (surface.x, surface.y))
+    phase = layer.absolute_phase(surface.depth_m * MM_PER_M)
+    ends = [layer.absolute_phase(end) - phase for end in renderer.rig.working_range_mm]
     low, high = np.minimum(*ends), np.maximum(*ends)
     shift = sign * field(surface.x, surface.y)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -136,39 +144,47 @@ def _room_for(surface: Surface, room: Darkroom, direction: Direction, field: Fie
 
 
 def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple[str, list[str]]]:
-    """``views`` samples of each object of ``split``, each with one sample of every other object, whose outlines it may
-    be cut to. Raises `DiagnosisError` for a split without an object."""
+    """``views`` samples of each object of ``split``, each with a sample of every other object, whose outlines it may be
+    cut to. Raises `DiagnosisError` for a split without an object."""
     by_object: dict[str, list[str]] = {}
     for sample in dataset.samples(split):
         if object_mask(dataset.depth_mm(sample)).any():
             by_object.setdefault(dataset.measured(sample)["object"], []).append(sample)
     if not by_object:
         raise DiagnosisError(f"{dataset.path}: {split} holds no sample with an object")
-    found = []
-    for place, (name, samples) in enumerate(by_object.items()):
+    chosen = []
+    for object_number, (name, samples) in enumerate(by_object.items()):
         # Every other view first: views 180 degrees apart show nearly the same outline.
         ordered = [*samples[0::2], *samples[1::2]]
-        for number in range(min(views, len(ordered))):
-            view = (number + place) % len(ordered)
-            others = [theirs[view % len(theirs)] for other, theirs in by_object.items() if other != name]
-            found.append((ordered[view], others))
-    return found
+        for view_number in range(min(views, len(ordered))):
+            view = (view_number + object_number) % len(ordered)
+            outline_samples = [
+                other_samples[view % len(other_samples)]
+                for other_name, other_samples in by_object.items()
+                if other_name != name
+            ]
+            chosen.append((ordered[view], outline_samples))
+    return chosen
 
 
-class SceneBook:
-    """The counterfactual scenes of a dataset, shared by every method that is asked about them: ``views`` samples of
-    each object of ``split``. Raises `DiagnosisError` for a split without an object."""
+class SceneSet:
+    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods.
+
+    Raises `DiagnosisError` for a split without an object.
+    """
 
     def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
-        self.dataset, self.room = dataset, Darkroom.of(dataset)
-        self.chosen = chosen_samples(dataset, split, views)
-        self._kept: dict[tuple[str, Direction], Counterfactuals] = {}
+        self.dataset, self.renderer = dataset, SceneRenderer.of(dataset)
+        self.samples = chosen_samples(dataset, split, views)
+        self._stored: dict[tuple[str, Direction], Counterfactuals] = {}
 
     def scenes(self, direction: Direction) -> Iterator[Counterfactuals]:
-        """Those of every sample, the phase of ``direction`` moved."""
-        for sample, others in self.chosen:
+        """The scenes of every sample, with the phase of ``direction`` moved."""
+        for sample, outline_samples in self.samples:
             key = sample, direction
-            found = self._kept.get(key) or counterfactuals(self.dataset, self.room, sample, direction, others)
-            if self.dataset.size[1] <= _KEPT_PX:
-                self._kept[key] = found
-            yield found
+            scenes = self._stored.get(key) or counterfactuals(
+                self.dataset, self.renderer, sample, direction, outline_samples
+            )
+            if self.dataset.size[1] <= _STORED_PX:
+                self._stored[key] = scenes
+            yield scenes

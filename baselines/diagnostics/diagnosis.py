@@ -1,4 +1,4 @@
-"""Asking a subject one probe after the other, keeping each answer, and writing the report."""
+"""Runs the probes on a subject, stores each finding, and writes the report."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     ProbeSettings,
     Progress,
     finding_key,
-    kept_finding,
+    load_finding,
     save_finding,
 )
 from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names, probe
@@ -34,97 +34,98 @@ _PACKAGES = ("numpy", "torch", "captum")
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A finding, how long it took, and whether it was kept from an earlier run."""
+class ProbeResult:
+    """A finding, its seconds, and whether it was ``reused`` from an earlier run."""
 
     probe: Probe
     finding: Finding
     seconds: float
-    kept: bool
+    reused: bool
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All answers about a subject, in the report's order."""
+    """All findings about a subject in the report's order, and the files ``report`` and ``values``."""
 
-    answers: tuple[Answer, ...]
+    results: tuple[ProbeResult, ...]
     report: Path
     values: Path
 
 
 def diagnose(
-    subject: "Subject", dataset: "DatasetFolder", asked: Sequence[str], settings: ProbeSettings, out: Path,
+    subject: "Subject", dataset: "DatasetFolder", probe_names: Sequence[str], settings: ProbeSettings, out: Path,
     progress: Callable[[Probe], Progress], command: str = "",
 ) -> Diagnosis:  # fmt: skip
-    """Run the probes ``asked`` by name (none: all) and write ``out/index.html`` and ``out/diagnose.json``.
+    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``.
 
-    A finding that ``out`` holds from the same subject, dataset, settings and version of the probe is kept; those of
-    probes that were not asked join the report. ``progress`` is called with a probe before it runs. ``command`` is
-    quoted in the report as the way to make it again.
+    A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the same. Findings of other
+    probes in ``out`` join the report. ``progress`` is called with a probe before it runs. ``command`` is quoted in the
+    report as the way to make it again.
 
-    Raises `DiagnosisError` for an ``out`` that holds something else, and what the probes raise; what was found before
-    is kept.
+    Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes; findings made before an
+    error stay in ``out``.
     """
     _prepare(out)
-    names = checked_names(asked)
-    answers = []
+    selected = checked_names(probe_names)
+    results = []
     for name in PROBES:
-        if name not in names and not (out / f"{name}.json").is_file():
+        if name not in selected and not (out / f"{name}.json").is_file():
             continue
-        one = probe(name)
-        key = finding_key(one, subject, dataset, settings)
-        kept = kept_finding(out, name, key)
-        if kept is not None:
-            answers.append(Answer(one, *kept, kept=True))
-        elif name in names:
-            answers.append(_asked(one, subject, dataset, settings, out, key, progress))
-    about = _about(subject, dataset, settings, command)
+        current_probe = probe(name)
+        key = finding_key(current_probe, subject, dataset, settings)
+        stored = load_finding(out, name, key)
+        if stored is not None:
+            finding, seconds = stored
+            results.append(ProbeResult(current_probe, finding, seconds, reused=True))
+        elif name in selected:
+            results.append(_run_probe(current_probe, subject, dataset, settings, out, key, progress))
+    context = _context(subject, dataset, settings, command)
     content = {
-        "format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **about,
+        "format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context,
         "findings": {
-            one.finding.probe: {
-                "title": one.finding.title, "summary": one.finding.summary, "skipped": one.finding.skipped,
-                "seconds": one.seconds, "values": one.finding.values,
+            result.finding.probe: {
+                "title": result.finding.title, "summary": result.finding.summary, "skipped": result.finding.skipped,
+                "seconds": result.seconds, "values": result.finding.values,
             }
-            for one in answers
+            for result in results
         },
     }  # fmt: skip
     values, report = out / JSON_FILE, out / REPORT_FILE
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(values, (text + "\n").encode("utf-8"))
-    page = report_page(about, [(one.probe.question, one.finding) for one in answers], out)
+    page = report_page(context, [(result.probe.question, result.finding) for result in results], out)
     write_atomically(report, page.encode("utf-8"))
-    return Diagnosis(tuple(answers), report, values)
+    return Diagnosis(tuple(results), report, values)
 
 
-def _asked(
-    one: Probe, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, out: Path, key: str,
+def _run_probe(
+    current_probe: Probe, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, out: Path, key: str,
     progress: Callable[[Probe], Progress],
-) -> Answer:  # fmt: skip
-    reason = one.applies_to(subject)
+) -> ProbeResult:  # fmt: skip
+    reason = current_probe.applies_to(subject)
     started = perf_counter()
     if reason is None:
-        finding = one.run(subject, dataset, settings, out, progress(one))
+        finding = current_probe.run(subject, dataset, settings, out, progress(current_probe))
     else:
-        finding = Finding(one.name, one.title, "", skipped=reason)
+        finding = Finding(current_probe.name, current_probe.title, "", skipped=reason)
     seconds = round(perf_counter() - started, 2)
     save_finding(out, key, finding, seconds)
-    return Answer(one, finding, seconds, kept=False)
+    return ProbeResult(current_probe, finding, seconds, reused=False)
 
 
 def _prepare(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        held = sorted(path.name for path in out.iterdir())
+        names = sorted(path.name for path in out.iterdir())
     except OSError as error:
         raise DiagnosisError(f"{out}: can't be made a folder ({error.strerror}); give another --out") from None
     ours = {JSON_FILE, REPORT_FILE, *(f"{name}.json" for name in PROBES)}
-    foreign = [name for name in held if name not in ours and not name.endswith((".png", ".tmp"))]
+    foreign = [name for name in names if name not in ours and not name.endswith((".png", ".tmp"))]
     if foreign:
         raise DiagnosisError(f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder")
 
 
-def _about(subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, command: str) -> dict[str, Any]:
+def _context(subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, command: str) -> dict[str, Any]:
     height, width = dataset.size
     return {
         "subject": {

@@ -1,4 +1,4 @@
-"""Figures of the report: one look for all, small files. Black on white, for they stand on a white card on the page."""
+"""Common style of the report's figures: small files, black on white."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 DPI = 130
 EDGES, DEPTH, PHASE, ORDER = "#2e8b57", "#c0392b", "#1b5bb8", "#8a4b00"
-"""Colours of what is asked for: edges and depth as in the paper's figure, phase and fringe order besides."""
+"""Colours of the targets: edges and depth as in the paper's figure, phase, and fringe order."""
 RAW, RANDOM = "#59616b", "#9aa3ad"
 """Colours of the controls: the raw input, and a network with random weights."""
 
@@ -30,7 +30,7 @@ def drawing(rows: int, columns: int, width: float = 9.0, height: float = 3.4, **
 
 
 def tidy(axes: "Axes", title: str = "", x: str = "", y: str = "") -> None:
-    """Titles, a light grid, no box."""
+    """Set titles and a light grid, and remove the box."""
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xlabel(x, fontsize=9)
     axes.set_ylabel(y, fontsize=9)
@@ -46,31 +46,31 @@ def picture(
     high: float | None = None,
 ) -> Any:  # fmt: skip
     """An image (H, W) without ticks; limits default to its own range."""
-    shown = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    drawn_image = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
     axes.set_title(title, fontsize=9)
     axes.set_xticks([])
     axes.set_yticks([])
-    return shown
+    return drawn_image
 
 
 def bars_of(
-    axes: "Axes", place: NDArray, values: Sequence[float | None], intervals: Sequence[tuple[float, float] | None],
+    axes: "Axes", positions: NDArray, values: Sequence[float | None], intervals: Sequence[tuple[float, float] | None],
     width: float, colour: str, label: str,
 ) -> None:  # fmt: skip
-    """Bars with their intervals; a value of None leaves its place empty."""
-    shown = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    axes.bar(place, shown, width, color=colour, label=label)
-    for x, value, interval in zip(place, shown, intervals, strict=True):
+    """Bars with their intervals; no bar for a value of None."""
+    heights = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    axes.bar(positions, heights, width, color=colour, label=label)
+    for x, value, interval in zip(positions, heights, intervals, strict=True):
         if interval is not None and np.isfinite(value):
             axes.plot([x, x], interval, color="#191c20", linewidth=1)
 
 
 def save_png(figure: "Drawing", path: Path) -> None:
-    """Write ``figure`` with 256 colours, a third of the bytes; the same bytes every time."""
+    """Write ``figure`` as PNG with 256 colours, a third of the size; the bytes are reproducible."""
     from PIL import Image
 
-    held = BytesIO()
-    figure.savefig(held, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
-    held.seek(0)
-    small = Image.open(held).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    small.save(path, optimize=True)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+    buffer.seek(0)
+    reduced = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    reduced.save(path, optimize=True)

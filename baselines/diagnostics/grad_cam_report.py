@@ -1,4 +1,4 @@
-"""What Grad-CAM found in words, in the paper's table, and in the paper's two figures."""
+"""Summary of Grad-CAM, the paper's table, and the paper's two figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,59 +16,61 @@ if TYPE_CHECKING:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
 PAPER_RATIO = 1.28
-_SHOWN = 3
+_EXAMPLES = 3
 _BARS = 0.2
 
 
-def summary(found: Correlations) -> str:
-    """What the numbers say, and what they can't."""
-    edges, fringes = found.average(EDGES), found.average(FRINGES)
-    random = found.average(EDGES, trained=False), found.average(FRINGES, trained=False)
-    own = found.average(OWN, trained=False).r
+def summary(correlations: Correlations) -> str:
+    """The result in a few sentences."""
+    edges, fringes = correlations.average(EDGES), correlations.average(FRINGES)
+    random = correlations.average(EDGES, trained=False), correlations.average(FRINGES, trained=False)
+    own = correlations.average(OWN, trained=False).r
     text = (
         f"Over the layers, heatmaps correlate with edges by {_r(edges.r)} and with fringe variation by "
-        f"{_r(fringes.r)}, {ratio_said(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: "
+        f"{_r(fringes.r)}, {ratio_text(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: "
         f"{_r(random[0].r)} and {_r(random[1].r)}; edges and fringe variation themselves correlate by "
-        f"{_r(found.references.r)}, for both are strong where the object is."
+        f"{_r(correlations.references.r)}, because both are strong where the object is."
     )
     if own is not None:
         text += f" Random weights' heatmaps agree with the trained ones by {own:.2f}."
     return text
 
 
-def ratio_said(edges: Mean, fringes: Mean) -> str:
-    """The ratio, and whether it can be one: a divisor whose interval holds 0 divides by anything."""
+def ratio_text(edges: Mean, fringes: Mean) -> str:
+    """The ratio, with a note where the interval of the divisor holds 0."""
     quotient, span = ratio(edges.r, fringes.r), fringes.interval
     if quotient is None:
         return "no ratio"
     if span is not None and span[0] <= 0 <= span[1]:
-        return f"ratio {quotient:.2f}, which says nothing: the second can't be told from 0"
+        return f"ratio {quotient:.2f}, which says nothing: its divisor can't be told from 0"
     return f"ratio {quotient:.2f}"
 
 
-def tables(found: Correlations) -> list[Table]:
+def tables(correlations: Correlations) -> list[Table]:
     """The paper's table with random weights beside it, and the sanity check."""
-    ours = set(found.layers) == set(PAPER_LAYERS)
+    has_paper_layers = set(correlations.layers) == set(PAPER_LAYERS)
     rows: list[list[Cell]] = []
-    for layer in found.layers:
-        edges, fringes = found.mean(layer, EDGES), found.mean(layer, FRINGES)
-        name = f"{layer} (paper's {PAPER_LAYERS[layer]})" if ours and PAPER_LAYERS[layer] != layer else layer
-        rows.append([name, _shown(edges), _shown(fringes), ratio(edges.r, fringes.r)])
+    for layer in correlations.layers:
+        edges, fringes = correlations.mean(layer, EDGES), correlations.mean(layer, FRINGES)
+        name = (
+            f"{layer} (paper's {PAPER_LAYERS[layer]})" if has_paper_layers and PAPER_LAYERS[layer] != layer else layer
+        )
+        rows.append([name, _cell(edges), _cell(fringes), ratio(edges.r, fringes.r)])
     for title, trained in (("Average", True), ("Average, random weights", False)):
-        edges, fringes = found.average(EDGES, trained), found.average(FRINGES, trained)
-        rows.append([title, _shown(edges), _shown(fringes), ratio(edges.r, fringes.r)])
-    between = found.references
-    rows.append(["Edges with fringes", _shown(between), None, None])
+        edges, fringes = correlations.average(EDGES, trained), correlations.average(FRINGES, trained)
+        rows.append([title, _cell(edges), _cell(fringes), ratio(edges.r, fringes.r)])
+    between = correlations.references
+    rows.append(["Edges with fringes", _cell(between), None, None])
     check: list[list[Cell]] = [
         [
             layer,
-            _shown(found.mean(layer, EDGES, trained=False)),
-            _shown(found.mean(layer, FRINGES, trained=False)),
-            _shown(found.mean(layer, OWN, trained=False)),
+            _cell(correlations.mean(layer, EDGES, trained=False)),
+            _cell(correlations.mean(layer, FRINGES, trained=False)),
+            _cell(correlations.mean(layer, OWN, trained=False)),
         ]
-        for layer in found.layers
+        for layer in correlations.layers
     ]
-    count = len(found.objects)
+    count = len(correlations.objects)
     return [
         Table(
             f"Correlation of Grad-CAM with edges and fringes, {count} test samples (the paper's table)",
@@ -82,28 +84,30 @@ def tables(found: Correlations) -> list[Table]:
 
 
 def draw(
-    found: Correlations, subject: Subject, dataset: "DatasetFolder", samples: Sequence[str], layers: Sequence[str],
-    folder: Path,
+    correlations: Correlations, subject: Subject, dataset: "DatasetFolder", samples: Sequence[str],
+    layers: Sequence[str], folder: Path,
 ) -> list[Figure]:  # fmt: skip
     """Both figures, written into ``folder``."""
-    return [_bars(found, folder), _heatmaps(subject, dataset, samples, layers, folder)]
+    return [_bars(correlations, folder), _heatmaps(subject, dataset, samples, layers, folder)]
 
 
-def _bars(found: Correlations, folder: Path) -> Figure:
+def _bars(correlations: Correlations, folder: Path) -> Figure:
     figure, axes = figures.drawing(1, 1, 9, 3.4)
-    axis, place = axes[0, 0], np.arange(len(found.layers))
+    axis, positions = axes[0, 0], np.arange(len(correlations.layers))
     series = (
         (EDGES, True, figures.EDGES, "edges"), (FRINGES, True, figures.PHASE, "fringes"),
         (EDGES, False, figures.RANDOM, "edges, random weights"),
         (FRINGES, False, figures.RAW, "fringes, random weights"),
     )  # fmt: skip
-    for number, (what, trained, colour, label) in enumerate(series):
-        means = [found.mean(layer, what, trained) for layer in found.layers]
+    for number, (target, trained, colour, label) in enumerate(series):
+        means = [correlations.mean(layer, target, trained) for layer in correlations.layers]
         shift = (number - 1.5) * _BARS
-        figures.bars_of(axis, place + shift, [m.r for m in means], [m.interval for m in means], _BARS, colour, label)
+        figures.bars_of(
+            axis, positions + shift, [m.r for m in means], [m.interval for m in means], _BARS, colour, label
+        )
     axis.axhline(0, color="#191c20", linewidth=0.8)
-    axis.set_xticks(place, found.layers, rotation=30 if len(found.layers) > 8 else 0)
-    figures.tidy(axis, f"Grad-CAM against edges and fringes, {len(found.objects)} test samples", y="Pearson r")
+    axis.set_xticks(positions, correlations.layers, rotation=30 if len(correlations.layers) > 8 else 0)
+    figures.tidy(axis, f"Grad-CAM against edges and fringes, {len(correlations.objects)} test samples", y="Pearson r")
     axis.legend(fontsize=8, frameon=False, ncols=2)
     file = "grad_cam_correlations.png"
     figures.save_png(figure, folder / file)
@@ -113,20 +117,20 @@ def _bars(found: Correlations, folder: Path) -> Figure:
 def _heatmaps(
     subject: Subject, dataset: "DatasetFolder", samples: Sequence[str], layers: Sequence[str], folder: Path
 ) -> Figure:
-    places = sorted({round(share * (len(samples) - 1)) for share in np.linspace(0, 1, _SHOWN)})
-    shown = [samples[place] for place in places]
+    picks = sorted({round(share * (len(samples) - 1)) for share in np.linspace(0, 1, _EXAMPLES)})
+    examples = [samples[pick] for pick in picks]
     if subject.network is None:
         raise ValueError("heatmaps need a network")
-    figure, axes = figures.drawing(len(shown), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(shown))
+    figure, axes = figures.drawing(len(examples), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(examples))
     (index,) = subject.frames_used
-    found = maps(subject, subject.network, dataset, shown, layers)
-    for number, (row, (sample, heat)) in enumerate(zip(axes, found, strict=True)):
-        known = references(subject, dataset, sample)
-        first = number == 0
-        frame = subject.as_given(dataset.frame(sample, index), dataset.depth_mm(sample))
+    sample_maps = maps(subject, subject.network, dataset, examples, layers)
+    for row_index, (row, (sample, heat)) in enumerate(zip(axes, sample_maps, strict=True)):
+        reference_maps = references(subject, dataset, sample)
+        first = row_index == 0
+        frame = subject.as_input(dataset.frame(sample, index), dataset.depth_mm(sample))
         figures.picture(row[0], frame, "input" if first else "", low=0, high=255)
-        figures.picture(row[1], known["edges"], "edges" if first else "", low=0)
-        figures.picture(row[2], known["fringes"], "fringes" if first else "", low=0)
+        figures.picture(row[1], reference_maps["edges"], "edges" if first else "", low=0)
+        figures.picture(row[2], reference_maps["fringes"], "fringes" if first else "", low=0)
         row[0].set_ylabel(sample, fontsize=7)
         for axis, layer in zip(row[3:], layers, strict=True):
             figures.picture(axis, heat[layer], layer if first else "", "inferno", 0, float(heat[layer].max()) or 1.0)
@@ -139,7 +143,7 @@ def _r(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def _shown(mean: Mean) -> str:
+def _cell(mean: Mean) -> str:
     if mean.r is None:
         return "-"
     span = "" if mean.interval is None else f" ({mean.interval[0]:.3f} to {mean.interval[1]:.3f})"

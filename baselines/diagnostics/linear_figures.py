@@ -1,4 +1,4 @@
-"""The figures of linear probing: the paper's bars, and what each layer holds against its controls."""
+"""The figures of linear probing: the paper's bars, and each layer beside the controls."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ def draw(linear: Scores, spatial: Scores, folder: Path) -> list[Figure]:
 def _paper(spatial: Scores, folder: Path) -> Figure:
     layers = list(spatial[TRAINED])
     figure, axes = figures.drawing(1, 2, 10, 3.6)
-    place = np.arange(len(layers))
+    positions = np.arange(len(layers))
     for axis, key, interval, title in (
         (axes[0, 0], "mse", "mse_interval", "Validation MSE: the paper's figure (different units!)"),
         (axes[0, 1], "r2", "r2_interval", "The same probes: share of variance explained"),
@@ -35,12 +35,12 @@ def _paper(spatial: Scores, folder: Path) -> Figure:
         for shift, target in ((-1, "edges"), (1, "depth")):
             scores = [spatial[TRAINED][layer][target] for layer in layers]
             figures.bars_of(
-                axis, place + shift * _BARS / 2, [getattr(one, key) for one in scores],
-                [getattr(one, interval) for one in scores], _BARS, _COLOURS[target], target,
+                axis, positions + shift * _BARS / 2, [getattr(layer_score, key) for layer_score in scores],
+                [getattr(layer_score, interval) for layer_score in scores], _BARS, _COLOURS[target], target,
             )  # fmt: skip
             random = [getattr(spatial[UNTRAINED][layer][target], key) for layer in layers]
             axis.plot(
-                place + shift * _BARS / 2, random, linestyle="none", marker="_", markersize=9, markeredgewidth=2,
+                positions + shift * _BARS / 2, random, linestyle="none", marker="_", markersize=9, markeredgewidth=2,
                 color="black", label="random weights" if shift > 0 else None,
             )  # fmt: skip
             raw = getattr(spatial[CONTROLS][INPUT][target], key)
@@ -65,22 +65,36 @@ def _curves(linear: Scores, folder: Path) -> Figure:
     columns = 3 if len(targets) > 2 else 2
     rows = -(-len(targets) // columns)
     figure, axes = figures.drawing(rows, columns, 10, 2.7 * rows)
-    place = np.arange(len(layers))
+    positions = np.arange(len(layers))
     for axis, target in zip(axes.flat, targets, strict=False):
         scores = [linear[TRAINED][layer][target] for layer in layers]
         random = [linear[UNTRAINED][layer][target] for layer in layers]
-        low, high = ([min(one.seeds) for one in random], [max(one.seeds) for one in random])
-        axis.fill_between(place, low, high, color=figures.RANDOM, alpha=0.4, linewidth=0)
-        axis.plot(place, [one.r2 for one in random], color=figures.RANDOM, label="random weights")
-        axis.plot(place, [one.r2 for one in scores], color=_COLOURS[target], marker="o", markersize=4, label="trained")
-        spans = [(x, one.r2_interval) for x, one in zip(place, scores, strict=True) if one.r2_interval is not None]
+        low, high = (
+            [min(layer_score.seeds) for layer_score in random],
+            [max(layer_score.seeds) for layer_score in random],
+        )
+        axis.fill_between(positions, low, high, color=figures.RANDOM, alpha=0.4, linewidth=0)
+        axis.plot(positions, [layer_score.r2 for layer_score in random], color=figures.RANDOM, label="random weights")
+        axis.plot(
+            positions,
+            [layer_score.r2 for layer_score in scores],
+            color=_COLOURS[target],
+            marker="o",
+            markersize=4,
+            label="trained",
+        )
+        spans = [
+            (x, layer_score.r2_interval)
+            for x, layer_score in zip(positions, scores, strict=True)
+            if layer_score.r2_interval is not None
+        ]
         for x, span in spans:
             axis.plot([x, x], span, color=_COLOURS[target], linewidth=1)
         for control, style in ((INPUT, ":"), ("position", "--")):
-            label = "raw input" if control == INPUT else "pixel's place"
+            label = "raw input" if control == INPUT else "pixel's position"
             axis.axhline(linear[CONTROLS][control][target].r2, color="black", linewidth=1, linestyle=style, label=label)
         axis.axhline(0, color="#dfe1e5", linewidth=1)
-        axis.set_ylim(min(-0.1, max(-0.5, min(one.r2 for one in scores) - 0.05)), 1.02)
+        axis.set_ylim(min(-0.1, max(-0.5, min(layer_score.r2 for layer_score in scores) - 0.05)), 1.02)
         _layers(axis, layers)
         figures.tidy(axis, TITLES[target], y="R2")
     for axis in axes.flat[len(targets) :]:
@@ -92,8 +106,8 @@ def _curves(linear: Scores, folder: Path) -> Figure:
         axes.flat[0].legend(fontsize=7, frameon=False)
     file = "linear_one_by_one.png"
     figures.save_png(figure, folder / file)
-    said = f"R2 of linear probes for {', '.join(TITLES[target] for target in targets)} by layer, with controls"
-    return Figure("Linear (1 x 1) probes by layer and target", file, said)
+    description = f"R2 of linear probes for {', '.join(TITLES[target] for target in targets)} by layer, with controls"
+    return Figure("Linear (1 x 1) probes by layer and target", file, description)
 
 
 def _layers(axis: Any, layers: Sequence[str]) -> None:

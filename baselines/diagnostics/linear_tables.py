@@ -1,4 +1,4 @@
-"""The tables of linear probing: the paper's, and those that say what its numbers rest on."""
+"""The tables of linear probing: the paper's, and the same probes beside their controls."""
 
 import numpy as np
 
@@ -20,18 +20,19 @@ TITLES = {
     "edges": "edges", "depth": "depth, whole image", "distance": "depth in mm, object", "phase": "wrapped phase",
     "order": "fringe order",
 }  # fmt: skip
-_CONTROL_TITLES = {INPUT: "raw input", "position": "pixel's place alone"}
+_CONTROL_TITLES = {INPUT: "raw input", "position": "pixel's position alone"}
 
 
 def tables(linear: Scores, spatial: Scores) -> list[Table]:
-    """All of them, the paper's first."""
+    """All tables, the paper's first."""
     return [paper_table(spatial), variance_table(spatial), linear_table(linear)]
 
 
 def paper_table(spatial: Scores) -> Table:
     """Validation MSE of the four-convolution probes by layer, and their ratio."""
     rows: list[list[Cell]] = [
-        [layer, found["edges"].mse, found["depth"].mse, ratio(found)] for layer, found in spatial[TRAINED].items()
+        [layer, targets["edges"].mse, targets["depth"].mse, ratio(targets)]
+        for layer, targets in spatial[TRAINED].items()
     ]
     rows += [
         [title, *(_mean(layers, target) for target in ("edges", "depth")), mean_ratio(layers)]
@@ -41,10 +42,10 @@ def paper_table(spatial: Scores) -> Table:
             ("Raw input", spatial[CONTROLS]),
         )
     ]
-    known = spatial[CONTROLS][INPUT]
-    rows.append(["Predicting the mean", known["edges"].mse_of_mean, known["depth"].mse_of_mean, ratio_of_means(known)])
+    raw = spatial[CONTROLS][INPUT]
+    rows.append(["Predicting the mean", raw["edges"].mse_of_mean, raw["depth"].mse_of_mean, ratio_of_means(raw)])
     return Table(
-        "Four-convolution probes, validation MSE (the paper's table; less is easier to read)",
+        "Four-convolution probes, validation MSE (the paper's table; lower is easier to read)",
         ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"),
         rows,
     )
@@ -56,32 +57,32 @@ def variance_table(spatial: Scores) -> Table:
     rows: list[list[Cell]] = [
         [
             layer,
-            *(shown(layers[layer][target]) for target in ("edges", "depth") for layers in _pair(spatial)),
+            *(score_text(layers[layer][target]) for target in ("edges", "depth") for layers in _pair(spatial)),
         ]
         for layer in spatial[TRAINED]
     ]
     raw = spatial[CONTROLS][INPUT]
-    rows.append(["Raw input", shown(raw["edges"]), None, shown(raw["depth"]), None])
+    rows.append(["Raw input", score_text(raw["edges"]), None, score_text(raw["depth"]), None])
     return Table("The same probes, share of variance explained (R2)", header, rows)
 
 
 def linear_table(linear: Scores) -> Table:
-    """R2 of the 1 x 1 probes by layer and target, beside that of random weights; the controls below."""
+    """R2 of the 1 x 1 probes by layer and target, beside random weights, with the controls below."""
     targets = list(next(iter(linear[TRAINED].values())))
     rows: list[list[Cell]] = []
-    for layer, found in linear[TRAINED].items():
-        pairs = [(found[target], linear[UNTRAINED][layer][target]) for target in targets]
-        rows.append([layer, *(f"{one.r2:.3f}" for pair in pairs for one in pair)])
-    for layer, found in linear[CONTROLS].items():
+    for layer, scores in linear[TRAINED].items():
+        pairs = [(scores[target], linear[UNTRAINED][layer][target]) for target in targets]
+        rows.append([layer, *(f"{target_score.r2:.3f}" for pair in pairs for target_score in pair)])
+    for layer, scores in linear[CONTROLS].items():
         rows.append(
-            [_CONTROL_TITLES[layer], *(cell for target in targets for cell in (f"{found[target].r2:.3f}", None))]
+            [_CONTROL_TITLES[layer], *(cell for target in targets for cell in (f"{scores[target].r2:.3f}", None))]
         )
     header = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
     return Table("Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)", header, rows)
 
 
-def shown(score: Score) -> str:
-    """R2 with its interval."""
+def score_text(score: Score) -> str:
+    """R2 with its interval, for a table cell."""
     if score.r2_interval is None:
         return f"{score.r2:.3f}"
     low, high = score.r2_interval
@@ -93,4 +94,4 @@ def _pair(scores: Scores) -> tuple[Layers, Layers]:
 
 
 def _mean(layers: Layers, target: str) -> float:
-    return float(np.mean([found[target].mse for found in layers.values()]))
+    return float(np.mean([targets[target].mse for targets in layers.values()]))

@@ -1,4 +1,4 @@
-"""The report as one HTML page that carries its pictures in itself and loads nothing."""
+"""The report as an HTML page with embedded pictures, which loads nothing."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,48 +11,52 @@ REPORT_FILE = "index.html"
 _TEXT = 4000
 _STYLE = """
 .drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
-.asked { font-style: italic; color: var(--soft); }
+.question { font-style: italic; color: var(--soft); }
 figure + .scroll, .scroll + .scroll { margin-top: 1.25rem; }
 ul.short { padding-left: 1.1rem; max-width: 46rem; }
 ul.short li { margin: .5rem 0; }
 """
 
 
-def report_page(about: Mapping[str, Any], found: Sequence[tuple[str, Finding]], folder: Path) -> str:
-    """The page on a subject ``about`` which is known what `diagnosis` writes; each finding with its question, pictures
-    from ``folder``."""
-    subject, dataset = about["subject"], about["dataset"]
+def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
+    """The report: a section for each finding with its question and its pictures from ``folder``.
+
+    ``context`` is what `diagnosis` stores about subject, dataset, settings and machine.
+    """
+    subject, dataset = context["subject"], context["dataset"]
     height, width = dataset["size"]
     frames = subject["frames_used"]
-    taken = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
+    frames_text = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
     lines = (
-        f"{subject['title']}; {taken} a sample, {subject['direction']} fringes",
+        f"{subject['title']}; {frames_text} per sample, {subject['direction']} fringes",
         f"{dataset['name']} ({dataset['fingerprint'][:8]}), {sum(dataset['samples'].values())} samples of {width} x "
         f"{height} px",
     )
     intro = "".join(f'<p class="soft">{escaped(line, _TEXT)}</p>' for line in lines)
     short = "".join(
-        f'<li><a href="#{escaped(one.probe)}">{escaped(one.title)}</a>: '
-        f"{escaped(one.skipped or one.summary, _TEXT)}</li>"
-        for _, one in found
+        f'<li><a href="#{escaped(finding.probe)}">{escaped(finding.title)}</a>: '
+        f"{escaped(finding.skipped or finding.summary, _TEXT)}</li>"
+        for _, finding in findings
     )
+    sections = "".join(_section(question, finding, folder) for question, finding in findings)
     body = (
         f"<header><h1>What did {escaped(subject['name'])} read?</h1>{intro}</header>\n"
         f'<main id="main">\n<section><h2>In short</h2><ul class="short">{short}</ul></section>\n'
-        f"{''.join(_section(question, one, folder) for question, one in found)}{_made(about)}</main>\n"
+        f"{sections}{_provenance(context)}</main>\n"
     )
     return page(f"{subject['name']}: diagnosis", body, _STYLE, description=f"What {subject['name']} read")
 
 
-def _section(question: str, one: Finding, folder: Path) -> str:
+def _section(question: str, finding: Finding, folder: Path) -> str:
     head = (
-        f'<section id="{escaped(one.probe)}"><h2>{escaped(one.title)}</h2><p class="asked">{escaped(question, 500)}</p>'
+        f'<section id="{escaped(finding.probe)}"><h2>{escaped(finding.title)}</h2>'
+        f'<p class="question">{escaped(question, 500)}</p>'
     )
-    if one.skipped is not None:
-        return f"{head}<p>Not asked: {escaped(one.skipped, _TEXT)}</p></section>\n"
-    drawn = "".join(_figure(figure, folder) for figure in one.figures)
-    listed = "".join(table_html(table) for table in one.tables)
-    return f"{head}<p>{escaped(one.summary, _TEXT)}</p>{drawn}{listed}</section>\n"
+    if finding.skipped is not None:
+        return f"{head}<p>Not run: {escaped(finding.skipped, _TEXT)}</p></section>\n"
+    figures = "".join(_figure(figure, folder) for figure in finding.figures)
+    tables = "".join(table_html(table) for table in finding.tables)
+    return f"{head}<p>{escaped(finding.summary, _TEXT)}</p>{figures}{tables}</section>\n"
 
 
 def _figure(figure: Figure, folder: Path) -> str:
@@ -65,7 +69,7 @@ def _figure(figure: Figure, folder: Path) -> str:
 
 
 def table_html(table: Table) -> str:
-    """A table that scrolls sideways where it is wide."""
+    """An HTML table that scrolls sideways where it is wide."""
     head = "".join(
         f'<th scope="col"{_class(place == 0)}>{escaped(title)}</th>' for place, title in enumerate(table.header)
     )
@@ -96,15 +100,15 @@ def _class(text: bool) -> str:
     return ' class="text"' if text else ""
 
 
-def _made(about: Mapping[str, Any]) -> str:
-    settings = ", ".join(f"{name} {value}" for name, value in about["settings"].items() if value is not None)
-    software = ", ".join(f"{name} {value}" for name, value in about["software"].items())
-    machine = about["hardware"]
-    command = f"<pre><code>{escaped(about['command'], _TEXT)}</code></pre>" if about["command"] else ""
+def _provenance(context: Mapping[str, Any]) -> str:
+    settings = ", ".join(f"{name} {value}" for name, value in context["settings"].items() if value is not None)
+    software = ", ".join(f"{name} {value}" for name, value in context["software"].items())
+    hardware = context["hardware"]
+    command = f"<pre><code>{escaped(context['command'], _TEXT)}</code></pre>" if context["command"] else ""
     lines = (
-        f"Settings: {settings}. Layers: {', '.join(about['subject']['layers']) or 'none'}.",
-        f"{software}; {machine['cpu']}, {machine['cores']} cores.",
+        f"Settings: {settings}. Layers: {', '.join(context['subject']['layers']) or 'none'}.",
+        f"{software}; {hardware['cpu']}, {hardware['cores']} cores.",
         "All values are in diagnose.json beside this page.",
     )
-    said = "".join(f'<p class="soft small">{escaped(line, _TEXT)}</p>' for line in lines)
-    return f"<section><h2>How this was made</h2>{command}{said}</section>\n"
+    paragraphs = "".join(f'<p class="soft small">{escaped(line, _TEXT)}</p>' for line in lines)
+    return f"<section><h2>How this was made</h2>{command}{paragraphs}</section>\n"

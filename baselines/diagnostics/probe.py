@@ -1,4 +1,4 @@
-"""What a probe is asked with and what it answers; a finding is kept on disk, so that no probe runs twice."""
+"""Settings and results of probes; a finding is stored on disk, so that no probe runs twice."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -18,10 +18,10 @@ Cell = str | int | float | None
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much is asked. None leaves it to the probe.
+    """How much a probe measures; None means the probe's default.
 
-    ``samples``: of each split that a probe reads, at most; they are taken evenly over the split (`spread`). ``seeds``:
-    how often what depends on chance is repeated, 1 or more. ``quick``: a look rather than a measurement.
+    ``samples``: most samples of each split, taken evenly over it (`spread`). ``seeds``: repeats of what depends on
+    random numbers, 1 or more. ``quick``: a short run for a first look.
 
     Raises `DiagnosisError` for a number below 1.
     """
@@ -46,14 +46,14 @@ class Table:
     rows: Sequence[Sequence[Cell]]
 
     def __post_init__(self) -> None:
-        odd = next((row for row in self.rows if len(row) != len(self.header)), None)
-        if odd is not None:
-            raise ValueError(f"table {self.title!r}: a row has {len(odd)} cells, its header has {len(self.header)}")
+        uneven = next((row for row in self.rows if len(row) != len(self.header)), None)
+        if uneven is not None:
+            raise ValueError(f"table {self.title!r}: a row has {len(uneven)} cells, its header has {len(self.header)}")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture ``file`` (PNG, in the probe's folder), with what it is called and what it shows in words."""
+    """A picture ``file`` (PNG, in the probe's folder), with its title and a description ``alt``."""
 
     title: str
     file: str
@@ -62,10 +62,10 @@ class Figure:
 
 @dataclass(frozen=True)
 class Finding:
-    """The answer of one probe.
+    """The result of a probe.
 
-    ``summary``: one or two plain sentences, honest about what they rest on. ``values``: JSON (no NaN: None instead),
-    which goes to ``diagnose.json``. ``skipped``: why the probe does not apply to this subject; then all else is empty.
+    ``summary``: the result in one or two sentences. ``values``: JSON for ``diagnose.json``, with None instead of NaN.
+    ``skipped``: why the probe does not apply to this subject; then the other fields are empty.
     """
 
     probe: str
@@ -78,17 +78,17 @@ class Finding:
 
 
 class Progress(Protocol):
-    """Told from time to time how far a probe is."""
+    """Called by a running probe with its progress."""
 
-    def __call__(self, done: int, total: int, doing: str = "") -> None: ...
+    def __call__(self, done: int, total: int, activity: str = "") -> None: ...
 
 
-def silent(done: int, total: int, doing: str = "") -> None:
+def silent(done: int, total: int, activity: str = "") -> None:
     """A `Progress` that shows nothing."""
 
 
 class Probe(Protocol):
-    """One question. ``version`` goes up when the answer to the same question changes."""
+    """A test of a model. ``version`` goes up when its result for the same model changes."""
 
     name: str
     title: str
@@ -96,23 +96,23 @@ class Probe(Protocol):
     version: int
 
     def applies_to(self, subject: "Subject") -> str | None:
-        """None where the probe can run, else why not, for the report."""
+        """None where the probe can run, else the reason why it can't, for the report."""
 
     def run(
         self, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
-        """The finding; its pictures are in ``folder``, which exists."""
+        """Measure ``subject``; pictures are written into ``folder``, which exists."""
 
 
 def spread(names: Sequence[str], limit: int | None) -> list[str]:
-    """At most ``limit`` of ``names``, evenly over them, in their order."""
+    """At most ``limit`` of ``names``, taken evenly, in their order."""
     if limit is None or limit >= len(names):
         return list(names)
     return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
 
 
 def finding_key(probe: Probe, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings) -> str:
-    """What a finding depends on, as 64 hex digits."""
+    """Hash (64 hex digits) of everything that a finding depends on."""
     content = {
         "probe": probe.name, "version": probe.version, "subject": subject.sha256, "layers": list(subject.layer_names),
         "dataset": dataset.fingerprint, "settings": asdict(settings),
@@ -121,7 +121,7 @@ def finding_key(probe: Probe, subject: "Subject", dataset: "DatasetFolder", sett
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """``PROBE.json`` in ``folder``, complete or not at all; its pictures must be there already.
+    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already.
 
     Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
     """
@@ -132,16 +132,16 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
     write_atomically(folder / f"{finding.probe}.json", (text + "\n").encode("utf-8"))
 
 
-def kept_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
-    """The finding of probe ``name`` and the seconds it took, if it was made with the same ``key`` and is whole."""
+def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
+    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
     try:
         content = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
         if content["key"] != key:
             return None
-        found = dict(content["finding"])
-        found["tables"] = tuple(Table(**table) for table in found["tables"])
-        found["figures"] = tuple(Figure(**figure) for figure in found["figures"])
-        finding = Finding(**found)
+        fields = dict(content["finding"])
+        fields["tables"] = tuple(Table(**table) for table in fields["tables"])
+        fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
+        finding = Finding(**fields)
         seconds = float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again

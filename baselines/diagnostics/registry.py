@@ -1,4 +1,4 @@
-"""The probes by name, in the order of the report; a probe's module is imported when it is asked for."""
+"""The probes by name, in the order of the report; a probe's module is imported on first use."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -20,21 +20,21 @@ PROBES: dict[str, tuple[str, str]] = {
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """``names``, each once, in the order of the report; all of them for none. Raises `DiagnosisError` for one that
-    there is not."""
+    """``names`` without repeats, in the order of the report; all probes if empty. Raises `DiagnosisError` for an
+    unknown name."""
     for name in names:
         if name not in PROBES:
             from difflib import get_close_matches
 
-            near = get_close_matches(name, PROBES, n=1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
+            suggestions = get_close_matches(name, PROBES, n=1)
+            hint = f"did you mean {suggestions[0]!r}? " if suggestions else ""
             raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
     return tuple(name for name in PROBES if not names or name in names)
 
 
 def probe(name: str) -> "Probe":
-    """Probe ``name``. Raises `DiagnosisError` for one that there is not."""
+    """The probe ``name``. Raises `DiagnosisError` for an unknown name."""
     checked_names([name])
     module, cls = PROBES[name]
-    made: Probe = getattr(import_module(f"fpp_ml_bench.baselines.diagnostics.{module}"), cls)()
-    return made
+    instance: Probe = getattr(import_module(f"fpp_ml_bench.baselines.diagnostics.{module}"), cls)()
+    return instance

@@ -1,14 +1,14 @@
-"""A truly linear probe: one weight a channel, the same at every pixel (a 1 x 1 convolution), in closed form.
+"""A linear probe in closed form: a weight per channel, the same at every pixel (a 1 x 1 convolution).
 
-The normal equations are summed up batch by batch in float64, so that the activations are never in memory together and
-the answer is that of all of them at once.
+The normal equations are accumulated batch by batch in float64. The activations need not be in memory together, and the
+solution is the same as for all of them at once.
 """
 
 import torch
 from torch import Tensor
 
 STRENGTH = 1e-6
-"""Ridge strength a pixel, on channels of unit spread: it only settles channels that are constant or copies."""
+"""Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
 
 
 class NormalEquations:
@@ -20,17 +20,17 @@ class NormalEquations:
         self.cross = torch.zeros(features + 1, targets, dtype=torch.float64)
 
     def add(self, features: Tensor, targets: Tensor) -> None:
-        """Take (N, C) and (N, T) in."""
-        known = _with_one(features)
-        self.count += len(known)
-        self.inner += known.T @ known
-        self.cross += known.T @ targets.double()
+        """Add observations (N, C) and their targets (N, T)."""
+        augmented = _with_bias_column(features)
+        self.count += len(augmented)
+        self.inner += augmented.T @ augmented
+        self.cross += augmented.T @ targets.double()
 
     def solve(self, strength: float = STRENGTH) -> Tensor:
         """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
         the squared weights of standardised features; the bias is free. Raises ``ValueError`` without observations."""
         if not self.count:
-            raise ValueError("a linear probe needs observations, and there are none")
+            raise ValueError("a linear probe needs observations, but none were added")
         mean = self.inner[-1, :-1] / self.count
         target = self.cross[-1] / self.count
         spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
@@ -48,9 +48,9 @@ class NormalEquations:
 
 
 def apply(weights: Tensor, features: Tensor) -> Tensor:
-    """What a solved probe says of (N, C): (N, T) float64."""
-    return _with_one(features) @ weights
+    """Predictions (N, T) float64 of a solved probe for features (N, C)."""
+    return _with_bias_column(features) @ weights
 
 
-def _with_one(features: Tensor) -> Tensor:
+def _with_bias_column(features: Tensor) -> Tensor:
     return torch.cat([features.double(), torch.ones(len(features), 1, dtype=torch.float64)], dim=1)

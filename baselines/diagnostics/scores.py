@@ -1,4 +1,4 @@
-"""How well a probe did: squared error, share of the variance it explains, and how sure that is."""
+"""Scores of a probe: squared error, explained share of the variance, and their intervals."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,9 +11,11 @@ from fpp_ml_bench.evaluation.uncertainty import Interval, object_interval
 
 @dataclass(frozen=True)
 class Score:
-    """``mse``: mean over samples and seeds. ``r2``: 1 - mse / that of predicting the training samples' mean everywhere;
-    1 is perfect, 0 no better than that mean. Intervals: 95%, resampled over objects; that of r2, a ratio of two means,
-    to first order. ``seeds``: r2 of each seed. ``mse_of_mean``: the error of that mean."""
+    """``mse``: mean over samples and seeds. ``mse_of_mean``: error of predicting the training samples' mean everywhere.
+
+    ``r2`` = 1 - mse / mse_of_mean: 1 is perfect, 0 is no better than the mean. Intervals: 95%, resampled over objects;
+    that of r2, a ratio of two means, to first order. ``seeds``: r2 of each seed.
+    """
 
     mse: float
     mse_interval: Interval | None
@@ -29,21 +31,21 @@ class Score:
 def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects: Sequence[str]) -> Score:
     """`Score` of ``errors`` (seeds, samples), squared, against those of the mean, ``reference`` (samples,).
 
-    Raises ``ValueError`` where the reference error is 0: a target that is constant can't be explained.
+    Raises ``ValueError`` where the reference error is 0, so for a constant target.
     """
     table = np.asarray(errors, dtype=np.float64)
-    known = float(np.mean(reference))
-    if not known > 0:
-        raise ValueError("the target is the same everywhere, so there is nothing to explain")
-    each = table.mean(axis=0)
-    mse = float(each.mean())
-    r2 = 1 - mse / known
-    # Of a resample, r2 differs from this by -mean(each - (1 - r2) reference) / known, to first order: large objects
-    # have large errors either way, and that cancels.
-    swing = object_interval(((each - (1 - r2) * np.asarray(reference)) / known).tolist(), objects)
-    span = None if swing is None else (r2 - swing[1], r2 - swing[0])
-    interval = object_interval(each.tolist(), objects)
-    return Score(mse, interval, r2, span, tuple((1 - table.mean(axis=1) / known).tolist()), known)
+    mean_error = float(np.mean(reference))
+    if not mean_error > 0:
+        raise ValueError("the target is constant, so there is nothing to explain")
+    sample_means = table.mean(axis=0)
+    mse = float(sample_means.mean())
+    r2 = 1 - mse / mean_error
+    # To first order, r2 of a resample differs by -mean(sample_means - (1 - r2) reference) / mean_error. Large objects
+    # have large errors in both terms, which cancels.
+    deviation = object_interval(((sample_means - (1 - r2) * np.asarray(reference)) / mean_error).tolist(), objects)
+    r2_interval = None if deviation is None else (r2 - deviation[1], r2 - deviation[0])
+    interval = object_interval(sample_means.tolist(), objects)
+    return Score(mse, interval, r2, r2_interval, tuple((1 - table.mean(axis=1) / mean_error).tolist()), mean_error)
 
 
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
@@ -54,7 +56,7 @@ Scores = dict[str, dict[str, dict[str, Score]]]
 
 
 def ratio(layer: Mapping[str, Score]) -> float:
-    """The paper's: MSE of the depth probe over that of the edge probe."""
+    """The paper's ratio: MSE of the depth probe over that of the edge probe."""
     return layer["depth"].mse / layer["edges"].mse
 
 
@@ -67,5 +69,5 @@ def mean_ratio(layers: Layers) -> float:
 
 
 def ratio_of_means(layer: Mapping[str, Score]) -> float:
-    """The paper's ratio of a probe that has learned nothing and predicts the means: of variances, not of knowledge."""
+    """The paper's ratio for a probe that predicts the means, so the ratio of the targets' variances."""
     return layer["depth"].mse_of_mean / layer["edges"].mse_of_mean

@@ -1,8 +1,8 @@
-"""Photographs of scenes that no dataset holds, by the dataset's own light and sensor.
+"""Rendered frames of scenes that are not in a dataset, with the dataset's own light and sensor model.
 
-An unchanged scene comes out as the frames of its dataset, noise included, but for a few pixels in 50,000 and those by
-one grey level (tests/test_counterfactual_scenes.py): the noise of a pixel depends on the dataset's seed, object, view,
-frame and pixel alone, and stays the same in a changed scene.
+An unchanged scene gives the frames of its dataset, noise included, except for a few pixels in 50,000 that differ by a
+grey level (tests/test_counterfactual_scenes.py). The noise of a pixel depends only on the dataset's seed, the object,
+view, frame and pixel, so it is the same in a changed scene.
 """
 
 from collections.abc import Sequence
@@ -24,17 +24,17 @@ from fpp_ml_bench.rig import Rig
 
 Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
 PITCH_FACTOR = 4 / 3
-"""Of the pattern with another pitch: the usual 18 px become 24."""
+"""Factor of the changed pitch: 18 px become 24."""
 Frames = list[NDArray[np.uint8] | None]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Lit pixels in front of the empty scene, and what is projected on them.
+    """Lit pixels in front of the empty scene, and the pattern that is projected on them.
 
-    ``pixels`` uint32 (n,) and their ``lit`` in that order; ``mask`` bool (H, W): what a method that is told the object
-    is told; ``stream`` names the noise. ``projected``: the sequence as it is, its mean light inside or outside the
-    object, the frames of the other direction in place of each, or fringes of another pitch.
+    ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
+    it. ``stream``: key of the noise. ``projected``: the unchanged sequence, its mean light inside or outside the
+    object, the frames of the other direction, or fringes of another pitch.
     """
 
     pixels: NDArray[np.uint32]
@@ -44,19 +44,20 @@ class Scene:
     projected: Projected = "sequence"
 
 
-class Darkroom:
-    """Light, sensor and empty background of one rig; keeps the background of the last noise stream."""
+class SceneRenderer:
+    """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
 
     def __init__(self, rig: Rig, noise_sigma_grey: float = BuildSettings.noise_sigma_grey) -> None:
         self.rig, self.lighting = rig, Lighting()
         self.shape = (rig.camera.height, rig.camera.width)
         self.noise = Noise.of_sigma(noise_sigma_grey)
-        self._all = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
-        self._kept: tuple[tuple[object, ...], dict[tuple[str, int], NDArray[np.uint8]]] = ((), {})
+        self._all_pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
+        self._background_stream: tuple[object, ...] = ()
+        self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     @classmethod
-    def of(cls, dataset: DatasetFolder) -> "Darkroom":
-        """That of ``dataset``; an imported one, which does not say its noise, gets the benchmark's."""
+    def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
+        """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
         return cls(dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", BuildSettings.noise_sigma_grey))
 
     @cached_property
@@ -64,7 +65,7 @@ class Darkroom:
         return Exposure.of(self.rig, self.noise)
 
     @cached_property
-    def _flat(self) -> Exposure:
+    def _uniform(self) -> Exposure:
         light = np.broadcast_to(self.exposure.light.mean(axis=1, keepdims=True), self.exposure.light.shape)
         return replace(self.exposure, light=np.ascontiguousarray(light))
 
@@ -84,39 +85,42 @@ class Darkroom:
         return light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
-        """Frames ``indices`` of ``scene`` by their number, uint8 (H, W), None for every other; ``masked``: 0 outside
-        ``scene.mask``."""
+        """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
+        0 outside ``scene.mask``."""
         inside, outside = {
-            "no fringe inside": (self._flat, self.exposure),
-            "no fringe outside": (self.exposure, self._flat),
+            "no fringe inside": (self._uniform, self.exposure),
+            "no fringe outside": (self.exposure, self._uniform),
             "other pitch": (self._other_pitch, self._other_pitch),
         }.get(scene.projected, (self.exposure, self.exposure))
-        shown = [self._partner(index) if scene.projected == "other direction" else index for index in indices]
-        object_values = inside.expose(shown, scene.lit, scene.pixels, scene.stream)
-        found: Frames = [None] * len(self.rig.sequence)
-        for index, real, values in zip(indices, shown, object_values, strict=True):
-            image = self._background(scene.stream, real, outside).copy()
+        projected_indices = [
+            self._partner(index) if scene.projected == "other direction" else index for index in indices
+        ]
+        object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
+        frames: Frames = [None] * len(self.rig.sequence)
+        for index, projected_index, values in zip(indices, projected_indices, object_values, strict=True):
+            image = self._background(scene.stream, projected_index, outside).copy()
             image.ravel()[scene.pixels] = values
-            found[index] = image * scene.mask if masked else image
-        return found
+            frames[index] = image * scene.mask if masked else image
+        return frames
 
     def _background(self, stream: tuple[object, ...], index: int, exposure: Exposure) -> NDArray[np.uint8]:
-        if self._kept[0] != stream:
-            self._kept = (stream, {})
-        kept, name = (
-            self._kept[1],
-            next(n for n in ("exposure", "_flat", "_other_pitch") if getattr(self, n) is exposure),
-        )
-        if (name, index) not in kept:
-            kept[name, index] = exposure.expose([index], self._empty, self._all, stream)[0].reshape(self.shape)
-        return kept[name, index]
+        if self._background_stream != stream:
+            self._background_stream, self._backgrounds = stream, {}
+        key = id(exposure), index  # the three exposures live as long as the renderer
+        if key not in self._backgrounds:
+            self._backgrounds[key] = exposure.expose([index], self._empty, self._all_pixels, stream)[0].reshape(
+                self.shape
+            )
+        return self._backgrounds[key]
 
     def _partner(self, index: int) -> int:
-        """The frame of the other direction with the same step or bit; black and white are their own."""
+        """The frame of the other direction with the same step or bit; black and white frames map to themselves."""
         sequence = self.rig.sequence
         frame = sequence.frames[index]
         if frame.direction is None:
             return index
-        other: Direction = "vertical" if frame.direction == "horizontal" else "horizontal"
-        run = sequence.sinusoids(other) if frame.kind == "sinusoid" else sequence.gray(other)
-        return run[min(frame.step, len(run) - 1)]
+        other_direction: Direction = "vertical" if frame.direction == "horizontal" else "horizontal"
+        frame_indices = (
+            sequence.sinusoids(other_direction) if frame.kind == "sinusoid" else sequence.gray(other_direction)
+        )
+        return frame_indices[min(frame.step, len(frame_indices) - 1)]

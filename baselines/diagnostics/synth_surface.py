@@ -1,4 +1,4 @@
-"""The surface that each pixel sees: of a dataset's sample, moved along the camera's rays, or a plane."""
+"""The surface that each pixel sees: a dataset's sample, a surface moved along the camera's rays, or a plane."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ from fpp_ml_bench.pixel_sets import object_mask
 from fpp_ml_bench.rig import Rig
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""A smooth map over the image plane: normalised ray coordinates x, y (n,) to a value (n,)."""
+"""A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
 
 _STEP = 1e-6
-"""In normalised ray coordinates: far below a pixel, far above rounding."""
+"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
 _SAME_SURFACE_M = 1e-3
-"""A traced depth farther than this from the stored one is of another triangle."""
+"""A traced depth that differs from the stored depth by more belongs to another triangle."""
 _GRAZING = 0.02
-"""Least cosine between ray and normal at which the tangent plane is carried to a neighbouring ray."""
+"""Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What pixels see. Flat ``pixels`` int64 (n,) of the image, their normalised rays ``x``, ``y`` (n,), ``depth_m``
-    float64 (n,), and unit ``normals`` (n, 3) toward the camera, in camera coordinates."""
+    """The surface seen by some pixels: flat image indices ``pixels`` int64 (n,), normalised rays ``x``, ``y`` (n,),
+    ``depth_m`` float64 (n,), and unit ``normals`` (n, 3) toward the camera, in camera coordinates."""
 
     pixels: NDArray[np.int64]
     x: NDArray[np.float64]
@@ -46,69 +46,71 @@ class Surface:
         return np.column_stack([self.x, self.y, np.ones_like(self.x)]) * self.depth_m[:, None]
 
     def at(self, chosen: NDArray) -> "Surface":
-        """The part that ``chosen``, a mask or indices (k,), picks."""
+        """The part at ``chosen``, a mask (n,) or indices (k,)."""
         return Surface(self.pixels[chosen], self.x[chosen], self.y[chosen], self.depth_m[chosen], self.normals[chosen])
 
     def depth_mm(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Depth map (H, W) in mm, 0 where the surface is not."""
+        """Depth map (H, W) in mm, 0 outside the surface."""
         whole = np.zeros(shape[0] * shape[1])
         whole[self.pixels] = self.depth_m * MM_PER_M
         return whole.reshape(shape)
 
 
 def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
-    """The object of ``sample`` as its pixels see it: exact depth where the dataset has it, else the decoded one.
+    """The object of ``sample``: exact depth where the dataset has it, else the decoded depth.
 
-    Normals come from the mesh that a built dataset holds, and where there is none (an imported dataset) or it is missed
-    by a hair, from the depth map.
+    Normals come from the mesh in a built dataset. Without a mesh (an imported dataset), and at pixels whose ray misses
+    it, they come from the depth map.
     """
     depth_mm = dataset.depth_mm(sample, DEPTH_EXACT if dataset.has_exact else DEPTH).astype(np.float64)
     x, y = dataset.rig.camera.rays()
     pixels = np.flatnonzero(object_mask(depth_mm))
     normals, depth_m = normals_of_depth(depth_mm, x, y)[pixels], depth_mm.ravel()[pixels] / MM_PER_M
-    about = dataset.measured(sample)
-    mesh = dataset.path / MESH_FOLDER / f"{about['object']}.ply"
-    if mesh.is_file() and about.get("distance_mm") is not None:
-        found = load_user_mesh(UserMesh(mesh.stem, str(mesh), centre=False))
-        vertices_m = turned(found.vertices_m, VIEW_DEGREES[VIEWS.index(about["view"])])
-        placed_m = vertices_m + np.array([0, 0, about["distance_mm"] / MM_PER_M])
-        hits = TracedObject(found, placed_m).primary(PixelRays.of(dataset.rig.camera))
-        place = np.full(x.size, -1)
-        place[hits.pixels] = np.arange(hits.pixels.size)
-        traced = place[pixels] >= 0
-        traced[traced] = np.abs(hits.depth_m[place[pixels[traced]]] - depth_m[traced]) < _SAME_SURFACE_M
-        normals[traced] = hits.normals[place[pixels[traced]]]
-        depth_m[traced] = hits.depth_m[place[pixels[traced]]]  # the stored depth is rounded to float32
+    record = dataset.measured(sample)
+    mesh_file = dataset.path / MESH_FOLDER / f"{record['object']}.ply"
+    if mesh_file.is_file() and record.get("distance_mm") is not None:
+        solid = load_user_mesh(UserMesh(mesh_file.stem, str(mesh_file), centre=False))
+        vertices_m = turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
+        placed_m = vertices_m + np.array([0, 0, record["distance_mm"] / MM_PER_M])
+        hits = TracedObject(solid, placed_m).primary(PixelRays.of(dataset.rig.camera))
+        hit_index = np.full(x.size, -1)
+        hit_index[hits.pixels] = np.arange(hits.pixels.size)
+        traced = hit_index[pixels] >= 0
+        traced[traced] = np.abs(hits.depth_m[hit_index[pixels[traced]]] - depth_m[traced]) < _SAME_SURFACE_M
+        normals[traced] = hits.normals[hit_index[pixels[traced]]]
+        depth_m[traced] = hits.depth_m[hit_index[pixels[traced]]]  # the stored depth is rounded to float32
     return Surface(pixels, x.ravel()[pixels], y.ravel()[pixels], depth_m, normals)
 
 
 def normals_of_depth(depth_mm: NDArray[np.float64], x: NDArray, y: NDArray) -> NDArray[np.float64]:
-    """Unit normals toward the camera of a depth map (H, W), 0 = background, by differences between neighbours of the
-    object; (H W, 3), facing the camera where a pixel has none."""
+    """Unit normals (H W, 3) toward the camera of a depth map (H, W), 0 = background.
+
+    They come from differences between neighbouring object pixels; a pixel without neighbours gets (0, 0, -1).
+    """
     inside = object_mask(depth_mm)
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_mm[..., None]
     tangents = []
     for axis in (1, 0):
         ahead, behind = np.roll(points, -1, axis), np.roll(points, 1, axis)
         has_ahead, has_behind = np.roll(inside, -1, axis), np.roll(inside, 1, axis)
-        np.moveaxis(has_ahead, axis, 0)[-1] = False  # beyond the image's edge there is nothing
+        np.moveaxis(has_ahead, axis, 0)[-1] = False  # np.roll wraps around the image's edge
         np.moveaxis(has_behind, axis, 0)[0] = False
         ahead = np.where(has_ahead[..., None], ahead, points)
         behind = np.where(has_behind[..., None], behind, points)
         tangents.append(ahead - behind)
     normals = np.cross(tangents[1], tangents[0]).reshape(-1, 3)
     lengths = np.linalg.norm(normals, axis=1)
-    known = inside.ravel() & (lengths > 0)
-    normals[known] /= lengths[known, None]
-    normals[~known] = (0.0, 0.0, -1.0)
+    defined = inside.ravel() & (lengths > 0)
+    normals[defined] /= lengths[defined, None]
+    normals[~defined] = (0.0, 0.0, -1.0)
     return normals
 
 
 def plane(
     rig: Rig, distance_m: float, tilt_deg: tuple[float, float] = (0.0, 0.0), mask: NDArray[np.bool_] | None = None
 ) -> Surface:
-    """A plane that crosses the camera's axis at ``distance_m``, turned by ``tilt_deg`` about the image's vertical and
-    horizontal axis: it recedes to the right and downward. It fills the frame, or is cut to ``mask`` (H, W)."""
+    """A plane that crosses the camera's axis at ``distance_m``, tilted by ``tilt_deg`` so that it recedes to the right
+    and downward. It fills the frame, or is cut to ``mask`` (H, W)."""
     x, y = (rays.ravel() for rays in rig.camera.rays())
     across, down = np.tan(np.deg2rad(tilt_deg))
     pixels = np.arange(x.size) if mask is None else np.flatnonzero(mask)
@@ -121,7 +123,7 @@ def plane(
 def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) -> Surface:
     """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``shift_rad``.
 
-    The outline stays, for each pixel keeps its ray. Normals are those of the moved surface.
+    Each pixel keeps its ray, so the outline stays. Normals are those of the moved surface.
     """
     new_m = _moved_m(surface.x, surface.y, surface.depth_m, rig, direction, shift_rad)
     rays = np.column_stack([surface.x, surface.y, np.ones_like(surface.x)])
@@ -129,10 +131,10 @@ def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) ->
     usable = np.abs(facing) > _GRAZING * np.linalg.norm(rays, axis=1)
     gradient = []
     for axis in (0, 1):
-        # Tangent planes lead to the neighbouring ray, and are moved there as the pixels are here.
+        # The tangent plane gives the depth on a neighbouring ray, which is moved in the same way as the pixel.
         x, y = surface.x + _STEP * (axis == 0), surface.y + _STEP * (axis == 1)
-        there = np.where(usable, facing + _STEP * surface.normals[:, axis], 1.0)
-        beside_m = np.where(usable, surface.depth_m * facing / there, surface.depth_m)
+        facing_beside = np.where(usable, facing + _STEP * surface.normals[:, axis], 1.0)
+        beside_m = np.where(usable, surface.depth_m * facing / facing_beside, surface.depth_m)
         gradient.append((_moved_m(x, y, beside_m, rig, direction, shift_rad) - new_m) / _STEP)
     across, down = gradient
     # Z(x, y) has the normal (Z_x, Z_y, -(Z + x Z_x + y Z_y)), up to its length.

@@ -1,4 +1,4 @@
-"""What probes are asked for, from the true depth: edges, depth, and the fringe's phase and order at every pixel."""
+"""Targets of the probes, from the true depth: edges, depth, and the fringe's phase and order at every pixel."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,11 +18,12 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Truth:
-    """What is true of one sample, each (H, W); what needs a fringe is 0 outside ``inside``.
+    """Ground truth of a sample, each map (H, W).
 
-    ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range, background 0 (the paper's target).
-    ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase. ``order``: the fringe order less that which a plane at
-    the rig's standoff would have at the pixel: what the pixel's place alone can't tell.
+    ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range,
+    background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object.
+    ``order``: the fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order
+    follows from the pixel's position alone.
     """
 
     inside: NDArray[np.bool_]
@@ -41,15 +42,15 @@ def truth(depth_mm: Image, rig: Rig, direction: Direction) -> Truth:
     """
     inside = object_mask(depth_mm)
     if not inside.any():
-        raise ValueError("expected a depth map with an object, got one that is background throughout")
-    known = depth_mm[inside]
+        raise ValueError("expected a depth map with an object, got background throughout")
+    object_depths = depth_mm[inside]
     periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
     phase = TAU * (periods - np.floor(periods))
     order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
     return Truth(
         inside,
         edge_map(depth_mm),
-        normalise(depth_mm, "individual", float(known.min()), float(known.max())),
+        normalise(depth_mm, "individual", float(object_depths.min()), float(object_depths.max())),
         np.asarray(depth_mm, dtype=np.float32),
         np.where(inside, np.sin(phase), 0.0).astype(np.float32),
         np.where(inside, np.cos(phase), 0.0).astype(np.float32),
@@ -60,7 +61,7 @@ def truth(depth_mm: Image, rig: Rig, direction: Direction) -> Truth:
 def edge_map(depth_mm: NDArray) -> Image:
     """Sobel gradient magnitude (3 x 3) of a depth map (H, W), divided by its largest value: float32 in [0, 1].
 
-    The paper says no more than "Sobel filtering of the ground truth depth"; the scale is ours. A constant map gives 0.
+    The paper specifies only "Sobel filtering of the ground truth depth"; the scale is ours. A constant map gives 0.
     """
     import cv2
 
@@ -75,7 +76,8 @@ def edge_map(depth_mm: NDArray) -> Image:
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
     """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32.
 
-    The window is the least odd number of px that holds ``period_px``, 3 at least; the image is mirrored at its rim.
+    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the image is mirrored at its
+    border.
     """
     import cv2
 
@@ -87,12 +89,14 @@ def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
 
 
 def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """Where on the pattern each pixel's surface point lies, in fringe periods from the projector's first px, (H, W);
-    its fraction is the wrapped phase / 2 pi, its whole part the fringe order. NaN where depth is 0."""
+    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W).
+
+    The fraction is the wrapped phase / 2 pi and the integer part the fringe order. NaN where depth is 0.
+    """
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) / MM_PER_M
-    seen = rig.project(np.stack([x * z, y * z, z], axis=-1))
-    return seen[0 if direction == "vertical" else 1] / rig.pitch(direction)
+    projected = rig.project(np.stack([x * z, y * z, z], axis=-1))
+    return projected[0 if direction == "vertical" else 1] / rig.pitch(direction)
 
 
 @lru_cache(maxsize=2)

@@ -1,4 +1,4 @@
-"""A torch module of the user's as a subject: ``path/to/file.py:factory``."""
+"""A user's torch module as a subject: ``path/to/file.py:factory``."""
 
 import hashlib
 import importlib.util
@@ -19,8 +19,8 @@ from fpp_ml_bench.baselines.diagnostics.subject import (
     OutputUnits,
     Subject,
     checked_output,
-    chosen_layers,
     direction_of,
+    select_layers,
 )
 from fpp_ml_bench.baselines.inference import fringe_batch
 from fpp_ml_bench.errors import DiagnosisError, FppBenchError
@@ -30,16 +30,16 @@ from fpp_ml_bench.normalisation import denormalise
 if TYPE_CHECKING:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
-_KEEP = 400
+_LONGEST_MESSAGE = 400
 
 
 def subject_of_factory(
     name: str, dataset: "DatasetFolder", layers: Sequence[str] | None, units: OutputUnits, frame: int, threads: int
 ) -> Subject:
-    """The module that ``file.py:factory`` makes; it is run once on a sample, so that a misfit shows now.
+    """The module that ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits show early.
 
-    The file is the user's own code and is run. Raises `DiagnosisError` for a file, factory, layer, frame or output that
-    can't be used; what the user's code raises is told in it.
+    The file is the user's own code and is executed. Raises `DiagnosisError` for a file, factory, layer, frame or output
+    that can't be used; its message quotes errors of the user's code.
     """
     if units not in NORMALISATION_OF:
         raise DiagnosisError(f"unknown units {units!r}; there are {', '.join(NORMALISATION_OF)}")
@@ -47,7 +47,7 @@ def subject_of_factory(
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
     torch.set_num_threads(threads)
     path, factory = _factory(name)
-    network = _made(name, factory)
+    network = _build_network(name, factory)
     normalisation = NORMALISATION_OF[units]
 
     def predict(frames: Frames) -> NDArray[np.float32]:
@@ -59,7 +59,7 @@ def subject_of_factory(
             values = checked_output(_run(name, network, batch), batch, name)[0, 0].numpy()
         return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
 
-    found = Subject(
+    user_subject = Subject(
         name=path.stem,
         title=f"{path.name}:{name.rpartition(':')[2]}",
         sha256=_digest(path, network, units, frame),
@@ -70,20 +70,23 @@ def subject_of_factory(
         predict_frames=predict,
         normalisation=normalisation,
         network=network,
-        layer_names=chosen_layers(layers, _layers(network, bool(layers)), name),
-        find_layers=lambda other: _layers(other, bool(layers)),
-        untrained=lambda seed: randomised(_made(name, factory), seed),
+        layer_names=select_layers(layers, _layers(network, bool(layers)), name),
+        find_layers=lambda model: _layers(model, bool(layers)),
+        untrained=lambda seed: randomised(_build_network(name, factory), seed),
     )
     first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
     if first is None:
         raise DiagnosisError(f"{dataset.path}: holds no sample")
-    found.predict(found.captured(dataset, first))
-    return found
+    user_subject.predict(user_subject.captured(dataset, first))
+    return user_subject
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:
-    """``network``, changed in place: every layer that can draws its weights anew (``reset_parameters``), the parameters
-    of the others are shuffled, which keeps their scale; buffers of normalisation layers are reset with them."""
+    """``network`` with random weights, changed in place.
+
+    Layers with ``reset_parameters`` are initialised again, with the buffers of normalisation layers. The parameters of
+    the others are shuffled, which keeps their scale.
+    """
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         for module in network.modules():
@@ -98,7 +101,7 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
 
 
 def _layers(network: nn.Module, every: bool) -> dict[str, nn.Module]:
-    """A module's own ``probe_layers``, else its children; every module below it where layers are ``asked`` by name."""
+    """A module's own ``probe_layers``, else its children; with ``every`` also all modules below it."""
     own = getattr(network, "probe_layers", None)
     if isinstance(own, dict) and not every:
         return own
@@ -116,29 +119,29 @@ def _factory(name: str) -> tuple[Path, Any]:
         raise DiagnosisError(f"{file}: can't be imported as Python")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    sys.path.insert(0, str(path.parent.resolve()))  # what it imports from beside itself
+    sys.path.insert(0, str(path.parent.resolve()))  # for imports from its own folder
     try:
         spec.loader.exec_module(module)
     except FppBenchError:
         raise
-    except (Exception, SystemExit) as error:  # the user's code can raise anything, and is told what it raised
-        raise DiagnosisError(f"{file}: importing it failed: {_said(error)}") from error
+    except (Exception, SystemExit) as error:  # the user's code can raise anything
+        raise DiagnosisError(f"{file}: importing it failed: {_error_text(error)}") from error
     finally:
         sys.path.remove(str(path.parent.resolve()))
     factory = getattr(module, attribute, None)
     if not callable(factory):
-        known = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
-        raise DiagnosisError(f"{file}: holds no function {attribute!r}; there are {known or 'none'}")
+        names = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+        raise DiagnosisError(f"{file}: holds no function {attribute!r}; there are {names or 'none'}")
     return path, factory
 
 
-def _made(name: str, factory: Any) -> nn.Module:
+def _build_network(name: str, factory: Any) -> nn.Module:
     try:
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # one that draws its weights draws the same every time
+            torch.manual_seed(0)  # random weights are the same every time
             network = factory()
     except (Exception, SystemExit) as error:
-        raise DiagnosisError(f"{name}: calling it without arguments failed: {_said(error)}") from error
+        raise DiagnosisError(f"{name}: calling it without arguments failed: {_error_text(error)}") from error
     if not isinstance(network, nn.Module):
         raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
     return network.eval().requires_grad_(False).cpu()
@@ -149,8 +152,10 @@ def _run(name: str, network: nn.Module, batch: torch.Tensor) -> Any:
         return network(batch)
     except FppBenchError:
         raise
-    except Exception as error:  # the user's code again
-        raise DiagnosisError(f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {_said(error)}") from error
+    except Exception as error:
+        raise DiagnosisError(
+            f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {_error_text(error)}"
+        ) from error
 
 
 def _digest(path: Path, network: nn.Module, units: str, frame: int) -> str:
@@ -164,5 +169,5 @@ def _digest(path: Path, network: nn.Module, units: str, frame: int) -> str:
     return digest.hexdigest()
 
 
-def _said(error: BaseException) -> str:
-    return printable(f"{type(error).__name__}: {error}", _KEEP)
+def _error_text(error: BaseException) -> str:
+    return printable(f"{type(error).__name__}: {error}", _LONGEST_MESSAGE)

@@ -1,1 +1,1 @@
-"""Stiff and extreme cases: each against a reference of higher precision and the error that theory predicts."""
+"""Ill-conditioned and extreme cases, each compared with a reference of higher precision and a theoretical bound."""

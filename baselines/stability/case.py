@@ -1,9 +1,9 @@
-"""What a stability case is, and the one place that says whether it passed.
+"""Stability cases and their verdicts.
 
-A case computes something that the benchmark computes, where that is hard, and compares it with a reference nobody can
-doubt: 50-digit arithmetic, a closed form, or exact sums. Next to the measured error stands the bound that theory
-predicts for it: a condition number times the unit round-off, or the propagation of noise and quantisation. The bound
-comes from the derivation that the case states, never from the measured error.
+A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a reliable reference:
+50-digit arithmetic, a closed form, or exact sums. The error is compared with a bound from theory: a condition number
+times the unit round-off, or the propagation of noise and quantisation. The bound comes from the derivation that the
+case states, never from the measured error.
 """
 
 import math
@@ -22,7 +22,7 @@ Expects = Literal["number", "refusal", "either"]
 
 
 class Verdict(StrEnum):
-    """WITHIN: the error is within its bound. FLAGGED: honestly refused, by an error or an invalid mask."""
+    """WITHIN: the error is within its bound. FLAGGED: correctly refused, by an exception or an invalid mask."""
 
     WITHIN = "within"
     FLAGGED = "flagged"
@@ -31,11 +31,11 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case measured, at its worst element: the one with the largest error / bound.
+    """The measurement of a case at its worst element, which has the largest error / bound.
 
-    ``error`` is None where nothing was computed because the code refused, with ``note`` saying how. ``flagged`` is the
-    share of elements that were refused and ``may_flag`` the largest share that theory allows. ``condition`` is the
-    condition number behind the bound, where there is one.
+    ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
+    that were refused; ``may_flag``: largest share that theory allows. ``condition``: the condition number behind the
+    bound, if any.
     """
 
     error: float | None
@@ -47,7 +47,7 @@ class Outcome:
 
     @property
     def ratio(self) -> float | None:
-        """Error as a part of its bound; 0 where both are 0, None where nothing was computed."""
+        """Error / bound; 0 where both are 0, None where nothing was computed."""
         if self.error is None:
             return None
         if self.error == 0:
@@ -57,11 +57,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """One stiff or extreme case.
+    """An ill-conditioned or extreme case.
 
-    ``run()`` gives the `Outcome`; ``computes``, ``reference`` and ``predicts`` say in a line each what is computed,
-    what it is compared with, and where the bound comes from. ``expects``: a number, a refusal, or either of them.
-    ``heavy`` cases take seconds or gigabytes and are left out of a quick run.
+    ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts`` describe in a line each what is
+    computed, its reference, and how the bound is derived. ``expects``: a number, a refusal, or either. ``heavy`` cases
+    take seconds or gigabytes and are left out of a quick run.
     """
 
     group: str
@@ -78,11 +78,11 @@ class Case:
     @property
     def name(self) -> str:
         """``family, parameter value, ...``"""
-        return ", ".join([self.family, *(f"{key} {shown(value)}" for key, value in self.parameters.items())])
+        return ", ".join([self.family, *(f"{key} {parameter_text(value)}" for key, value in self.parameters.items())])
 
 
-def shown(value: Scalar) -> str:
-    """A parameter as people write it: in six digits where those are all, else in all that there are."""
+def parameter_text(value: Scalar) -> str:
+    """A parameter as text: six digits where they are exact, else all digits."""
     if not isinstance(value, float):
         return str(value)
     short = f"{value:.6g}"
@@ -102,11 +102,11 @@ def family(
     expects: Expects | Callable[..., Expects] = "number",
     heavy: Callable[..., bool] = lambda **_: False,
 ) -> list[Case]:
-    """Cases of one kind, one for every combination of the grid's values, which ``run`` and ``expects`` get by name."""
+    """Cases of a family: one for each combination of the grid's values, which ``run`` and ``expects`` get by name."""
     cases = []
     for values in product(*grid.values()):
         parameters = dict(zip(grid, values, strict=True))
-        wanted = expects(**parameters) if callable(expects) else expects
+        expected = expects(**parameters) if callable(expects) else expects
         cases.append(
             Case(
                 group,
@@ -117,7 +117,7 @@ def family(
                 predicts,
                 unit,
                 partial(run, **parameters),
-                wanted,
+                expected,
                 heavy(**parameters),
             )
         )
@@ -125,7 +125,7 @@ def family(
 
 
 def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
-    """The verdict on a case, and what speaks against it where it failed."""
+    """The verdict on a case, and the reason where it failed."""
     if outcome.error is None:
         if case.expects == "number":
             return Verdict.FAIL, f"refused what can be computed: {outcome.note}"
@@ -133,7 +133,7 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
     if case.expects == "refusal":
         return Verdict.FAIL, "gave a number where there is none"
     if not math.isfinite(outcome.bound):
-        return Verdict.FAIL, "theory predicts no finite error, so the number says nothing and should be refused"
+        return Verdict.FAIL, "theory predicts no finite error, so the number is meaningless and should be refused"
     if not outcome.error <= outcome.bound:  # NaN is not
         return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
     if outcome.flagged > outcome.may_flag:
@@ -149,24 +149,24 @@ def worst(
     condition: float | None = None,
     note: str = "",
 ) -> Outcome:
-    """The outcome of many elements: the worst that was not flagged. NaN errors that were not flagged stay NaN."""
+    """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     masked = False if flagged is None else np.asarray(flagged)
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), masked)
     error, bound, refused = (np.ravel(part) for part in parts)
     share = float(refused.mean()) if refused.size else 0.0
-    kept = np.flatnonzero(~refused)
-    if not kept.size:
+    unflagged = np.flatnonzero(~refused)
+    if not unflagged.size:
         return Outcome(
             None, flagged=1.0, may_flag=may_flag, note=note or "every element is masked", condition=condition
         )
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(error[kept] == 0, 0.0, error[kept] / bound[kept])
-    place = kept[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
-    return Outcome(float(error[place]), float(bound[place]), share, may_flag, note, condition)
+        ratio = np.where(error[unflagged] == 0, 0.0, error[unflagged] / bound[unflagged])
+    index = unflagged[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
+    return Outcome(float(error[index]), float(bound[index]), share, may_flag, note, condition)
 
 
 def refusal(call: Callable[[], object], *errors: type[BaseException]) -> Outcome:
-    """Outcome of a call that should refuse: its message where one of ``errors`` comes, else a number (exactly 0)."""
+    """Outcome of a call that should raise one of ``errors``: the message if it does, else an error of 0."""
     try:
         call()
     except errors as error:

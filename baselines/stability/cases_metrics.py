@@ -22,18 +22,19 @@ def cases() -> list[Case]:
         *family(
             group, "magnitude", check.magnitude,
             {"scale_mm": (1.0, 1e-30, 1e30, 1e-130, 1e140, 1e-160, 5e-324, 1e-310, 1e200, 1e306)},
-            computes="MAE and RMSE of 20,000 errors up to 999 x this", reference=EXACT,
+            computes="MAE and RMSE of 20,000 errors up to 999 x scale_mm", reference=EXACT,
             predicts=BLOCKED + "; squares above 1e308 refused", unit="relative",
             expects=lambda scale_mm: "number" if scale_mm <= 1e140 else "either",
         ),
         *family(
             group, "mixed magnitudes", check.mixed,
             {"low_mm": (1e-30, 1e-6), "high_mm": (1e-5, 1.0, 1e30)},
-            computes="MAE and RMSE of magnitudes between these", reference=EXACT, predicts=BLOCKED, unit="relative",
+            computes="MAE and RMSE of magnitudes from low_mm to high_mm", reference=EXACT, predicts=BLOCKED,
+            unit="relative",
         ),
         *family(
             group, "one large error", check.one_large, {"large_mm": (1.0, 1.7e7, 1e8, 1e12, 1e16)},
-            computes="MAE and RMSE of 10^7 errors, all others 1 mm", reference=EXACT, predicts=WORST,
+            computes="MAE and RMSE of 10^7 errors, all but this one 1 mm", reference=EXACT, predicts=WORST,
             unit="relative",
         ),
         *family(
@@ -49,7 +50,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "cancelling errors", check.cancelling, {"large_mm": (1.0, 1e6, 1e12, 1e16)},
-            computes="bias of +-errors that nearly cancel", reference="exact sum", unit="mm",
+            computes="bias of positive and negative errors that nearly cancel", reference="exact sum", unit="mm",
             predicts="gamma of (log2 9600 + 16) x mean |e|: pairwise sums in a block, blocks exactly",
         ),
         *family(
@@ -59,7 +60,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "not a number", check.not_a_number, {"value": (float("nan"), float("inf"), float("-inf"), 1e300)},
-            computes="a score of a prediction with one such pixel", reference="there is none",
+            computes="a score of a prediction with a pixel of this value", reference="there is none",
             predicts="must be refused", unit="mm", expects="refusal",
         ),
         *family(

@@ -20,7 +20,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "empty mask", losses.empty_mask, {"name": LOSSES},
-            computes="loss and gradient without one object pixel", reference="exactly rounded sums; 0 where masked",
+            computes="loss and gradient without object pixels", reference="exactly rounded sums; 0 where masked",
             predicts="32 u32: torch's pairwise sums", unit="1",
         ),
         *family(
@@ -91,8 +91,8 @@ def cases() -> list[Case]:
             group, "phase route", check.phase_output,
             {"name": ("phase", "phase-net"), "image": ("black", "white", "constant", "noise", "checkerboard")},
             computes="depth of an image without an object", unit="mm", expects="either",
-            reference="a depth in the working range and its slack of 15 mm, or a reason why it is not to be trusted",
-            predicts="exact: no other number may count as measured, and none that is not finite",
+            reference="a depth in the working range and its slack of 15 mm, or a reason why it is invalid",
+            predicts="exact: no other depth may count as measured",
         ),
         *family(
             group, "training metric", losses.metric_scale, {"scale": (1.0, 1e-30, 1e30, 1e-160, 1e-300)},
@@ -102,7 +102,7 @@ def cases() -> list[Case]:
         *family(
             group, "training metric, not a number", losses.metric_refuses,
             {"value": (float("nan"), float("inf"), 1e200)},
-            computes="a score of a prediction with one such pixel", reference="there is none",
+            computes="a score of a prediction with a pixel of this value", reference="there is none",
             predicts="must be refused", unit="mm", expects="refusal",
         ),
     ]  # fmt: skip

@@ -39,8 +39,8 @@ def cases() -> list[Case]:
         *family(
             group, "range from a file", check.foreign_range,
             {"low_mm": (1700.1,), "span_mm": (1e-2, 1.0, 200.0, 1e3)},
-            computes="individual depth under a range that is no float32", reference="the quotient in 80-bit arithmetic",
-            predicts="4 u32 of the value", unit="1",
+            computes="individual depth with a range that is not a float32 number",
+            reference="the quotient in 80-bit arithmetic", predicts="4 u32 of the value", unit="1",
         ),
         *family(
             group, "subnormal range", check.round_trip,
@@ -51,7 +51,7 @@ def cases() -> list[Case]:
         *family(
             group, "impossible range", check.impossible_range,
             {"low_mm": (1600.0, float("nan"), float("-inf")), "high_mm": (1500.0, float("inf"), float("nan"))},
-            computes="depth under a range that is none", reference="there is no such representation",
+            computes="depth with an invalid range", reference="there is no such representation",
             predicts="must be refused", unit="1", expects="refusal",
         ),
         *family(

@@ -20,7 +20,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "phase at +-pi", check.wrap_at_pi, {"pitch_px": (4.0, 18.0, 100.0), "bit_noise": (0.0, 0.7)},
-            computes="coordinate of pixels half-way through every period", reference=COORDINATE, predicts=ROUNDED,
+            computes="coordinate of pixels in the middle of every period", reference=COORDINATE, predicts=ROUNDED,
             unit="px",
         ),
         *family(
@@ -43,19 +43,19 @@ def cases() -> list[Case]:
         *family(
             group, "flipped bit, both directions", check.flipped_bit_both,
             {"direction": ("vertical", "horizontal"), "bit": tuple(range(7))},
-            computes="depth of a plane with one bit turned over all over the image", reference="the plane, 1800 mm",
-            predicts="8-bit frames, by rig.md's slope; every slipped pixel flagged: 18 px are 11 off the epipolar line",
+            computes="depth of a plane with one Gray bit inverted in the whole image", reference="the plane, 1800 mm",
+            predicts="8-bit frames, by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line",
             unit="mm", expects="either",
         ),
         *family(
             group, "flipped bit, one direction", check.flipped_bit_alone, {"bit": tuple(range(7))},
-            computes="coordinate with one bit turned over, and which pixels are flagged",
-            reference="integer arithmetic on the misread cell: so many whole periods off, or refused",
+            computes="coordinate with one bit inverted, and the flagged pixels",
+            reference="integer arithmetic on the misread cell: error in whole periods, or refused",
             predicts=ROUNDED, unit="px", expects="either",
         ),
         *family(
             group, "more periods than codes", check.too_few_codes, {"bits": (1, 4, 5, 6)},
-            computes="a rig of 51 periods with so few Gray bits", reference="102 cells need 7 bits",
+            computes="a rig of 51 periods with this number of Gray bits", reference="102 cells need 7 bits",
             predicts="the code would repeat", unit="px", expects="refusal",
         ),
         *family(

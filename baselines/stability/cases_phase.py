@@ -1,4 +1,4 @@
-"""Phase: dim, saturated, bent by gamma, coarsely quantised, few or uneven steps, dead frames, fine and wide fringes."""
+"""Phase: dim, saturated, non-linear, coarsely quantised, few or unequal steps, dead frames, fine and wide fringes."""
 
 from fpp_ml_bench.baselines.stability import phase_checks as check
 from fpp_ml_bench.baselines.stability.case import Case, family
@@ -44,11 +44,11 @@ def cases() -> list[Case]:
         *family(
             group, "gamma", check.gamma_bend, {"steps": (18, 4, 3), "gamma": (1.0, 1.5, 2.2, 3.0)},
             computes="wrapped phase of frames 255 (I / 255)^gamma", reference=CIRCLE, unit="rad",
-            predicts="asin(sum of the harmonics kN +- 1 over the first): what N steps can't tell from the fringe",
+            predicts="asin(sum of the harmonics kN +- 1 over the first), which N steps alias with the fringe",
         ),
         *family(
             group, "quantisation", check.quantisation, {"steps": (18, 3), "bits": (1, 2, 3, 4, 6, 8, 10, 12, 14, 16)},
-            computes="wrapped phase of frames of so many bits, B = 100", reference=CIRCLE, unit="rad",
+            computes="wrapped phase of frames of this bit depth, B = 100", reference=CIRCLE, unit="rad",
             predicts="asin(q g / 2B), q = 255 / (2^bits - 1); pi / N where one bit leaves 2N states or N",
         ),
         *family(
@@ -58,7 +58,7 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "unequal steps", check.uneven_steps, {"chosen": (3, 4, 5, 7, 8, 11, 13, 17)},
-            computes="wrapped phase of so many of 18 steps, 8-bit frames", reference=CIRCLE, unit="rad",
+            computes="wrapped phase of this number of 18 steps, 8-bit frames", reference=CIRCLE, unit="rad",
             predicts="asin(g' / 2B), g' = max over directions of sum |least-squares weight|",
         ),
         *family(
@@ -72,19 +72,19 @@ def cases() -> list[Case]:
         *family(
             group, "equal shifts", check.equal_steps_twice, {},
             computes="weights of the shifts 0, 1, 1 rad", reference="there is no such phase", unit="rad",
-            predicts="two different shifts leave the phase open", expects="refusal",
+            predicts="two different shifts do not determine the phase", expects="refusal",
         ),
         *family(
             group, "dead frame", check.dead_frame, {"steps": (18, 9, 6, 4), "level": (0, 255)},
-            computes="a plane's depth with one frame black or white all over", unit="mm",
-            reference="the frame's mean can't be what N - 1 others predict",
-            predicts="frame means follow A + C cos + S sin too; from 4 steps on the odd one shows and is refused",
+            computes="a plane's depth with one frame entirely black or white", unit="mm",
+            reference="the frame's mean contradicts the N - 1 others",
+            predicts="frame means follow A + C cos + S sin too; from 4 steps on the dead frame must be refused",
             expects="refusal",
         ),
         *family(
             group, "dead frame of three", check.dead_frame, {"steps": (3,), "level": (0, 255)},
             computes="a plane's depth with one of three frames black or white", reference="the plane, 1800 mm",
-            predicts="nothing is redundant; the epipolar check passes 1.5 px across, hence 1.5 px / sin(alpha) of u",
+            predicts="no redundancy; the epipolar check allows 1.5 px across, hence 1.5 px / sin(alpha) of u",
             unit="mm", expects="either",
         ),
         *family(

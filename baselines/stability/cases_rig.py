@@ -24,7 +24,7 @@ def cases() -> list[Case]:
         *family(
             group, "rotation off orthonormal", check.off_orthonormal,
             {"kind": ("scaled", "sheared"), "off": (0.0, 1e-9, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 1e-2)},
-            computes="depth through that matrix", reference="depth through the rotation, 1800 mm",
+            computes="depth through this matrix", reference="depth through the rotation, 1800 mm",
             predicts="2 |R R^T - I| kappa + round-off; over 1e-6 a rig is refused", unit="relative",
             expects=lambda kind, off: "number" if off < 1e-6 else "refusal",
         ),

@@ -10,7 +10,8 @@ def cases() -> list[Case]:
     return [
         *family(
             group, "wall edge-on", check.edge_on, {"off_deg": (90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0)},
-            computes="depth of a wall this far from the line of sight", reference="ray and plane in 80-bit arithmetic",
+            computes="depth of a wall at this angle to the line of sight",
+            reference="ray and plane in 80-bit arithmetic",
             predicts="264 u kappa, kappa = sum |n d| over |n . d|; never beyond the wall's own extent", unit="m",
             expects=lambda off_deg: "number" if off_deg >= 1 else "either",
         ),
@@ -18,14 +19,14 @@ def cases() -> list[Case]:
             group, "needle", check.needle,
             {"centre_px": (0.0, 0.3), "width_px": (2.5, 1.0, 0.9, 0.5, 0.1, 0.01)},
             computes="pixels of an upright strip at 1.8 m, and their depth", reference="the columns that it covers",
-            predicts="exact where no edge is within 0.02 px (Embree's float32) of a centre; depth 64 u", unit="px, m",
+            predicts="exact where no edge is within 1e-9 px of a centre; depth 64 u", unit="px, m",
         ),
         *family(
             group, "broken mesh", check.broken,
             {"kind": ("degenerate triangles", "collinear triangles", "flipped triangles", "every triangle twice",
                       "non-manifold fin", "loose vertices", "open back")},
-            computes="outline, depth and normals of a ball with that fault", reference="the ball without it",
-            predicts="same outline; depth 16 x 2^-24 x 1.8 m where a ray meets an edge of two facets", unit="m",
+            computes="outline, depth and normals of a ball with this defect", reference="the ball without it",
+            predicts="same outline; depth 64 u x 1.8 m x condition of the most oblique facet", unit="m",
         ),
         *family(
             group, "no solid triangle", check.nothing_solid, {},
@@ -34,14 +35,14 @@ def cases() -> list[Case]:
         ),
         *family(
             group, "number of triangles", check.triangles, {"count": (1.0, 1e2, 1e4, 1e6, 1e7)},
-            computes="depth of a paraboloid of so many triangles", reference="the paraboloid, closed form",
-            predicts="chord error 1.3 step^2 / 2 and 32 x 2^-24 x 1.8 m at edges; one triangle: 64 u", unit="m",
+            computes="depth of a paraboloid of this number of triangles", reference="the paraboloid, closed form",
+            predicts="chord error 1.3 step^2 / 2 and 64 u x 1.8 m; one triangle: 64 u", unit="m",
             heavy=lambda count: count > 1e6,
         ),
         *family(
             group, "camera inside the object", check.camera_inside, {"turn_deg": (0.0, 45.0, 10.0, 89.9)},
             computes="depth of the walls of a 2 m box around the camera", reference="1 / max |d|, closed form",
-            predicts="64 x 2^-24 m where a ray meets an edge of two walls", unit="m",
+            predicts="64 u", unit="m",
         ),
         *family(
             group, "misplaced object", check.placed_around, {"name": ("around the camera", "too large", "shifted out")},

@@ -52,7 +52,7 @@ def cases() -> list[Case]:
         *family(
             group, "nearly parallel rays", check.near_parallel,
             {"shift_px": (10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0)},
-            computes="depth of a projector plane so many px from parallel", reference=CLOSED,
+            computes="depth of a projector plane this many px from parallel", reference=CLOSED,
             predicts=RUNNING + "; masked where it lies behind", unit="relative", expects="either",
         ),
         *family(
@@ -78,8 +78,9 @@ def cases() -> list[Case]:
         *family(
             group, "float32 coordinate", check.single_coordinate_in,
             {"range_m": (0.3, 1.8, 100.0), "baseline_mm": BASELINES},
-            computes="depth from a coordinate rounded to float32", reference="depth from the one in float64, 50 digits",
-            predicts="2^-24 kappa, kappa = u_p / (u_p - u_infinity); over half of the depth a number says nothing",
+            computes="depth from a coordinate rounded to float32",
+            reference="depth from the float64 coordinate, 50 digits",
+            predicts="2^-24 kappa, kappa = u_p / (u_p - u_infinity); not checked where that is over 1/2",
             unit="relative", expects="either",
         ),
         *family(
@@ -92,7 +93,7 @@ def cases() -> list[Case]:
             group, "impossible coordinates", check.overflowing,
             {"value": (1e308, -1e308, 1e16, float("inf"), float("nan"))},
             computes="depth from coordinates that no projector has", reference="finite and positive, or masked",
-            predicts="must be masked where it is no depth", unit="mm", expects="either",
+            predicts="must be masked where there is no depth", unit="mm", expects="either",
         ),
         *family(
             group, "no weight", check.no_weight, {},

@@ -1,4 +1,4 @@
-"""Grey levels of pixels whose projector coordinate is known: what the decoding cases are fed with."""
+"""Grey levels of pixels with known projector coordinates: the input of the decoding cases."""
 
 import math
 
@@ -14,7 +14,7 @@ MEAN = 127.5
 
 
 def phases(count: int = 720) -> NDArray[np.float64]:
-    """Phases over the whole circle, none of them special, rad."""
+    """Phases over the whole circle in rad, none of them a special value."""
     return -np.pi + 2 * np.pi * (np.arange(count) + 0.3819) / count
 
 
@@ -29,12 +29,12 @@ def sinusoids(phase: NDArray, deltas: NDArray, mean: float, modulation: float) -
 
 
 def grey(values: NDArray) -> NDArray[np.uint8]:
-    """What an 8-bit camera makes of grey levels."""
+    """Grey levels as an 8-bit camera records them."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def frame_gain(steps: int) -> float:
-    """max over phi of (2/N) sum |sin(phi + delta_n)|: how far frame errors of one grey level can move (C, S).
+    """max over phi of (2/N) sum |sin(phi + delta_n)|: largest change of (C, S) by errors of one grey level per frame.
 
     2/N times 2 / sin(pi/N) for even N and 1 / sin(pi/2N) for odd N, about 4/pi.
     """
@@ -47,7 +47,7 @@ def worst_angle(shift: float, modulation: float) -> float:
 
 
 def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: int | None = None) -> Rig:
-    """The paper's rig with another pitch and step number, and just the Gray bits that these need."""
+    """The paper's rig with another pitch and number of steps, and as many Gray bits as these need."""
     rig = paper_rig(size)
     device = rig.projector
     if length is not None:

@@ -1,4 +1,4 @@
-"""The heat maps' colours and order: one row a family, one cell a case, coloured by how much of its bound it used."""
+"""Colours and order of the heat maps: a row per family, a cell per case, coloured by error / bound."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ LEVELS = (
     ("near", "1/1000 to 1/10 of the bound", "#74bf9f"),
     ("close", "1/10 to 1/2 of the bound", "#2f9470"),
     ("tight", "1/2 to the whole bound", "#0b6b50"),
-    ("flagged", "refused or masked, as it should be", "#b9c0c8"),
+    ("flagged", "correctly refused or masked", "#b9c0c8"),
     ("fail", "FAIL", "#d1242f"),
 )
 """Name, meaning and colour of each level."""
@@ -32,10 +32,10 @@ def level(row: Row) -> str:
 
 def families(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
     """Rows by group and family, in the order in which they ran."""
-    found: dict[str, dict[str, list[Row]]] = {}
+    grouped: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
-        found.setdefault(row.case.group, {}).setdefault(row.case.family, []).append(row)
-    return found
+        grouped.setdefault(row.case.group, {}).setdefault(row.case.family, []).append(row)
+    return grouped
 
 
 def figure(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""What the cases of losses and training metrics compute: values and gradients where they are stiff."""
+"""Checks of losses and training metrics: values and gradients in ill-conditioned and extreme cases."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ _SHAPE = (2, 1, 24, 32)
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch on one thread: at 64 px threads wait for each other longer than they work."""
+    """Run torch on one thread, which is faster for images of 64 px."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -69,44 +69,44 @@ def zero_residual(name: str) -> Outcome:
     gradient = prediction.grad
     if gradient is None or not bool(torch.isfinite(gradient).all()):
         return Outcome(math.inf, 0.0, note="a gradient that is not finite")
-    wanted = math.sqrt(EPSILON) if name.endswith("rmse") else 0.0
-    return worst([float(loss.detach()) - wanted, float(gradient.abs().max())], [4 * U32 * wanted, 0.0])
+    exact = math.sqrt(EPSILON) if name.endswith("rmse") else 0.0
+    return worst([float(loss.detach()) - exact, float(gradient.abs().max())], [4 * U32 * exact, 0.0])
 
 
 def empty_mask(name: str) -> Outcome:
-    """No object pixel at all: a masked mean is 0/0."""
+    """No object pixels: a masked mean would be 0/0."""
     prediction, _ = _scene(1.0)
     target = torch.zeros(_SHAPE)
     prediction = prediction.clone().requires_grad_()
     loss = loss_function(name, _alpha(name))(prediction, target)
     loss.backward()
-    each = sample_losses(name, _alpha(name), prediction.detach(), target)
-    if prediction.grad is None or not bool(torch.isfinite(prediction.grad).all() and torch.isfinite(each).all()):
+    per_sample = sample_losses(name, _alpha(name), prediction.detach(), target)
+    if prediction.grad is None or not bool(torch.isfinite(prediction.grad).all() and torch.isfinite(per_sample).all()):
         return Outcome(math.inf, 0.0, note="a loss or gradient that is not finite")
-    wanted = _exact_loss(name, prediction.detach(), target)
-    return worst([float(loss.detach()) - wanted], [gamma(32, U32) * wanted])
+    exact = _exact_loss(name, prediction.detach(), target)
+    return worst([float(loss.detach()) - exact], [gamma(32, U32) * exact])
 
 
 def loss_magnitude(name: str, scale: float) -> Outcome:
     prediction, target = _scene(scale)
-    found = float(loss_function(name, _alpha(name))(prediction, target))
-    wanted = _exact_loss(name, prediction, target)
-    if math.isinf(found):
+    value = float(loss_function(name, _alpha(name))(prediction, target))
+    exact = _exact_loss(name, prediction, target)
+    if math.isinf(value):
         return Outcome(None, flagged=1.0, note="an infinite loss, on which training stops")
     # Torch sums in vectors and pairs: log2(n) + 16 roundings, doubled by the square.
-    return worst([found - wanted], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * wanted])
+    return worst([value - exact], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * exact])
 
 
 def loss_half(name: str, dtype: str, scale: float) -> Outcome:
     """Half-precision input of this size: 2,100 mm squared is beyond float16."""
     prediction, target = _scene(scale, getattr(torch, dtype))
-    found = float(loss_function(name, _alpha(name))(prediction, target))
+    value = float(loss_function(name, _alpha(name))(prediction, target))
     if not math.isfinite(float(prediction.float().abs().max())):
-        if math.isfinite(found):
-            return Outcome(found, 0.0)
+        if math.isfinite(value):
+            return Outcome(value, 0.0)
         return Outcome(None, flagged=1.0, note="infinite input gives an infinite loss")
-    wanted = _exact_loss(name, prediction, target)
-    return worst([found - wanted], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * wanted])
+    exact = _exact_loss(name, prediction, target)
+    return worst([value - exact], [gamma(2 * (math.log2(prediction.numel()) + 16), U32) * exact])
 
 
 def directional(function: Callable[[Tensor], Tensor], x: Tensor, smooth: bool) -> Outcome:
@@ -122,12 +122,12 @@ def directional(function: Callable[[Tensor], Tensor], x: Tensor, smooth: bool) -
         with torch.no_grad():
             return float(function(x + h * seed) - function(x - h * seed)) / (2 * h)
 
-    one, two, four = quotient(step), quotient(2 * step), quotient(4 * step)
+    at_step, at_double, at_quadruple = quotient(step), quotient(2 * step), quotient(4 * step)
     with torch.no_grad():
         value = abs(float(function(x)))
-    first, second = (4 * one - two) / 3, (4 * two - four) / 3
+    first, second = (4 * at_step - at_double) / 3, (4 * at_double - at_quadruple) / 3
     rounding = 64 * U64 * max(value, 1e-300) * math.sqrt(x.numel()) / step
-    return worst([slope - first], [abs(first - second) + abs(one - two) * 1e-3 + rounding])
+    return worst([slope - first], [abs(first - second) + abs(at_step - at_double) * 1e-3 + rounding])
 
 
 def loss_gradient(name: str) -> Outcome:
@@ -148,14 +148,17 @@ def metric_scale(scale: float) -> Outcome:
             metric.update(target + error[None], target)
     except PredictionError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    found = float(metric.compute()["overall_rmse_mm"])
+    rmse_mm = float(metric.compute()["overall_rmse_mm"])
     exact = (target + errors) - target
     roots = [
-        scale * math.sqrt(math.fsum((value / scale) ** 2 for value in one.flatten().tolist()) / one.numel())
-        for one in exact
+        scale
+        * math.sqrt(
+            math.fsum((value / scale) ** 2 for value in sample_errors.flatten().tolist()) / sample_errors.numel()
+        )
+        for sample_errors in exact
     ]
-    wanted = math.fsum(roots) / len(roots)
-    return worst([found / wanted - 1], [gamma(460) + 2 * 2.0**-1074 / max(wanted, 2.0**-1074)])
+    exact_rmse_mm = math.fsum(roots) / len(roots)
+    return worst([rmse_mm / exact_rmse_mm - 1], [gamma(460) + 2 * 2.0**-1074 / max(exact_rmse_mm, 2.0**-1074)])
 
 
 def metric_refuses(value: float) -> Outcome:

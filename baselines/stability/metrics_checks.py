@@ -33,15 +33,15 @@ def _exact(parts: list[tuple[NDArray[np.float64], int]]) -> tuple[float, float]:
     return float(absolute / pixels), float(mp.sqrt(squares / pixels))
 
 
-def _compared(found: ErrorStats, exact: tuple[float, float], operations: float) -> Outcome:
+def _compared(stats: ErrorStats, exact: tuple[float, float], operations: float) -> Outcome:
     """Relative errors of MAE and RMSE; below the normal numbers a whole last place counts."""
-    if found.mae_mm is None or found.rmse_mm is None:
+    if stats.mae_mm is None or stats.rmse_mm is None:
         return Outcome(math.inf, 0.0, note="no score of pixels that there are")
-    wanted = np.array(exact)
-    if not wanted.any():
-        return worst(np.array([found.mae_mm, found.rmse_mm]), 0.0)
-    least = 2.0**-1074 / np.maximum(wanted, 2.0**-1074)
-    return worst((np.array([found.mae_mm, found.rmse_mm]) - wanted) / wanted, operations * U64 + 2 * least)
+    reference = np.array(exact)
+    if not reference.any():
+        return worst(np.array([stats.mae_mm, stats.rmse_mm]), 0.0)
+    least = 2.0**-1074 / np.maximum(reference, 2.0**-1074)
+    return worst((np.array([stats.mae_mm, stats.rmse_mm]) - reference) / reference, operations * U64 + 2 * least)
 
 
 def streamed(pixels: float, scale_mm: float) -> Outcome:
@@ -68,10 +68,10 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
 def magnitude(scale_mm: float) -> Outcome:
     errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000)
     try:
-        found = stats_of(errors.astype(np.float64))
+        stats = stats_of(errors.astype(np.float64))
     except PredictionError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    return _compared(found, _exact([(errors.astype(np.float64), 1)]), LIKELY * math.sqrt(BLOCK))
+    return _compared(stats, _exact([(errors.astype(np.float64), 1)]), LIKELY * math.sqrt(BLOCK))
 
 
 def mixed(low_mm: float, high_mm: float) -> Outcome:
@@ -116,7 +116,7 @@ def distribution(scale_mm: float) -> Outcome:
     errors = scale_mm * rng.integers(-500, 1000, (SIDE, SIDE)).astype(np.float64)
     target = np.full((SIDE, SIDE), 4096.0 * scale_mm)
     prediction = target + errors
-    found = score_sample(prediction, target).distribution
+    measured = score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
     size = np.sort(np.abs(exact))
 
@@ -126,11 +126,11 @@ def distribution(scale_mm: float) -> Outcome:
         return float(values[low] + (values[low + 1] - values[low]) * (place - low))
 
     median = quantile(exact, 0.5)
-    wanted = [quantile(size, 0.5), quantile(size, 0.95), float(size[-1]), math.fsum(exact.tolist()) / exact.size,
+    expected = [quantile(size, 0.5), quantile(size, 0.95), float(size[-1]), math.fsum(exact.tolist()) / exact.size,
               math.fsum(np.abs(exact - median).tolist()) / exact.size]  # fmt: skip
-    got = [found.median_mm, found.p95_mm, found.max_mm, found.bias_mm, found.shift_free_mae_mm]
-    bound = gamma(BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(wanted)
-    return worst(np.array(got, float) - np.array(wanted), bound)
+    computed = [measured.median_mm, measured.p95_mm, measured.max_mm, measured.bias_mm, measured.shift_free_mae_mm]
+    bound = gamma(BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
+    return worst(np.array(computed, float) - np.array(expected), bound)
 
 
 def cancelling(large_mm: float) -> Outcome:
@@ -138,11 +138,11 @@ def cancelling(large_mm: float) -> Outcome:
     half = np.random.default_rng(7).uniform(0.5, 1.0, 100_000) * large_mm
     errors = np.concatenate([half, -half]) + 1e-3
     np.random.default_rng(8).shuffle(errors)
-    found = mean_of(errors)
+    bias_mm = mean_of(errors)
     exact = math.fsum(errors.tolist()) / errors.size
     # NumPy's pairwise sum: log2(n) + 16 roundings of sums no larger than the sum of magnitudes.
     bound = gamma(math.log2(BLOCK) + 16) * float(np.abs(errors).mean())
-    return worst(np.array([math.inf if found is None else found - exact]), bound, condition=large_mm / 1e-3)
+    return worst(np.array([math.inf if bias_mm is None else bias_mm - exact]), bound, condition=large_mm / 1e-3)
 
 
 def merged(order: str) -> Outcome:
@@ -171,10 +171,10 @@ def not_a_number(value: float) -> Outcome:
     prediction = target.copy()
     prediction[3, 4] = value
     try:
-        found = score_sample(prediction, target)
+        scores = score_sample(prediction, target)
     except PredictionError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    return Outcome(found.overall.mae_mm, 0.0)
+    return Outcome(scores.overall.mae_mm, 0.0)
 
 
 def flawless() -> Outcome:

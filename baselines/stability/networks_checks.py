@@ -1,4 +1,4 @@
-"""What the network cases compute: normalisation layers, gradients, half precisions, images that show nothing."""
+"""Checks of the networks: normalisation layers, gradients, half precisions, images without an object."""
 
 import math
 
@@ -26,7 +26,7 @@ SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
     "hformer": {"width": 8}, "pix2pix": {"width": 4},
 }  # fmt: skip
-"""Widths at which the networks are run here: the arithmetic is the paper's, layer by layer."""
+"""Widths of the networks here: small, with the paper's layers."""
 
 
 def constant_input(value: float, dtype: str) -> Outcome:
@@ -41,7 +41,7 @@ def constant_input(value: float, dtype: str) -> Outcome:
     if x.grad is None or not bool(torch.isfinite(x.grad).all()):
         return Outcome(math.inf, 0.0, note="a gradient that is not finite")
     unit = U32 if dtype == "float32" else U64
-    # The mean of n equal numbers is off by (log2 n + 16) u value at most; that is divided by sqrt(eps).
+    # The mean of n equal numbers has an error of at most (log2 n + 16) u value, which is divided by sqrt(eps).
     relative = gamma(math.log2(56 * 56) + 16, unit)
     off = relative * abs(value)
     if off**2 > layer.eps * RECENTRED_FROM:
@@ -51,30 +51,33 @@ def constant_input(value: float, dtype: str) -> Outcome:
 
 
 def nearly_constant(offset: float) -> Outcome:
-    """A pattern of amplitude 1 on a large offset: its variance is a small difference for one-pass formulas."""
+    """A pattern of amplitude 1 on a large offset, where one-pass formulas for the variance cancel."""
     pattern = torch.randn((1, 2, 48, 48), generator=seeded(4), dtype=torch.float64)
     x = (pattern + offset).float()
-    found = InstanceNorm(2, affine=False)(x).double()
+    output = InstanceNorm(2, affine=False)(x).double()
     wide = x.double()
     centred = wide - wide.mean((2, 3), keepdim=True)
-    wanted = centred / (centred.square().mean((2, 3), keepdim=True) + 1e-5).sqrt()
+    exact = centred / (centred.square().mean((2, 3), keepdim=True) + 1e-5).sqrt()
     relative = gamma(math.log2(48 * 48) + 16, U32)
     off = min(relative * abs(offset), math.sqrt(RECENTRED_FROM) + relative**2 * abs(offset))
-    bound = 2 * (off + relative * wanted.abs()) + 2 * relative
-    return worst((found - wanted).numpy(), bound.numpy(), condition=abs(offset))
+    bound = 2 * (off + relative * exact.abs()) + 2 * relative
+    return worst((output - exact).numpy(), bound.numpy(), condition=abs(offset))
 
 
 def instance_norm_gradient() -> Outcome:
     """The closed-form gradient against torch's own layer, both in float64."""
-    mine, theirs = InstanceNorm(3, affine=True).double(), torch.nn.InstanceNorm2d(3, affine=True).double()
+    benchmark_layer, torch_layer = (
+        InstanceNorm(3, affine=True).double(),
+        torch.nn.InstanceNorm2d(3, affine=True).double(),
+    )
     with torch.no_grad():
-        for parameter, other in zip(mine.parameters(), theirs.parameters(), strict=True):
+        for parameter, torch_parameter in zip(benchmark_layer.parameters(), torch_layer.parameters(), strict=True):
             parameter.copy_(torch.randn(3, generator=seeded(5), dtype=torch.float64))
-            other.copy_(parameter)
+            torch_parameter.copy_(parameter)
     x = torch.randn((2, 3, 12, 10), generator=seeded(6), dtype=torch.float64)
     seed = torch.randn(x.shape, generator=seeded(7), dtype=torch.float64)
     results = []
-    for layer in (mine, theirs):
+    for layer in (benchmark_layer, torch_layer):
         inner = x.clone().requires_grad_()
         (layer(inner) * seed).sum().backward()
         results.append([inner.grad, *(parameter.grad for parameter in layer.parameters())])
@@ -104,7 +107,7 @@ def network_gradient(name: str) -> Outcome:
 
 @one_thread()
 def network_single(name: str) -> Outcome:
-    """float32 against float64, beside what rounding every weight and pixel once does to the float64 result."""
+    """float32 against float64, with a bound from rounding every weight and pixel once in float64."""
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).double().eval()
     x = torch.rand((1, 1, 64, 64), generator=seeded(11), dtype=torch.float64)
@@ -124,15 +127,15 @@ def network_single(name: str) -> Outcome:
             spread = torch.maximum(spread, (network(rounded(x)) - exact).abs())
         for parameter, weight in zip(network.parameters(), weights, strict=True):
             parameter.copy_(weight)
-        found = network.float()(x.float()).double()
+        single = network.float()(x.float()).double()
     scale = float(spread.max())
-    # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and the weights' own rounding is in.
-    return worst([float((found - exact).abs().max())], [16 * scale], condition=scale / U32 / float(exact.abs().max()))
+    # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and includes the weights' rounding.
+    return worst([float((single - exact).abs().max())], [16 * scale], condition=scale / U32 / float(exact.abs().max()))
 
 
 @one_thread()
 def network_constant(name: str, value: float) -> Outcome:
-    """A constant image, and one gradient step's worth of numbers from it: nothing may be NaN or infinite."""
+    """Output and gradients of a constant image: nothing may be NaN or infinite."""
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).train()
     x = torch.full((2, 1, 64, 64), value)
@@ -140,12 +143,12 @@ def network_constant(name: str, value: float) -> Outcome:
     loss = loss_function("hybrid_l1", 0.7)(out, torch.zeros_like(out))
     loss.backward()
     tensors = [out.detach(), *(p.grad for p in network.parameters() if p.grad is not None)]
-    return worst([float(sum(int((~torch.isfinite(one)).sum()) for one in tensors))], [0.0])
+    return worst([float(sum(int((~torch.isfinite(tensor)).sum()) for tensor in tensors))], [0.0])
 
 
 @one_thread()
 def network_half(name: str, dtype: str) -> Outcome:
-    """Inference under autocast, raw depth out (a bias of 1,800): the last layer must not round to steps of 8 mm."""
+    """Inference under autocast with raw depth (a bias of 1,800): the last layer must not round to steps of 8 mm."""
     torch.manual_seed(4)
     network = build(name, **SMALL[name]).eval()
     head = torch.nn.Conv2d(8, 1, 1)
@@ -154,18 +157,18 @@ def network_half(name: str, dtype: str) -> Outcome:
         head.bias.fill_(1800.0)  # type: ignore[union-attr]
         with torch.autocast("cpu", dtype=getattr(torch, dtype)):
             out = network(torch.rand((1, 1, 64, 64), generator=seeded(13)))
-            found = in_full_precision(head, features)
+            depth = in_full_precision(head, features)
         exact = torch.nn.functional.conv2d(
             features.double(), head.weight.double(), None if head.bias is None else head.bias.double()
         )
     if out.dtype != torch.float32 or not bool(torch.isfinite(out).all()):
         return Outcome(math.inf, 0.0, note=f"the network gives {out.dtype}, or numbers that are not finite")
-    return worst((found.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
+    return worst((depth.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
 
 
 @one_thread()
 def phase_output(name: str, image: str) -> Outcome:
-    """Depth of an image that shows no object: what counts as measured must lie in the working range and its slack."""
+    """Depth of an image without an object: measured pixels must lie in the working range and its slack."""
     rig = paper_rig(480)
     side = rig.camera.width
     grey = {
@@ -176,13 +179,13 @@ def phase_output(name: str, image: str) -> Outcome:
         "checkerboard": lambda: 255.0 * (np.indices((side, side)).sum(axis=0) % 2),
     }[image]()
     try:
-        made = method(name, rig)
+        phase_method = method(name, rig)
         frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
-        frames[made.frames_used[0]] = grey.astype(np.uint8)
-        found = made.measure(frames)  # type: ignore[attr-defined]
+        frames[phase_method.frames_used[0]] = grey.astype(np.uint8)
+        measurement = phase_method.measure(frames)  # type: ignore[attr-defined]
     except FppBenchError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     near, far = rig.working_range_mm
-    slack, depth = Settings().slack_mm * (1 + U32), found.depth_mm
+    slack, depth = Settings().slack_mm * (1 + U32), measurement.depth_mm
     legal = np.isfinite(depth) & ((depth == 0) | ((depth >= near - slack) & (depth <= far + slack)))
-    return worst(np.where(legal, 0.0, np.inf), 0.0, found.reason != Reason.MEASURED, 1.0)
+    return worst(np.where(legal, 0.0, np.inf), 0.0, measurement.reason != Reason.MEASURED, 1.0)

@@ -1,4 +1,4 @@
-"""What the normalisation cases compute: representations of flat, tiny, full, empty and extreme depth maps, and back."""
+"""Checks of the normalisations: flat, tiny, full, empty and extreme depth maps, forward and back."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +37,16 @@ def round_trip(name: Normalisation, kind: str, low_mm: float, span_mm: float, st
     """Depth through a float32 representation and back, on the object."""
     depth = depth_map(kind, low_mm, span_mm).astype(stored)
     low, high = _range(depth)
-    there = normalise(depth, name, low, high)
-    back = denormalise(there, name, low, high)
+    representation = normalise(depth, name, low, high)
+    back = denormalise(representation, name, low, high)
     inside = object_mask(depth)
-    legal = np.isfinite(there).all() and (there[~inside] == 0).all()
+    legal = np.isfinite(representation).all() and (representation[~inside] == 0).all()
     if name == "individual":
-        legal &= bool((there >= 0).all() and (there <= 1).all())
+        legal &= bool((representation >= 0).all() and (representation <= 1).all())
     if not legal:
         return Outcome(np.inf, 0.0, note="a representation that is not finite, not 0 outside or not in [0, 1]")
     if not inside.any():
-        return worst(there, 0.0)
+        return worst(representation, 0.0)
     exact = depth[inside].astype(np.float64)
     if name == "individual":
         bound = 4 * U32 * (exact - low) + 4 * U64 * exact + _TINY * (high - low)
@@ -62,20 +62,20 @@ def forward(kind: str, low_mm: float, span_mm: float, stored: str) -> Outcome:
     low, high = _range(depth)
     inside = object_mask(depth)
     exact = (depth[inside].astype(np.longdouble) - low) / (np.longdouble(high) - low) if high > low else 0.0
-    found = normalise(depth, "individual", low, high)[inside]
+    representation = normalise(depth, "individual", low, high)[inside]
     bound = np.asarray(4 * U32 * exact, float) + _TINY
-    return worst(np.asarray(found - exact, float), bound)
+    return worst(np.asarray(representation - exact, float), bound)
 
 
 def foreign_range(low_mm: float, span_mm: float) -> Outcome:
-    """A range that came from a file in double precision and is no float32, as published depth_params are."""
+    """A range from a file in double precision that is not a float32 number, like published depth_params."""
     depth = depth_map("part", low_mm, span_mm)
     low, high = low_mm + span_mm * 1e-9, low_mm + span_mm * (1 - 1e-9)
-    found = normalise(depth.astype(np.float32), "individual", low, high)
+    representation = normalise(depth.astype(np.float32), "individual", low, high)
     inside = object_mask(depth)
     exact = (depth.astype(np.float32)[inside].astype(np.longdouble) - low) / (np.longdouble(high) - low)
     bound = np.asarray(4 * U32 * np.abs(exact), float) + _TINY
-    return worst(np.asarray(found[inside] - exact, float), bound)
+    return worst(np.asarray(representation[inside] - exact, float), bound)
 
 
 def impossible_range(low_mm: float, high_mm: float) -> Outcome:
@@ -84,7 +84,7 @@ def impossible_range(low_mm: float, high_mm: float) -> Outcome:
 
 
 def scored(kind: str, mode: str) -> Outcome:
-    """What the evaluator makes of normalised values on such a target."""
+    """The evaluator's conversion of normalised predictions to mm."""
     target = depth_map(kind, 1700.0, 200.0).astype(np.float32)
     values = np.where(object_mask(target), np.float32(0.5), np.float32(0.0))
     try:

@@ -1,4 +1,4 @@
-"""What the order cases compute: cells and fringe orders where bits blend, flip or run out and the phase wraps."""
+"""Checks of the fringe order: blended, flipped and missing bits, and phases at the wrap."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ _MODULATION = 100.0
 
 
 def _quantised_px(rig: Rig) -> float:
-    """Largest error of a coordinate, px, that rounding frames to whole grey levels causes."""
+    """Largest error of a coordinate in px by rounding frames to whole grey levels."""
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(0.5 * frame_gain(rig.sequence.steps), _MODULATION)
 
 
@@ -46,29 +46,29 @@ def edge_blend(pitch_px: float, blend: float) -> Outcome:
     rig = coded_rig(pitch_px)
     length, half = rig.pattern_length("vertical"), pitch_px / 2
     edges = np.ceil(np.arange(1, cell_count(length, pitch_px)) * half)
-    where = edges - 1 + blend  # between the last pixel of a cell and the first of the next
+    positions_px = edges - 1 + blend  # between the last pixel of a cell and the first of the next
     below, above = direction_levels(rig, edges - 1), direction_levels(rig, edges)
-    levels = direction_levels(rig, where)
+    levels = direction_levels(rig, positions_px)
     steps = rig.sequence.steps
     levels[steps:] = (1 - blend) * below[steps:] + blend * above[steps:]
-    found = decode_direction(grey(levels), plan(rig), Limits())
-    return worst(found.coordinate_px - where, _quantised_px(rig), found.reason != Reason.DECODED)
+    decoded = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(decoded.coordinate_px - positions_px, _quantised_px(rig), decoded.reason != Reason.DECODED)
 
 
 def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
-    """Pixels at phase +-pi exactly, where sine is 0 and its sign an accident, with unsteady but readable bits."""
+    """Pixels at phase +-pi exactly, where the sign of the sine is arbitrary, with noisy but readable bits."""
     rig = coded_rig(pitch_px)
     periods = int(rig.pattern_length("vertical") / pitch_px) - 1
-    where = (np.arange(periods) + 0.5) * pitch_px
-    levels = direction_levels(rig, where)
+    positions_px = (np.arange(periods) + 0.5) * pitch_px
+    levels = direction_levels(rig, positions_px)
     steps = rig.sequence.steps
     levels[steps:] += bit_noise * _MODULATION * np.random.default_rng(1).uniform(-1, 1, levels[steps:].shape)
-    found = decode_direction(grey(levels), plan(rig), Limits())
-    return worst(found.coordinate_px - where, _quantised_px(rig), found.reason != Reason.DECODED)
+    decoded = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(decoded.coordinate_px - positions_px, _quantised_px(rig), decoded.reason != Reason.DECODED)
 
 
 def order_of_pi(phase_rad: float) -> Outcome:
-    """The order rule itself on a phase at the wrap, in every cell: no whole period may be lost or gained."""
+    """The order rule for a phase at the wrap, in every cell: no period may be lost or gained."""
     rig = paper_rig(32)
     pitch, length = rig.pitch("vertical"), rig.pattern_length("vertical")
     centres = cell_centres_rad(length, pitch)
@@ -86,7 +86,7 @@ def order_of_pi(phase_rad: float) -> Outcome:
 
 
 def arctangent(scale: float, code: str) -> Outcome:
-    """The phase's arctangent in every octant, on its axes, and a hair's breadth beside +-pi."""
+    """The phase's arctangent in every octant, on the axes, and close to +-pi."""
     turn = np.concatenate(
         [
             np.linspace(-np.pi, np.pi, 97),
@@ -101,22 +101,22 @@ def arctangent(scale: float, code: str) -> Outcome:
     if code == "compiled" and numba_enabled():
         from fpp_ml_bench.decode_kernels import _minus_atan2
 
-        found = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
+        phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:
-        found = minus_atan2(sine, cosine)
+        phase = minus_atan2(sine, cosine)
     mp = high_precision()
     exact = [-mp.atan2(mp.mpf(float(a)), mp.mpf(float(b))) for a, b in zip(sine, cosine, strict=True)]
-    error = difference(found, exact)
-    error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi is -pi, as it should be
-    bound = np.maximum(4 * U64 * np.abs(found), 2.0**-1073)
-    return worst(error, np.maximum(bound, 8 * U64 * (np.abs(found) > 3.0)))
+    error = difference(phase, exact)
+    error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi and -pi are the same angle
+    bound = np.maximum(4 * U64 * np.abs(phase), 2.0**-1073)
+    return worst(error, np.maximum(bound, 8 * U64 * (np.abs(phase) > 3.0)))
 
 
 def order_range() -> Outcome:
-    """+pi is never given: the interval is [-pi, pi), also for signed zeros."""
+    """The result is never +pi: the interval is [-pi, pi), also for signed zeros."""
     sine, cosine = np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0, -1.0, -1.0, -1.0, -1e-300])
-    found = minus_atan2(sine, cosine)
-    return worst(np.maximum(found - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - found, 0), 0.0)
+    phase = minus_atan2(sine, cosine)
+    return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0), 0.0)
 
 
 def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
@@ -127,37 +127,37 @@ def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
     frames[flipped] = None if turned_over is None else 255 - turned_over
     u, v = exact["vertical"], exact["horizontal"]
     inside = (u > 3) & (u < rig.projector.width - 4) & (v > 3) & (v < rig.projector.height - 4)
-    found = decode_stack(frames, rig, mask=inside)
+    decoded = decode_stack(frames, rig, mask=inside)
     per_metre = rig.projector.fx * rig.translation_m[0] / 1.8**2
     bound_mm = _quantised_px(rig) / per_metre * MM_PER_M * np.sqrt(2) * 1.01
-    return worst(found.depth_mm[inside] - 1800.0, bound_mm, found.reason[inside] != Reason.DECODED, 1.0)
+    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != Reason.DECODED, 1.0)
 
 
 def flipped_bit_alone(bit: int) -> Outcome:
-    """One direction can't know: its error must be the one that the misread cell predicts, period for period."""
+    """A single direction can't detect a flipped bit: the error must be the whole periods of the misread cell."""
     rig = coded_rig()
     pitch, bits = 18.0, rig.sequence.bits("vertical")
-    where = np.arange(3.0, rig.pattern_length("vertical") - 3.0, 0.25)
-    levels = direction_levels(rig, where)
+    positions_px = np.arange(3.0, rig.pattern_length("vertical") - 3.0, 0.25)
+    levels = direction_levels(rig, positions_px)
     row = rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
-    found = decode_direction(grey(levels), plan(rig), Limits())
-    cells = np.floor(np.rint(where) / (pitch / 2)).astype(int)
+    decoded = decode_direction(grey(levels), plan(rig), Limits())
+    cells = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int)
     read = np.asarray(gray_to_binary(binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
     centres = cell_centres_rad(912, pitch)
     exists = read < len(centres)
     centre = centres[np.minimum(read, len(centres) - 1)]
-    absolute = where * 2 * np.pi / pitch
+    absolute = positions_px * 2 * np.pi / pitch
     slip = np.floor((centre - absolute) / (2 * np.pi) + 0.5)
     refused = ~exists | (np.abs(absolute + 2 * np.pi * slip - centre) > INCONSISTENT_RAD)
-    refused |= (where + pitch * slip < -0.5) | (where + pitch * slip > 911.5)
-    flagged = found.reason != Reason.DECODED
-    error = found.coordinate_px - (where + pitch * slip)
+    refused |= (positions_px + pitch * slip < -0.5) | (positions_px + pitch * slip > 911.5)
+    flagged = decoded.reason != Reason.DECODED
+    error = decoded.coordinate_px - (positions_px + pitch * slip)
     silent = float(np.mean(~flagged & (slip != 0)))
-    # Within half a grey level of a limit either answer is right.
+    # Within half a grey level of a limit both results are correct.
     near = np.abs(np.abs(absolute + 2 * np.pi * slip - centre) - INCONSISTENT_RAD) < 0.01
     wrong_flag = (flagged != refused) & ~near
-    note = f"{silent:.0%} of the pixels are whole periods off and one direction can't know it; both directions do"
+    note = f"{silent:.0%} of the pixels are wrong by whole periods, which only both directions together can detect"
     return worst(np.where(wrong_flag, np.inf, error), _quantised_px(rig), flagged & ~wrong_flag, 1.0, note=note)
 
 
@@ -172,7 +172,7 @@ def too_few_codes(bits: int) -> Outcome:
 
 
 def cell_off_pattern(cell: int) -> Outcome:
-    """A code that no pixel of the pattern has: seven bits name 128 cells and 912 px hold 102."""
+    """A code that is not in the pattern: seven bits encode 128 cells, and 912 px have 102."""
     rig = paper_rig(32)
     deltas = shifts(rig.sequence.steps)
     angle = np.linspace(-3, 3, 50)
@@ -180,14 +180,18 @@ def cell_off_pattern(cell: int) -> Outcome:
     bits = np.array([(code >> (6 - bit)) & 1 for bit in range(7)], float)
     waves = sinusoids(angle, deltas, MEAN, _MODULATION)[:, 0]
     levels = np.concatenate([waves, np.repeat(MEAN + _MODULATION * (2 * bits[:, None] - 1), 50, axis=1)])
-    found = decode_direction(grey(levels), plan(rig), Limits())
-    return worst(np.zeros(50), 0.0, found.reason != Reason.DECODED, 1.0)
+    decoded = decode_direction(grey(levels), plan(rig), Limits())
+    return worst(np.zeros(50), 0.0, decoded.reason != Reason.DECODED, 1.0)
 
 
 def code_length(bits: int) -> Outcome:
-    """Every cell of a code that is used to its last word; 15 bits fill the compiled decoder's 16-bit integers."""
+    """Every cell of a full code; 15 bits fill the compiled decoder's 16-bit integers."""
     pitch = 4.0
     rig = coded_rig(pitch, steps=3, length=min(65536, 2**bits * 2))
-    where = np.arange(2**bits) * 2 + 0.5
-    found = decode_direction(grey(direction_levels(rig, where)), plan(rig), Limits())
-    return worst(found.coordinate_px - where, _quantised_px(rig) + 8 * U64 * where, found.reason != Reason.DECODED)
+    positions_px = np.arange(2**bits) * 2 + 0.5
+    decoded = decode_direction(grey(direction_levels(rig, positions_px)), plan(rig), Limits())
+    return worst(
+        decoded.coordinate_px - positions_px,
+        _quantised_px(rig) + 8 * U64 * positions_px,
+        decoded.reason != Reason.DECODED,
+    )

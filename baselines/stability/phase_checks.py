@@ -1,4 +1,4 @@
-"""What the phase cases compute: wrapped phase from frames that are dim, clipped, bent, coarse, few, uneven or dead."""
+"""Checks of the wrapped phase from frames that are dim, clipped, non-linear, coarse, few, uneven or dead."""
 
 import math
 
@@ -34,12 +34,12 @@ def _exact_phase(frames: NDArray, deltas: list) -> list:
     mp = high_precision()
     model = mp.matrix([[1, mp.cos(d), mp.sin(d)] for d in deltas])
     solve = (model.T * model) ** -1 * model.T
-    found = []
+    phases_rad = []
     for pixel in frames.T:
         levels = [mp.mpf(float(level)) for level in pixel]
         cosine, sine = (mp.fsum(solve[row, n] * level for n, level in enumerate(levels)) for row in (1, 2))
-        found.append(-mp.atan2(sine, cosine))
-    return found
+        phases_rad.append(-mp.atan2(sine, cosine))
+    return phases_rad
 
 
 def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
@@ -47,16 +47,16 @@ def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     frames = sinusoids(phase, shifts(steps), MEAN, modulation)
     mp = high_precision()
     exact = _exact_phase(frames[:, 0], [2 * mp.pi * n / steps for n in range(steps)])
-    found = wrapped_phase(frames).phase[0]
+    measured = wrapped_phase(frames).phase[0]
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
-    return worst(difference(found, exact), bound, condition=condition)
+    return worst(difference(measured, exact), bound, condition=condition)
 
 
 def _decoded_phase(levels: NDArray[np.uint8], rig: Rig, exact_px: NDArray) -> tuple[NDArray, NDArray]:
-    """Error of the absolute phase in rad (so that a slipped period shows), and what was flagged."""
-    found = decode_direction(levels, plan(rig), Limits())
-    return (found.coordinate_px - exact_px) * 2 * np.pi / rig.pitch("vertical"), found.reason != Reason.DECODED
+    """Error of the absolute phase in rad, which includes slipped periods, and the flagged pixels."""
+    decoded = decode_direction(levels, plan(rig), Limits())
+    return (decoded.coordinate_px - exact_px) * 2 * np.pi / rig.pitch("vertical"), decoded.reason != Reason.DECODED
 
 
 def _coordinates(rig: Rig, count: int = 2000) -> NDArray[np.float64]:
@@ -66,8 +66,8 @@ def _coordinates(rig: Rig, count: int = 2000) -> NDArray[np.float64]:
 
 def modulation_8bit(modulation: float) -> Outcome:
     rig = coded_rig()
-    where = _coordinates(rig)
-    error, flagged = _decoded_phase(grey(direction_levels(rig, where, modulation=modulation)), rig, where)
+    positions_px = _coordinates(rig)
+    error, flagged = _decoded_phase(grey(direction_levels(rig, positions_px, modulation=modulation)), rig, positions_px)
     shift = 0.5 * frame_gain(18)
     may_flag = 0.0 if modulation - shift >= MIN_MODULATION else 1.0
     return worst(error, worst_angle(shift, modulation), flagged, may_flag)
@@ -82,17 +82,17 @@ def expects_modulation(modulation: float) -> Expects:
 
 def noise(modulation: float, noise_grey: float = 1.0) -> Outcome:
     rig, rng = coded_rig(), np.random.default_rng(7)
-    where = _coordinates(rig, 20_000)
-    levels = direction_levels(rig, where, modulation=modulation)
-    error, flagged = _decoded_phase(grey(levels + noise_grey * rng.standard_normal(levels.shape)), rig, where)
+    positions_px = _coordinates(rig, 20_000)
+    levels = direction_levels(rig, positions_px, modulation=modulation)
+    error, flagged = _decoded_phase(grey(levels + noise_grey * rng.standard_normal(levels.shape)), rig, positions_px)
     sigma = math.sqrt(2 / 18) * math.hypot(noise_grey, math.sqrt(1 / 12)) / modulation
-    kept = error[~flagged]
-    # Modulations under the limit by more than four sigma of its own noise are flagged to the last pixel.
+    unflagged = error[~flagged]
+    # Up to six sigma of noise above the limit of the modulation, pixels may be flagged.
     may_flag = 0.0 if modulation > MIN_MODULATION + 6 * sigma * modulation else 1.0
-    if not kept.size:
+    if not unflagged.size:
         return Outcome(None, flagged=1.0, note="every pixel is masked: low modulation")
-    bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * kept.size))
-    return Outcome(float(np.sqrt(np.mean(kept**2))), bound, float(flagged.mean()), may_flag)
+    bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * unflagged.size))
+    return Outcome(float(np.sqrt(np.mean(unflagged**2))), bound, float(flagged.mean()), may_flag)
 
 
 def expects_noise(modulation: float) -> Expects:
@@ -130,9 +130,11 @@ def saturation_phase(share: float, steps: int) -> Outcome:
 
 def saturation_decoder(share: float) -> Outcome:
     rig = coded_rig()
-    where = _coordinates(rig)
+    positions_px = _coordinates(rig)
     mean, modulation = _clipped(share)
-    error, flagged = _decoded_phase(grey(direction_levels(rig, where, mean=mean, modulation=modulation)), rig, where)
+    error, flagged = _decoded_phase(
+        grey(direction_levels(rig, positions_px, mean=mean, modulation=modulation)), rig, positions_px
+    )
     alpha = math.pi * share
     left = modulation * (1 - _clip_harmonic(1, alpha))
     leak = modulation * sum(abs(_clip_harmonic(k * 18 + side, alpha)) for k in range(1, 500) for side in (-1, 1))
@@ -188,7 +190,7 @@ def close_steps(spread_rad: float) -> Outcome:
     phase = phases(48)
     frames = sinusoids(phase, deltas, MEAN, 100.0)
     try:
-        found = wrapped_phase(frames, deltas).phase[0]
+        measured = wrapped_phase(frames, deltas).phase[0]
     except DecodeError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     mp = high_precision()
@@ -198,7 +200,7 @@ def close_steps(spread_rad: float) -> Outcome:
     condition = float(singular[0] / singular[-1])
     strength = float(np.linalg.norm(frames[:, 0], axis=0).max())
     bound = 8 * 3 * U64 * condition * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / float(singular[-1]) / 100.0
-    return worst(difference(found, exact), bound, condition=condition)
+    return worst(difference(measured, exact), bound, condition=condition)
 
 
 def equal_steps_twice() -> Outcome:
@@ -211,11 +213,11 @@ def dead_frame(steps: int, level: int) -> Outcome:
     dead = rig.sequence.sinusoids("vertical")[1]
     frames[dead] = np.full_like(frames[dead], level)  # type: ignore[arg-type]
     try:
-        found = decode_stack(frames, rig)
+        decoded = decode_stack(frames, rig)
     except DecodeError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    depth = found.depth_mm
-    # The epipolar check lets 1.5 px across pass: e px of u alone stand e sin(alpha) across, e = 1.5 / sin(alpha).
+    depth = decoded.depth_mm
+    # The epipolar check allows 1.5 px across the line, and e px of u alone are e sin(alpha) across.
     tx, ty, _ = rig.translation_m
     slip_px = 1.5 / (abs(ty) / math.hypot(tx, ty))
     per_metre = rig.projector.fx * tx / 1.8**2
@@ -235,7 +237,7 @@ def pitch(pitch_px: float) -> Outcome:
         rig = coded_rig(pitch_px)
     except RigError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    where = _coordinates(rig, 20_000)
-    found = decode_direction(grey(direction_levels(rig, where)), plan(rig), Limits())
+    positions_px = _coordinates(rig, 20_000)
+    decoded = decode_direction(grey(direction_levels(rig, positions_px)), plan(rig), Limits())
     bound = pitch_px / (2 * math.pi) * worst_angle(0.5 * frame_gain(18), 100.0)
-    return worst(found.coordinate_px - where, bound, found.reason != Reason.DECODED)
+    return worst(decoded.coordinate_px - positions_px, bound, decoded.reason != Reason.DECODED)

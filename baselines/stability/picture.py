@@ -10,7 +10,7 @@ _MOST_ACROSS = 24
 
 
 def write_picture(rows: Sequence[Row], path: Path) -> None:
-    """Write the heat maps as PNG: two columns of groups, a line a family, a square a case."""
+    """Write the heat maps as PNG: two columns of groups, a line per family, a square per case."""
     import matplotlib
 
     matplotlib.use("Agg", force=False)

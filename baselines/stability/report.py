@@ -1,4 +1,4 @@
-"""What a run of cases leaves: JSON with every case, one HTML page, and a picture of the heat maps."""
+"""The output of a run: JSON with every case, an HTML page, and a picture of the heat maps."""
 
 import json
 import math
@@ -19,26 +19,26 @@ SCHEMA_VERSION = "1.0.0"
 
 def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """By group, and under "all": cases per verdict, the largest error / bound, and processor time."""
-    found: dict[str, dict[str, Any]] = {}
+    groups: dict[str, dict[str, Any]] = {}
     for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
         part = [row for row in rows if group in (row.case.group, "all")]
         ratios = [row.outcome.ratio for row in part if row.outcome.ratio is not None]
-        found[group] = {
+        groups[group] = {
             "cases": len(part),
             **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
             "largest_ratio": number(max(ratios, default=None)),
             "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
         }
-    return found
+    return groups
 
 
 def number(value: float | None) -> float | str | None:
-    """A number that JSON knows, or the name of one that it does not."""
+    """A number for JSON; NaN and infinity by name."""
     return value if value is None or math.isfinite(value) else str(value)
 
 
 def row_dict(row: Row) -> dict[str, Any]:
-    """One case as JSON values."""
+    """A case as JSON values."""
     case, outcome = row.case, row.outcome
     return {
         "group": case.group,

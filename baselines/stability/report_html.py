@@ -1,9 +1,9 @@
-"""The stability page: heat maps, what failed, and a table of every case with its bound's derivation."""
+"""The stability page: failures, heat maps, and a table of every case with the derivation of its bound."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fpp_ml_bench.baselines.stability.case import Verdict, shown
+from fpp_ml_bench.baselines.stability.case import Verdict, parameter_text
 from fpp_ml_bench.baselines.stability.heat import LEVELS, families, figure, level
 from fpp_ml_bench.baselines.stability.run import Row
 from fpp_ml_bench.evaluation.report_html import escaped, page
@@ -31,7 +31,7 @@ td.FAIL { color: #d1242f; font-weight: 600; }
 
 
 def report_page(rows: Sequence[Row], content: Mapping[str, Any]) -> str:
-    """The page as HTML; loads nothing."""
+    """The page as HTML without external resources."""
     failed = [row for row in rows if row.verdict is Verdict.FAIL]
     total = content["summary"]["all"]
     verdict = (
@@ -40,10 +40,10 @@ def report_page(rows: Sequence[Row], content: Mapping[str, Any]) -> str:
     machine = content["environment"]
     intro = (
         f"<p>{verdict} {total['within']} of {total['cases']} cases are within the error that theory predicts, "
-        f"{total['flagged']} are refused or masked as they should be. {total['cpu_seconds']:.0f} s of "
+        f"{total['flagged']} are correctly refused or masked. {total['cpu_seconds']:.0f} s of "
         "processor time.</p>"
-        '<p class="soft">Each square is one stiff or extreme case: computed by the benchmark, compared with a '
-        "reference of higher precision or a closed form, and with a bound from theory. Point at a square to read it."
+        '<p class="soft">Each square is an ill-conditioned or extreme case: computed by the benchmark, compared with a '
+        "reference of higher precision or a closed form, and with a bound from theory. Point at a square to see it."
         "</p>"
         f'<p class="soft small">{escaped(machine_line(machine), 300)}</p>'
     )
@@ -55,7 +55,7 @@ def report_page(rows: Sequence[Row], content: Mapping[str, Any]) -> str:
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:
-    """What ran this, on one line."""
+    """Processor and versions, in a line."""
     hardware = machine.get("hardware", {})
     parts = [f"{hardware.get('cpu', 'unknown processor')}, {hardware.get('cores', '?')} cores"]
     parts += [f"Python {machine.get('python', '?')}"]
@@ -68,7 +68,7 @@ def _key() -> str:
     return f'<ul class="key small">{"".join(items)}</ul>'
 
 
-def _said(row: Row) -> str:
+def _row_text(row: Row) -> str:
     outcome = row.outcome
     if outcome.error is None:
         result = outcome.note
@@ -84,7 +84,7 @@ def _heat(rows: Sequence[Row]) -> str:
         lines = []
         for family, members in kinds.items():
             cells = "".join(
-                f'<span class="cell {level(row)}" title="{escaped(_said(row), _LONG)}"></span>' for row in members
+                f'<span class="cell {level(row)}" title="{escaped(_row_text(row), _LONG)}"></span>' for row in members
             )
             counted = ", ".join(
                 f"{sum(row.verdict is verdict for row in members)} {verdict.value}"
@@ -115,7 +115,7 @@ def _tables(rows: Sequence[Row]) -> str:
 
 def _family(name: str, members: Sequence[Row]) -> str:
     case = members[0].case
-    about = (
+    description = (
         f'<p class="about small">Computes {escaped(case.computes, _LONG)}; compared with '
         f"{escaped(case.reference, _LONG)}. Bound: {escaped(case.predicts, _LONG)}.</p>"
     )
@@ -129,12 +129,12 @@ def _family(name: str, members: Sequence[Row]) -> str:
     opened = " open" if any(row.verdict is Verdict.FAIL for row in members) else ""
     worst = max((row.outcome.ratio for row in members if row.outcome.ratio is not None), default=None)
     title = f'{escaped(name)} <span class="soft small">({len(members)}; largest error / bound {figure(worst)})</span>'
-    return f'<details{opened}><summary>{title}</summary>{about}<div class="scroll">{table}</div></details>'
+    return f'<details{opened}><summary>{title}</summary>{description}<div class="scroll">{table}</div></details>'
 
 
 def _line(row: Row, keys: Sequence[str]) -> str:
     outcome = row.outcome
-    cells = "".join(f"<td>{escaped(shown(row.case.parameters[key]))}</td>" for key in keys)
+    cells = "".join(f"<td>{escaped(parameter_text(row.case.parameters[key]))}</td>" for key in keys)
     bound = None if outcome.error is None else outcome.bound
     for value in (outcome.error, bound, outcome.ratio):
         cells += f"<td>{figure(value)}</td>"

@@ -1,4 +1,4 @@
-"""What the rig cases compute: intrinsics that hardly invert, poses off orthonormal, lenses that fold, files."""
+"""Checks of the rig: nearly singular intrinsics, rotations that are not orthonormal, folding lenses, files."""
 
 import json
 import math
@@ -48,28 +48,28 @@ def _tilted(off: float, kind: str) -> Any:
 
 
 def off_orthonormal(off: float, kind: str) -> Outcome:
-    """Depth through a rotation that is none, against the rotation it was before."""
+    """Depth through a matrix that is not orthonormal, against depth through the original rotation."""
     base = replace(paper_rig(24), rotation=rotation_matrix((0.05, -0.09, 0.12)).tolist())
     try:
         rig = replace(base, rotation=_tilted(off, kind))
     except RigError as error:
         return Outcome(None, flagged=1.0, note=str(error))
-    where = rays()
-    coordinate = exact_coordinates(where, 1.8, base)[0]
-    found = depth_from_coordinate(where, coordinate, rig, "vertical")
-    relative, condition = conditioning(where, coordinate, base, 0)
+    ray_maps = rays()
+    coordinate = exact_coordinates(ray_maps, 1.8, base)[0]
+    depth_mm = depth_from_coordinate(ray_maps, coordinate, rig, "vertical")
+    relative, condition = conditioning(ray_maps, coordinate, base, 0)
     # Each row of R moves by off at most: the difference a - x_p a_2 by off times the condition number, twice.
     bound = relative + 2 * off * condition
-    return worst(found / 1800.0 - 1, bound / (1 - bound), np.isnan(found), condition=float(condition.max()))
+    return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), np.isnan(depth_mm), condition=float(condition.max()))
 
 
 def rotation_vector(angle_rad: float) -> Outcome:
-    """Rodrigues' formula, and whether a rig would take what comes out."""
+    """Rodrigues' formula, and whether a rig accepts its result."""
     axis = np.array([0.48, -0.6, 0.64])
     vector = axis * angle_rad
-    found = rotation_matrix(tuple(vector.tolist()))
+    matrix = rotation_matrix(tuple(vector.tolist()))
     try:
-        replace(paper_rig(24), rotation=found.tolist())
+        replace(paper_rig(24), rotation=matrix.tolist())
     except RigError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     mp = high_precision()
@@ -79,18 +79,18 @@ def rotation_vector(angle_rad: float) -> Outcome:
     first = mp.sin(angle) / angle if angle != 0 else mp.mpf(1)
     second = (1 - mp.cos(angle)) / angle**2 if angle != 0 else mp.mpf(0.5)
     exact = mp.eye(3) + first * cross + second * cross * cross
-    errors = difference(found.ravel(), [exact[i, j] for i in range(3) for j in range(3)])
+    errors = difference(matrix.ravel(), [exact[i, j] for i in range(3) for j in range(3)])
     return worst(errors, 8 * U64 * (1 + angle_rad), condition=angle_rad)
 
 
 def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
-    """The inverse over a wide image: bisection in 50 digits where there is one, masked where there is none."""
+    """The inverse over a wide image: bisection in 50 digits where it exists, masked elsewhere."""
     coefficients = (k1, k2, 0.0, 0.0, k3)
     fold = math.sqrt(fold_radius_squared(coefficients))
     radius = np.linspace(0.0, 1.6, 81)[1:]
     turn = 0.7
     x, y = undistort(radius * math.cos(turn), radius * math.sin(turn), coefficients)
-    found = np.hypot(x, y)
+    radii = np.hypot(x, y)
     mp = high_precision()
 
     def forward(r):  # type: ignore[no-untyped-def]
@@ -108,22 +108,24 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
             low, high = (middle, high) if forward(middle) < target else (low, middle)
         exact.append(low)
         slopes.append(max(float(mp.diff(forward, low)) if exists[-1] else 1.0, 1e-9))
-    there, slope = np.array(exists), np.array(slopes)
+    invertible, slope = np.array(exists), np.array(slopes)
     bound = 32 * U64 / slope
-    error = np.where(there, found - floats(exact), np.where(np.isnan(found), 0.0, np.inf))
+    error = np.where(invertible, radii - floats(exact), np.where(np.isnan(radii), 0.0, np.inf))
     near = np.abs(radius - float(largest)) < 1e-3 if math.isfinite(fold) else np.zeros(len(radius), bool)
-    return worst(error, bound, np.isnan(found), float(np.mean(~there | near)), condition=float(1 / slope[there].min()))
+    return worst(
+        error, bound, np.isnan(radii), float(np.mean(~invertible | near)), condition=float(1 / slope[invertible].min())
+    )
 
 
 def tangential(p1: float) -> Outcome:
-    """Strong tangential distortion: what comes back must distort to what went in, on the branch that joins the axis."""
+    """Strong tangential distortion: the inverse must distort back to the input, on the branch through the axis."""
     coefficients = (-0.2, 0.0, p1, -p1, 0.0)
     grid = np.linspace(-0.8, 0.8, 33)
     xd, yd = (axis.ravel() for axis in np.meshgrid(grid, grid))
     x, y = undistort(xd, yd, coefficients)
-    good = np.isfinite(x)
-    again = np.hypot(*(a - b for a, b in zip(distort(x, y, coefficients), (xd, yd), strict=True)))
-    # The right branch is the one that the point reaches as the picture shrinks onto the axis: 200 small steps.
+    finite = np.isfinite(x)
+    residual = np.hypot(*(a - b for a, b in zip(distort(x, y, coefficients), (xd, yd), strict=True)))
+    # The right branch is reached by continuation from the axis: 200 small steps.
     px, py = np.zeros_like(xd), np.zeros_like(yd)
     lost = np.zeros(xd.shape, bool)
     k1, _, q1, q2, _ = coefficients
@@ -142,9 +144,9 @@ def tangential(p1: float) -> Outcome:
     right = ~lost & (r2 < fold_radius_squared(coefficients))
     trace = jxx + jyy
     slope = (trace - np.sqrt(np.maximum(trace * trace - 4 * determinant, 0))) / 2  # the Jacobian is symmetric
-    off = np.where(right, np.hypot(x - px, y - py), np.inf)  # off the axis' branch there is nothing to find
+    off = np.where(right, np.hypot(x - px, y - py), np.inf)  # no solution off that branch
     bound = np.where(right, 32 * U64 / np.maximum(slope, 1e-6), 1.0)
-    return worst(np.where(good, np.maximum(off, again), 0.0), bound, ~good, float(np.mean(~right)))
+    return worst(np.where(finite, np.maximum(off, residual), 0.0), bound, ~finite, float(np.mean(~right)))
 
 
 def folding_camera(k1: float) -> Outcome:
@@ -155,12 +157,12 @@ def folding_camera(k1: float) -> Outcome:
     frames, _ = plane_stack(replace(base, camera=replace(camera, distortion=(0.0,) * 5)))
     x, y = camera.rays()
     without = np.isnan(x) | np.isnan(y)
-    found = decode_stack(frames, rig, direction="vertical")
-    wrong = without & (found.depth_mm != 0)
-    wrong |= without & (found.reason == Reason.DECODED)
+    decoded = decode_stack(frames, rig, direction="vertical")
+    wrong = without & (decoded.depth_mm != 0)
+    wrong |= without & (decoded.reason == Reason.DECODED)
     corner = bool(without[0, 0])
-    note = f"{without.mean():.0%} of the pixels have no ray, the corner {'too' if corner else 'has one'}"
-    return worst(np.where(wrong, np.inf, 0.0), 0.0, found.depth_mm == 0, 1.0, note=note)
+    note = f"{without.mean():.0%} of the pixels have no ray; the corner {'has none' if corner else 'has a ray'}"
+    return worst(np.where(wrong, np.inf, 0.0), 0.0, decoded.depth_mm == 0, 1.0, note=note)
 
 
 def _bad_rig(change: str) -> Rig:
@@ -187,10 +189,10 @@ def bad_file(change: str) -> Outcome:
 
 
 def file_round_trip(suffix: str) -> Outcome:
-    """Numbers that are hard to print must come back to the last bit."""
+    """Numbers that are hard to print must be restored to the last bit."""
     base = paper_rig(24)
-    odd = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
-    camera = replace(base.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=odd)
+    awkward = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
+    camera = replace(base.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward)
     rig = replace(
         base, camera=camera, translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
         rotation=rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(), pitch_vertical_px=18 + 2**-48,
@@ -198,6 +200,6 @@ def file_round_trip(suffix: str) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
         save_rig(rig, path)
-        again = load_rig(path)
-    same = again == rig and json.dumps(again.to_dict()) == json.dumps(rig.to_dict())
+        loaded = load_rig(path)
+    same = loaded == rig and json.dumps(loaded.to_dict()) == json.dumps(rig.to_dict())
     return Outcome(0.0 if same else math.inf, 0.0)

@@ -14,7 +14,7 @@ DIGITS = 50
 
 
 def high_precision() -> Any:
-    """An mpmath context of `DIGITS` digits of its own, so that nobody else's precision changes."""
+    """A separate mpmath context of `DIGITS` digits, so that the global precision does not change."""
     import mpmath
 
     context = mpmath.MPContext()

@@ -1,4 +1,4 @@
-"""Running cases: the list, one after the other, and what came of each."""
+"""Lists and runs the cases."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,13 +13,13 @@ from fpp_ml_bench.errors import StabilityError
 GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes")
 """Groups of cases, each in a module ``cases_{group}`` beside this one; only ``networks`` imports torch."""
 
-# A crash is a finding about the code under test and not the end of the run; these are what numerical code throws.
+# A crash of the code under test is a FAIL and does not end the run; numerical code raises these.
 _CRASHES = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A case with its outcome and verdict; ``against`` says what speaks against it where it failed.
+    """A case with its outcome and verdict; ``against`` is the reason where it failed.
 
     ``cpu_seconds``: processor time of all threads, so that a busy machine does not show.
     """
@@ -33,12 +33,12 @@ class Row:
 
 def all_cases(groups: Iterable[str] = GROUPS, quick: bool = False) -> list[Case]:
     """The cases of ``groups``, without the heavy ones when ``quick``. Raises `StabilityError`."""
-    found: list[Case] = []
+    cases: list[Case] = []
     for group in groups:
         if group not in GROUPS:
             raise StabilityError(f"unknown group {group!r}; there are {', '.join(GROUPS)}")
-        found += import_module(f"{__package__}.cases_{group}").cases()
-    return [case for case in found if not (quick and case.heavy)]
+        cases += import_module(f"{__package__}.cases_{group}").cases()
+    return [case for case in cases if not (quick and case.heavy)]
 
 
 def run_case(case: Case) -> Row:
@@ -56,7 +56,7 @@ def run_case(case: Case) -> Row:
 
 
 def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
-    """Run cases in order; ``done`` hears of each."""
+    """Run cases in order; ``done`` is called with each row."""
     rows = []
     for case in cases:
         rows.append(run_case(case))

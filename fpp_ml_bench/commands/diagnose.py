@@ -1,4 +1,4 @@
-"""``fpp-bench diagnose``: what a model read, fringes or shapes, as one HTML report."""
+"""``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
 
 import argparse
 from collections.abc import Callable, Iterator
@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.diagnosis import Diagnosis
     from fpp_ml_bench.baselines.diagnostics.probe import Probe, Progress
 
-SUMMARY = "Look into a model: the paper's probes and more, on any network or method, as one HTML report and a JSON."
+SUMMARY = (
+    "Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file."
+)
 EXAMPLES = (
     "fpp-bench diagnose unet-individual-rmse data/cpu224 --out report",
-    "fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   joins the report",
+    "fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   adds to the report",
     "fpp-bench diagnose phase data/cpu224 --out report-phase",
     "fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1 bottleneck dec1 --quick --out look",
     "fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder decoder.2 --out report-mine",
@@ -29,26 +31,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument(
         "model", metavar="MODEL",
-        help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or a torch "
-        "module of yours as file.py:factory; that file is run",
+        help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own "
+        "torch module as file.py:factory; that file is executed",
     )  # fmt: skip
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the model's image size")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
     parser.add_argument(
         "--probe", action="append", default=[], metavar="NAME",
-        help=f"only this one; may be given again: {', '.join(PROBES)} (default: all)",
+        help=f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)",
     )  # fmt: skip
     parser.add_argument(
-        "--samples", type=_count, metavar="N", help="samples of a split at most, evenly over it (default: the probe's)"
+        "--samples", type=_count, metavar="N", help="most samples of a split, taken evenly (default: the probe's)"
     )
-    parser.add_argument("--seeds", type=_count, metavar="N", help="repeats of what depends on chance (default: 2)")
-    parser.add_argument("--quick", action="store_true", help="a look in a minute or two, not a measurement")
-    parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to look into (default: the model's own)")
-    parser.add_argument("--frame", type=int, metavar="N", help="frame a network is given (default: its first)")
+    parser.add_argument(
+        "--seeds", type=_count, metavar="N", help="repeats of what depends on random numbers (default: 2)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a short run for a first look; its numbers are not reliable"
+    )
+    parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
+    parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
     parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
     parser.add_argument(
         "--units", choices=UNITS,
-        help="what a module of yours puts out: depth in mm, in m, or normalised to the sample's range (default)",
+        help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
     )  # fmt: skip
 
 
@@ -59,7 +65,7 @@ def _count(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask the probes, write the report, print what they say. Raises FppBenchError for what can't be looked into."""
+    """Run the probes, write the report, print the summaries. Raises FppBenchError for what can't be diagnosed."""
     from fpp_ml_bench.hardware import usable_cores
     from fpp_ml_bench.linear_algebra import limit_threads
 
@@ -72,14 +78,14 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.evaluation.console import show
     from fpp_ml_bench.loaders.store import DatasetFolder
 
-    asked = checked_names(args.probe)
-    opened = DatasetFolder(args.dataset)
-    model = subject(args.model, opened, args.layers, args.units, args.frame, threads)
+    probe_names = checked_names(args.probe)
+    dataset = DatasetFolder(args.dataset)
+    model = subject(args.model, dataset, args.layers, args.units, args.frame, threads)
     settings = ProbeSettings(args.samples, args.seeds, args.quick)
     with _bars() as progress:
-        found = diagnose(model, opened, asked, settings, args.out, progress, _command(args))
-    show(_table(model.title, found))
-    print(f"Written: {found.report}\nWritten: {found.values}")
+        diagnosis = diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+    show(_table(model.title, diagnosis))
+    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
     return 0
 
 
@@ -98,31 +104,31 @@ def _bars() -> "Iterator[Callable[[Probe], Progress]]":
         def started(probe: "Probe") -> "Progress":
             task = bars.add_task(probe.title, total=None)
 
-            def told(done: int, total: int, doing: str = "") -> None:
-                said = f"{probe.title}: {doing}" if doing else probe.title
-                bars.update(task, completed=done, total=total, description=said)
+            def show_progress(done: int, total: int, activity: str = "") -> None:
+                description = f"{probe.title}: {activity}" if activity else probe.title
+                bars.update(task, completed=done, total=total, description=description)
 
-            return told
+            return show_progress
 
         yield started
 
 
-def _table(title: str, found: "Diagnosis") -> "Table":
+def _table(title: str, diagnosis: "Diagnosis") -> "Table":
     from rich.table import Table
     from rich.text import Text
 
     table = Table(title=Text(title), title_justify="left")
     table.add_column("Probe")
-    table.add_column("What it says", overflow="fold")
+    table.add_column("Summary", overflow="fold")
     table.add_column("Seconds", justify="right")
-    for answer in found.answers:
-        said = f"not asked: {answer.finding.skipped}" if answer.finding.skipped else answer.finding.summary
-        table.add_row(answer.probe.name, Text(said), "kept" if answer.kept else f"{answer.seconds:.1f}")
+    for result in diagnosis.results:
+        text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
+        table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
     return table
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command that makes the same report, machine's settings left out."""
+    """The command that makes the same report, without the machine's settings."""
     import shlex
 
     words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]

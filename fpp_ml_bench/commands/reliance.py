@@ -1,4 +1,4 @@
-"""``fpp-bench reliance``: how far a method's answers follow the fringe's phase, as one number, into its result."""
+"""``fpp-bench reliance``: how far a method's predictions follow the fringe's phase, as a score from 0 to 1."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from fpp_ml_bench.evaluation.reliance import Reliance
 
-SUMMARY = "Measure phase reliance: does an answer follow the fringe's phase, or the object's outline?"
+SUMMARY = "Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?"
 EXAMPLES = (
     "fpp-bench reliance classical data/cpu224",
     "fpp-bench reliance phase data/cpu224 --fringe vertical",
@@ -22,24 +22,26 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder; its test objects are changed")
+    parser.add_argument(
+        "dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects"
+    )
     parser.add_argument(
         "--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)"
     )
     parser.add_argument(
         "--into", type=Path, metavar="FILE",
-        help="put it into this result of the same method, or leaderboard row (.json)",
+        help="write the score into this result or leaderboard row of the same method (.json)",
     )  # fmt: skip
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write it here")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
     add_method_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write what was asked for, print. Raises FppBenchError before measuring for a file that can't take it."""
+    """Measure, write, print. A file that can't take the score raises FppBenchError before measuring."""
     from fpp_ml_bench.linear_algebra import limit_threads
 
     limit_threads(args.threads)
-    from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneBook
+    from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
     from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
     from fpp_ml_bench.commands.console import progress_bar
     from fpp_ml_bench.errors import PredictionError
@@ -51,46 +53,48 @@ def run(args: argparse.Namespace) -> int:
 
     if not 1 <= args.views <= 6:
         raise PredictionError(f"--views {args.views}: expected 1 to 6, an object has six views")
-    opened = DatasetFolder(args.dataset)
-    method = chosen_method(args, opened)
+    dataset = DatasetFolder(args.dataset)
+    method = chosen_method(args, dataset)
     entry = None if args.into is None else read_entry(args.into)
     if entry is not None:
         check_same_method(entry, method)
-    book = SceneBook(opened, args.views)
-    before = 0
-    with progress_bar(f"asking {args.method}", len(book.chosen), "samples") as advance:
+    scene_set = SceneSet(dataset, args.views)
+    advanced = 0
+    with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
 
-        def progress(done: int, total: int, doing: str = "") -> None:
-            nonlocal before
-            advance(done - before)
-            before = done
+        def progress(done: int, total: int, activity: str = "") -> None:
+            nonlocal advanced
+            advance(done - advanced)
+            advanced = done
 
         sha256 = method.settings.get("weights_sha256")
-        found, _ = measure(method, book, sha256 if isinstance(sha256, str) else None, progress)
+        reliance, _ = measure(method, scene_set, sha256 if isinstance(sha256, str) else None, progress)
     if args.json is not None:
-        write_json(found.model_dump(mode="json"), args.json)
+        write_json(reliance.model_dump(mode="json"), args.json)
     if entry is not None:
-        write_reliance(entry, found)
-    show(_table(method.title, found))
+        write_reliance(entry, reliance)
+    show(_table(method.title, reliance))
     return 0
 
 
-def _table(title: str, found: "Reliance") -> "Table":
+def _table(title: str, reliance: "Reliance") -> "Table":
     from rich.table import Table
     from rich.text import Text
 
     from fpp_ml_bench.evaluation.reliance import PART_TITLES
 
-    table = Table(title=Text(f"{title}: {found.samples} samples of {found.objects} objects"), title_justify="left")
+    table = Table(
+        title=Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects"), title_justify="left"
+    )
     table.add_column("")
     table.add_column("value", justify="right")
-    low, high = found.interval
-    span = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
-    table.add_row("phase reliance, 0 to 1", f"{found.score:.3f}{span}")
-    if found.order_free_score is not None:
-        table.add_row("  whole periods aside", f"{found.order_free_score:.3f}")
+    low, high = reliance.interval
+    interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+    table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
+    if reliance.order_free_score is not None:
+        table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
     for key, words in PART_TITLES.items():
-        value = getattr(found.parts, key)
+        value = getattr(reliance.parts, key)
         if value is not None:
             table.add_row(words, f"{value:.3f}")
     return table

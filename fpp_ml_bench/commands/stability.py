@@ -1,4 +1,4 @@
-"""``fpp-bench stability``: stiff and extreme cases against higher precision and the error that theory predicts."""
+"""``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical bounds."""
 
 import argparse
 from pathlib import Path
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.stability.case import Case
     from fpp_ml_bench.baselines.stability.run import Row
 
-SUMMARY = "Stiff and extreme cases against references of higher precision and the error that theory predicts."
+SUMMARY = "Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds."
 EXAMPLES = (
     "fpp-bench stability",
     "fpp-bench stability --out stability --quick",
@@ -23,13 +23,15 @@ _GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics",
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--group", action="append", choices=_GROUPS, metavar="GROUP",
-        help=f"only this group, may be given again: {', '.join(_GROUPS)} (default: all)",
+        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write index.html, stability.json and stability.png here"
     )
     parser.add_argument("--json", action="store_true", help="print the run as JSON instead of a table")
-    parser.add_argument("--quick", action="store_true", help="leave out what takes gigabytes: 10 million triangles")
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out the case that needs gigabytes (10 million triangles)"
+    )
     parser.add_argument("--list", action="store_true", help="list the cases and their bounds, and run none")
 
 
@@ -46,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
     groups = [group for group in _GROUPS if group in (args.group or _GROUPS)]
     if args.out is not None and args.out.exists() and not args.out.is_dir():
-        raise StabilityError(f"--out {args.out}: expected a folder, or a path where one can be made, found a file")
+        raise StabilityError(f"--out {args.out}: expected a folder or a new path, got a file")
     cases = all_cases(groups, quick=args.quick)
     if args.list:
         return _list(cases)
@@ -80,11 +82,11 @@ def _show(rows: "Sequence[Row]") -> None:
     table = Table()
     for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
         table.add_column(title, justify="left" if title == "group" else "right")
-    for group, found in summary(rows).items():
-        ratio = found["largest_ratio"]
+    for group, counts in summary(rows).items():
+        ratio = counts["largest_ratio"]
         table.add_row(
-            group, str(found["cases"]), str(found["within"]), str(found["flagged"]), str(found["FAIL"]),
-            ratio if isinstance(ratio, str) else figure(ratio), f"{found['cpu_seconds']:.1f}",
+            group, str(counts["cases"]), str(counts["within"]), str(counts["flagged"]), str(counts["FAIL"]),
+            ratio if isinstance(ratio, str) else figure(ratio), f"{counts['cpu_seconds']:.1f}",
         )  # fmt: skip
     show(table)
     for row in rows:
@@ -98,11 +100,11 @@ def _list(cases: "Sequence[Case]") -> int:
     from fpp_ml_bench.commands import OK
     from fpp_ml_bench.evaluation.console import show
 
-    shown = set()
+    listed = set()
     for case in cases:
-        if (case.group, case.family) not in shown:
-            shown.add((case.group, case.family))
-            members = sum((one.group, one.family) == (case.group, case.family) for one in cases)
+        if (case.group, case.family) not in listed:
+            listed.add((case.group, case.family))
+            members = sum((member.group, member.family) == (case.group, case.family) for member in cases)
             show(Text(f"{case.group}: {case.family} ({members}): {case.computes}; against {case.reference}"))
             show(Text(f"    bound: {case.predicts}"))
     show(Text(f"{len(cases)} cases"))
