@@ -30,7 +30,7 @@ from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.loaders.build import build
 from fpp_ml_bench.loaders.illumination import hit_points_m, lit_object
 from fpp_ml_bench.loaders.meshes import solid_mesh
-from fpp_ml_bench.loaders.raycast import TracedObject
+from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.scene import place
 from fpp_ml_bench.loaders.settings import BuildSettings
 from fpp_ml_bench.loaders.view import Studio
@@ -69,8 +69,8 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     mesh = solid_mesh(settings.objects[0])
     vertices_m, _ = place(mesh, "A60", rig, "fixed", settings.seed)
     traced = TracedObject(mesh, vertices_m)
-    rays = rig.camera.rays()
-    hits = traced.primary(*rays)
+    rays = PixelRays.of(rig.camera)
+    hits = traced.primary(rays)
     lit = lit_object(hits, rig, studio.lighting, traced)
     whole = studio.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
     row = studio.photograph(mesh, "A60")
@@ -80,8 +80,8 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     stream = (settings.seed, mesh.name, "A60")
     count = len(frames)
     times = [
-        ("mesh to Embree", median_ms(lambda: TracedObject(mesh, vertices_m))),
-        ("primary rays, exact depth", median_ms(lambda: traced.primary(*rays))),
+        ("triangles of the mesh", median_ms(lambda: TracedObject(mesh, vertices_m))),
+        ("visible triangle, exact depth", median_ms(lambda: traced.primary(rays))),
         ("illumination of the object", median_ms(lambda: lit_object(hits, rig, studio.lighting, traced))),
         (
             f"{count} exposures with noise",
@@ -100,7 +100,7 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
     mesh = solid_mesh(settings.objects[0])
     vertices_m, _ = place(mesh, "A60", rig, "fixed", settings.seed)
     traced = TracedObject(mesh, vertices_m)
-    hits = traced.primary(*rig.camera.rays())
+    hits = traced.primary(PixelRays.of(rig.camera))
     lit = studio.backdrop.behind(traced, hits.pixels).patched(
         hits.pixels, lit_object(hits, rig, studio.lighting, traced)
     )
