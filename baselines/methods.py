@@ -19,8 +19,8 @@ class Method(Protocol):
     A method may have besides: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
     frames that are 0 outside the object; default no), ``seeds``, ``packages`` whose versions matter (default numpy and
     numba), ``predict_reported`` and ``summary`` (a report of every sample, see `fpp_ml_bench.baselines.prediction`),
-    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), and ``mode`` and
-    ``target``, how its row is scored.
+    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), ``weights_config`` (see
+    `fpp_ml_bench.baselines.training_data`), and ``mode`` and ``target``, how its row is scored.
     """
 
     @property

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.model import Model
 from fpp_ml_bench.baselines.training.recipe import Loss
+from fpp_ml_bench.baselines.weights_file import ModelConfig
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.frames import PAPER_SEQUENCE
@@ -114,6 +115,11 @@ class NetworkMethod:
             "device": self.device,
         }
         return {key: value for key, value in found.items() if value is not None} | self.about
+
+    @property
+    def weights_config(self) -> ModelConfig:
+        """What the weights file says of the network and its training data."""
+        return self.model.config
 
     @property
     def seeds(self) -> Mapping[str, int]:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from fpp_ml_bench.baselines.training_data import TrainingBenchmark
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
 from fpp_ml_bench.evaluation.text import printable
@@ -45,8 +46,9 @@ class ModelConfig:
     ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is the representation it puts out,
     ``image_size`` (H, W) in px the only size it is meant for (at another size the fringe period in px is another, and
     so is the problem). ``data_config`` names the frames it was trained on, ``background_removed`` says that its input
-    is 0 outside the object. ``dataset_fingerprint`` is that of the training data, ``recipe`` the resolved training
-    recipe, ``epoch`` the one whose weights these are, ``validation`` its scores.
+    is 0 outside the object. ``dataset_fingerprint`` is that of the training data, ``benchmark`` its name and version
+    (None for a dataset of the user's own, and in older files), ``recipe`` the resolved training recipe, ``epoch`` the
+    epoch of these weights, ``validation`` its scores.
 
     Raises ``ValueError`` for a value of the wrong type, an unknown normalisation or configuration.
     """
@@ -58,6 +60,7 @@ class ModelConfig:
     normalisation: Normalisation
     image_size: tuple[Pixels, Pixels]
     dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    benchmark: TrainingBenchmark | None = None
     data_config: Text = "single_shot"
     background_removed: bool = False
     recipe: dict[Text, Any] = field(default_factory=dict)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetFile, load_net
+from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetConfig, NetFile, load_net
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -78,9 +78,14 @@ class PhaseNetMethod:
         }  # fmt: skip
 
     @property
+    def weights_config(self) -> NetConfig:
+        """What the weights file says of the network and its training data."""
+        return self.file.config
+
+    @property
     def parameters(self) -> int:
         """Numbers that were learned."""
-        return sum(one.numel() for one in self.file.network.parameters())
+        return sum(parameter.numel() for parameter in self.file.network.parameters())
 
     def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
         """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""

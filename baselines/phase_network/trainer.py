@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.phase_network.unions import unions_of
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.training.history import CURVE_FILE, LOG_FILE, write_log
+from fpp_ml_bench.baselines.training_data import training_benchmark
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.loaders.manifest import write_atomically
@@ -120,7 +121,8 @@ def train_phase_net(
     config = NetConfig(
         name=name, title="Fringe order, mask and bounded phase correction", options=done.network.options,
         threshold=threshold, lead=lead, period_px={one: g.route.period_px for one, g in geometries.items()},
-        dataset_fingerprint=opened.fingerprint, steps=recipe.steps, recipe=described, validation=dict(means),
+        dataset_fingerprint=opened.fingerprint, benchmark=training_benchmark(opened.fingerprint), steps=recipe.steps,
+        recipe=described, validation=dict(means),
     )  # fmt: skip
     save_net(out / WEIGHTS_FILE, done.network, config)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)

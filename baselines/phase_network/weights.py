@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from fpp_ml_bench.baselines.training_data import TrainingBenchmark
 from fpp_ml_bench.baselines.weights_file import SUFFIX, weights_path
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
@@ -43,6 +44,7 @@ class NetConfig:
     threshold: Finite
     period_px: dict[Text, Finite]
     dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    benchmark: TrainingBenchmark | None = None
     lead: Finite = 0.0
     steps: Count = 0
     recipe: dict[Text, Any] = field(default_factory=dict)

@@ -9,6 +9,7 @@ from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.training.objectives import Adversarial, Objective, Regression
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.baselines.training.tables import GAN
+from fpp_ml_bench.baselines.training_data import training_benchmark
 from fpp_ml_bench.baselines.weights_file import ModelConfig
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -52,6 +53,7 @@ def model_config(
         normalisation=recipe.normalisation,
         image_size=(recipe.size, recipe.size),
         dataset_fingerprint=fingerprint,
+        benchmark=training_benchmark(fingerprint),
         data_config=recipe.data_config,
         background_removed=recipe.background_removed,
         recipe=recipe.to_dict(),
