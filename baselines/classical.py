@@ -57,11 +57,11 @@ class ClassicalMethod:
 
     @property
     def title(self) -> str:
-        which = "both directions" if self.direction == "both" else f"{self.direction} fringes"
+        fringes = "both directions" if self.direction == "both" else f"{self.direction} fringes"
         count = sum(map(len, self._gray_bits.values()))
         if not self.fewest:
-            return f"Classical {self.steps}-step + Gray code, {which}"
-        return f"Classical {self.steps}-step, {which}, " + (f"{count} Gray frames" if count else "no Gray code")
+            return f"Classical {self.steps}-step + Gray code, {fringes}"
+        return f"Classical {self.steps}-step, {fringes}, " + (f"{count} Gray frames" if count else "no Gray code")
 
     @property
     def _gray_bits(self) -> Mapping[Direction, tuple[int, ...]]:

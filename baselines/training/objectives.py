@@ -114,10 +114,10 @@ class Adversarial:
         return "discriminator", loss, _detached(logged)
 
     def _generator_step(self, prediction: Tensor, generated: Tensor, real: Tensor, depth: Tensor) -> Step:
-        with _fixed(self.modules["discriminator"]) as judge:
-            on_generated = judge(generated)
+        with _fixed(self.modules["discriminator"]) as discriminator:
+            on_generated = discriminator(generated)
             with torch.no_grad():
-                on_real = judge(real)
+                on_real = discriminator(real)
         terms = {
             "adversarial": gan_losses.scores_against(on_generated, real=True),
             "feature_matching": gan_losses.feature_matching(on_generated, on_real),

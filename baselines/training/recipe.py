@@ -62,7 +62,7 @@ class Loss(StrictModel):
     alpha: Annotated[float, Field(ge=0, le=1)] | None = None
 
     @model_validator(mode="after")
-    def _known(self) -> "Loss":
+    def _check(self) -> "Loss":
         if self.name != GAN or self.alpha is not None:
             check_loss(self.name, self.alpha)
         return self
@@ -193,9 +193,9 @@ def _recipe_path(name_or_path: str | Path) -> Path:
         from difflib import get_close_matches
 
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
-        near = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
+        closest = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
         raise RecipeError(
-            f"no recipe {printable(text, 100)!r}; near it: {', '.join(near)}. Give one of the shipped names (see "
+            f"no recipe {printable(text, 100)!r}; near it: {', '.join(closest)}. Give one of the shipped names (see "
             "fpp-bench reproduce --list) or a .yaml file"
         )
     return path
@@ -207,14 +207,14 @@ def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
         raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
     content = _read(path)
     parent = content.pop(_EXTENDS, None)
-    mine = not path.resolve().is_relative_to(RECIPES)
+    is_users_own = not path.resolve().is_relative_to(RECIPES)
     if parent is None:
-        return ({}, content) if mine else (content, {})
+        return ({}, content) if is_users_own else (content, {})
     if not isinstance(parent, str):
         raise RecipeError(f"{path}: extends: expected a recipe's name, like base, got {printable(repr(parent), 60)}")
     beside = path.parent / parent
     shipped, own = _resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1)
-    return (shipped, _merge(own, content)) if mine else (_merge(shipped, content), own)
+    return (shipped, _merge(own, content)) if is_users_own else (_merge(shipped, content), own)
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from fpp_ml_bench.loaders.training import FringeDepthDataset
 
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
     """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
-    found = []
+    datasets = []
     for split in ("train", "validation"):
         data = FringeDepthDataset(dataset, split, recipe.data_config, recipe.normalisation, recipe.background_removed)
         if data.source.size != (recipe.size, recipe.size):
@@ -29,8 +29,8 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
             )
         if not len(data):
             raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
-        found.append(data)
-    return found[0], found[1]
+        datasets.append(data)
+    return datasets[0], datasets[1]
 
 
 def objective_of(recipe: Recipe) -> Objective:
