@@ -20,7 +20,7 @@ from phase_route_stages import SHOWN
 
 from fpp_ml_bench.baselines.model import load
 from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
-from fpp_ml_bench.baselines.phase_network.route import Asked, Levers, NetworkRoute
+from fpp_ml_bench.baselines.phase_network.route import AnsweredObservation, Levers, NetworkRoute
 from fpp_ml_bench.baselines.phase_network.weights import DEFAULT
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
@@ -66,9 +66,9 @@ def compare(found: Measurement, route: NetworkRoute, target: np.ndarray) -> dict
     }
 
 
-def guided(asked: Asked, route: NetworkRoute, depth_mm: np.ndarray) -> Measurement:
+def guided(asked: AnsweredObservation, route: NetworkRoute, depth_mm: np.ndarray) -> Measurement:
     """The candidate order nearest to a depth map's."""
-    seen = asked.seen
+    seen = asked.observation
     wanted = np.rint((seen.layer.absolute_phase(np.maximum(depth_mm[seen.crop], 1.0)) - seen.phase_rad) / TAU)
     first, count = seen.candidates.first, seen.candidates.count
     order = np.clip(wanted, first, first + np.maximum(count, 1) - 1).astype(np.int32)
@@ -122,7 +122,7 @@ def pictures(opened: DatasetFolder, method: PhaseNetMethod, folder: Path) -> Non
         none = np.where(found.depth_mm > 0, 1.0, np.nan)[box]
         limits = np.percentile(target[object_mask(target)], [1, 99])
         correction = np.zeros(image.shape)
-        correction[asked.seen.crop] = 0 if asked.answers is None else asked.answers.correction_rad
+        correction[asked.observation.crop] = 0 if asked.answers is None else asked.answers.correction_rad
         error = {"cmap": "RdBu", "vmin": -20, "vmax": 20}
         panels = (
             ("fringe, grey levels", image[box], {"cmap": "gray"}),

@@ -49,7 +49,7 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     image = photograph("cork", "A60").frames[FIRST[direction]]
     asked = learned.observe(image)
     found = learned.conclude(asked)
-    seen, here = asked.seen, found.depth_mm[asked.seen.crop] > 0
+    seen, here = asked.observation, found.depth_mm[asked.observation.crop] > 0
     assert here.sum() > 3000
     absolute = seen.layer.absolute_phase(np.where(here, found.depth_mm[seen.crop], 1000.0))
     order = np.rint((absolute - seen.phase_rad) / TAU)
