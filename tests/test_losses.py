@@ -204,9 +204,9 @@ def test_wrong_names_and_alphas_are_refused():
 def test_wrong_tensors_are_refused(name, alpha):
     loss = loss_function(name, alpha)
     prediction, target = images()
-    for other in (target[:, 0], target[:1], target[..., :-1], target.expand(3, 2, 11, 14)):
+    for wrong_shape in (target[:, 0], target[:1], target[..., :-1], target.expand(3, 2, 11, 14)):
         with pytest.raises(ValueError, match=r"of one shape \(B, 1, H, W\)"):
-            loss(prediction, other)
+            loss(prediction, wrong_shape)
     for empty in (prediction[:0], prediction[..., :0]):
         with pytest.raises(ValueError, match="not empty"):
             loss(empty, empty)
