@@ -1,8 +1,7 @@
 """Classical multi-frame FPP: N-step phase, Gray-code order, triangulation (paper Section 2.1).
 
 It is the benchmark's reference: what the optics allow when 10 to 50 frames are captured instead of one. With all steps
-and both directions it is the very process that made the ``depth`` column, so there only ``--target depth_exact`` says
-anything about its error.
+and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact`` shows its error.
 """
 
 from collections.abc import Mapping, Sequence

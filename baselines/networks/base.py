@@ -1,4 +1,4 @@
-"""What all networks share: their input rule, the options that rebuild them, and the layers that others look into."""
+"""The base of all networks: input check, the options that rebuild them, and the layers for probes."""
 
 from abc import ABC, abstractmethod
 

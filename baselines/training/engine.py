@@ -313,7 +313,7 @@ def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None
         differs = [key for key, value in own_recipe.items() if existing_recipe.get(key) != value] or ["dataset"]
         raise TrainingError(
             f"{path}: was made for another training, which differs in {', '.join(differs)}; give another folder, or "
-            f"remove {out} to train anew"
+            f"remove {out} to train again from the start"
         )
 
 

@@ -1,4 +1,4 @@
-"""From a recipe to what the engine runs: the data, the objective with its networks, the description of the weights."""
+"""From a recipe to the data, the objective with its networks, and the configuration in the weights file."""
 
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
 
 
 def objective_of(recipe: Recipe) -> Objective:
-    """The recipe's networks, freshly initialised, and what they minimise. Seed torch first."""
+    """The objective of a recipe, with freshly initialised networks. Seed torch first."""
     network = networks.build(recipe.network, width=recipe.width, **recipe.options)
     if recipe.loss.name == GAN:
         return Adversarial(network, networks.discriminator(width=recipe.width))
@@ -44,7 +44,7 @@ def objective_of(recipe: Recipe) -> Objective:
 def model_config(
     recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: dict[str, Any]
 ) -> ModelConfig:
-    """What the weights file says of itself."""
+    """Configuration for the weights file."""
     return ModelConfig(
         name=recipe.name,
         title=recipe.title,

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if not PartialState().is_main_process:
         return 0 if trained.finished else CHECK_FAILED
     if not trained.finished:
-        print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; the same command goes on")
+        print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
     weights = trained.weights
     if recipe.normalisation == "individual" and not recipe.background_removed:
@@ -99,7 +99,8 @@ def _phase_net(args: argparse.Namespace) -> int:
     recipe = Recipe(**options)
     trained = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
     if trained.weights is None:
-        print(f"{args.out}: stopped after {trained.steps} of {recipe.steps} steps, all saved; the same command goes on")
+        steps = f"{trained.steps} of {recipe.steps} steps"
+        print(f"{args.out}: stopped after {steps}, all saved; run the same command to resume")
         return CHECK_FAILED
     scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
     print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
