@@ -1,8 +1,7 @@
 """Classical multi-frame FPP: N-step phase, Gray-code order, triangulation (paper Section 2.1).
 
 It is the benchmark's reference: what the optics allow when 10 to 50 frames are captured instead of one. With all steps
-and both directions it is the very process that made the ``depth`` column, so there only ``--target depth_exact`` says
-anything about its error.
+and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact`` shows its error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,11 +56,11 @@ class ClassicalMethod:
 
     @property
     def title(self) -> str:
-        which = "both directions" if self.direction == "both" else f"{self.direction} fringes"
+        fringes = "both directions" if self.direction == "both" else f"{self.direction} fringes"
         count = sum(map(len, self._gray_bits.values()))
         if not self.fewest:
-            return f"Classical {self.steps}-step + Gray code, {which}"
-        return f"Classical {self.steps}-step, {which}, " + (f"{count} Gray frames" if count else "no Gray code")
+            return f"Classical {self.steps}-step + Gray code, {fringes}"
+        return f"Classical {self.steps}-step, {fringes}, " + (f"{count} Gray frames" if count else "no Gray code")
 
     @property
     def _gray_bits(self) -> Mapping[Direction, tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""What a run of ``fpp-bench predict`` left out: frames that its method does not need, pixels that can't be object."""
+"""What ``fpp-bench predict`` left out: frames that the method does not need, pixels that can't be object."""
 
 from typing import Any
 
@@ -20,11 +20,11 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
     stored = stored_frames(opened.sequence, opened.manifest.stored)
     lines = [_frames(opened, method, samples, [index for index in stored if index not in method.frames_used])]
     count = min(COUNTED_SAMPLES, len(samples))
-    some = [samples[i * len(samples) // count] for i in range(count)]
+    counted = [samples[i * len(samples) // count] for i in range(count)]
     if isinstance(method, ClassicalMethod):
-        lines += _second_direction(opened, method, some, len(samples))
+        lines += _second_direction(opened, method, counted, len(samples))
     elif getattr(method, "route", None) is not None:
-        lines.append(_outside_crop(opened, method, some, len(samples)))
+        lines.append(_outside_crop(opened, method, counted, len(samples)))
     height, width = opened.size
     about = f"{method.title}; {len(samples)} samples of {width}x{height} px"
     return explained("predict", about, lines)
@@ -43,40 +43,43 @@ def _frames(opened: DatasetFolder, method: Method, samples: list[str], unused: l
     )  # fmt: skip
 
 
-def _second_direction(opened: DatasetFolder, method: ClassicalMethod, some: list[str], samples: int) -> list[LeftOut]:
+def _second_direction(
+    opened: DatasetFolder, method: ClassicalMethod, counted: list[str], samples: int
+) -> list[LeftOut]:
     if method.direction != "both":
         return []
     height, width = opened.size
-    seen, left, seconds = 0, 0, 0.0
-    for sample in some:
+    decoded_px, skipped_px, seconds = 0, 0, 0.0
+    for sample in counted:
         frames = captured_frames(opened, method, sample)
         with skipping(True):
-            looked_at = method.decode(frames, reasons=False).second_px
+            second_px = method.decode(frames, reasons=False).second_px
         saved = saved_by(lambda frames=frames: method.predict(frames), 1, 1)  # type: ignore[misc]
-        seen, left, seconds = seen + looked_at, left + height * width - looked_at, seconds + (saved or 0.0)
-    scale = samples / len(some)
+        decoded_px, skipped_px = decoded_px + second_px, skipped_px + height * width - second_px
+        seconds += saved or 0.0
+    scale = samples / len(counted)
     frames_each = len(method.frames_used) // 2
     return [
         LeftOut(
-            "second direction where the first shows no object", "pixels", round(seen * scale), round(left * scale),
-            round(left * scale) * frames_each, seconds * scale,
-            f"{len(some)} of {samples} samples predicted again now with skipping off and on, and scaled up",
+            "second direction where the first shows no object", "pixels", round(decoded_px * scale),
+            round(skipped_px * scale), round(skipped_px * scale) * frames_each, seconds * scale,
+            f"{len(counted)} of {samples} samples predicted again now with skipping off and on, and scaled up",
         )
     ]  # fmt: skip
 
 
-def _outside_crop(opened: DatasetFolder, method: Any, some: list[str], samples: int) -> LeftOut:
+def _outside_crop(opened: DatasetFolder, method: Any, counted: list[str], samples: int) -> LeftOut:
     height, width = opened.size
     inside = 0
-    for sample in some:
+    for sample in counted:
         frames = captured_frames(opened, method, sample)
         images = [frames[index] for index in method.frames_used]
         crop = method.route.observe(images if len(images) > 1 else images[0]).crop
         inside += (crop[0].stop - crop[0].start) * (crop[1].stop - crop[1].start)
-    scale = samples / len(some)
+    scale = samples / len(counted)
     return LeftOut(
         "local fits and orders far from the object", "pixels", round(inside * scale),
-        round((len(some) * height * width - inside) * scale), None, None,
-        f"pixels counted on {len(some)} of {samples} samples; the crop is part of the method, so there is no run "
+        round((len(counted) * height * width - inside) * scale), None, None,
+        f"pixels counted on {len(counted)} of {samples} samples; the crop is part of the method, so there is no run "
         "without it to measure against",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Running a trained network: images in the range it was trained on, outputs that are numbers, layers looked into."""
+"""Running a trained network: images in the range it was trained on, finite outputs, outputs of inner layers."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -45,8 +45,8 @@ def _check_image(image: NDArray[Any], size: tuple[int, int], trained_on: str) ->
     if image.shape != size:
         raise PredictionError(
             f"expected a fringe image of {size[0]}x{size[1]} px (H x W), the size {trained_on} was trained at, got "
-            f"{image.shape[0]}x{image.shape[1]}: at another size the fringe period in px is another, and so is the "
-            "problem; use weights of that size, or a dataset built at this one"
+            f"{image.shape[0]}x{image.shape[1]}: the fringe period in px depends on the size, so a network works at "
+            "one size only; use weights of that size, or a dataset built at this one"
         )
     if image.dtype == np.uint8:
         return
@@ -63,29 +63,29 @@ def _check_image(image: NDArray[Any], size: tuple[int, int], trained_on: str) ->
 def represent(network: nn.Module, fringe: Tensor, name: str) -> Tensor:
     """Output (B, 1, H, W) of ``network``; `PredictionError` where it holds a value that is not finite."""
     output: Tensor = network(fringe)
-    sick = int((~output.isfinite()).sum())
-    if sick:
+    not_finite = int((~output.isfinite()).sum())
+    if not_finite:
         raise PredictionError(
-            f"{name}: the network gave {sick} of {output.numel()} values that are NaN or infinite; its weights come "
-            "from a training that diverged, or the precision it runs in is too low: train it again"
+            f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or infinite; its weights "
+            "come from a training that diverged, or the precision it runs in is too low: train it again"
         )
     return output
 
 
 class Probe:
-    """What a network's inside said about the last batch: see `probed`."""
+    """Outputs of two layers of a network for the last batch: see `probed`."""
 
     def __init__(self) -> None:
-        self.caught: dict[str, Tensor] = {}
+        self.outputs: dict[str, Tensor] = {}
 
     def pooled(self) -> Tensor:
         """Mean and spread over the pixels of each bottleneck channel, float64 (B, 2 C), on the CPU."""
-        layer = self.caught["bottleneck"].double().flatten(2)
+        layer = self.outputs["bottleneck"].double().flatten(2)
         return torch.cat([layer.mean(2), layer.std(2, correction=0)], dim=1).cpu()
 
     def pixels(self, size: tuple[int, int]) -> Tensor:
         """Features of the last decoder layer (B, C, H, W) at ``size``; bilinear where the layer is coarser."""
-        layer = self.caught["last"]
+        layer = self.outputs["last"]
         if layer.shape[2:] == size:
             return layer
         return functional.interpolate(layer, size=size, mode="bilinear", align_corners=False)
@@ -93,17 +93,17 @@ class Probe:
 
 @contextmanager
 def probed(network: "FringeNetwork") -> Iterator[Probe]:
-    """Look into the bottleneck and the last decoder layer of every batch that ``network`` sees inside this block."""
+    """Record the outputs of the bottleneck and the last decoder layer for every batch inside this block."""
     probe = Probe()
     layers = network.probe_layers
 
-    def catch(name: str, layer: str) -> Any:
+    def record(name: str, layer: str) -> Any:
         def hook(module: nn.Module, inputs: object, output: Tensor) -> None:
-            probe.caught[name] = output
+            probe.outputs[name] = output
 
         return layers[layer].register_forward_hook(hook)
 
-    handles = [catch("bottleneck", "bottleneck"), catch("last", network.last_layer)]
+    handles = [record("bottleneck", "bottleneck"), record("last", network.last_layer)]
     try:
         yield probe
     finally:

@@ -14,13 +14,13 @@ from fpp_ml_bench.rig import Rig
 
 
 class Method(Protocol):
-    """One frame stack in, one depth map out.
+    """A frame stack in, a depth map out.
 
-    A method may have besides: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
+    A method may also have: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
     frames that are 0 outside the object; default no), ``seeds``, ``packages`` whose versions matter (default numpy and
     numba), ``predict_reported`` and ``summary`` (a report of every sample, see `fpp_ml_bench.baselines.prediction`),
-    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), and ``mode`` and
-    ``target``, how its row is scored.
+    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), ``weights_config`` (see
+    `fpp_ml_bench.baselines.training_data`), and ``mode`` and ``target``, how its row is scored.
     """
 
     @property
@@ -60,18 +60,18 @@ def method(name: str, rig: Rig, **options: Any) -> Method:
     if name == "phase" and "error_mm" in options:
         from fpp_ml_bench.baselines.phase_route.frame_choice import FewestFrames
 
-        choosing: Method = FewestFrames(rig, **options)
-        return choosing
+        fewest_frames: Method = FewestFrames(rig, **options)
+        return fewest_frames
     if name == "phase":
         from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 
-        made: Method = PhaseMethod(rig, **options)
-        return made
+        phase_route: Method = PhaseMethod(rig, **options)
+        return phase_route
     if name == "phase-net":
         from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
 
-        learned: Method = PhaseNetMethod(rig, **options)
-        return learned
+        phase_net: Method = PhaseNetMethod(rig, **options)
+        return phase_net
     raise FppBenchError(f"unknown method {name!r}; there are {', '.join(METHODS)}")
 
 

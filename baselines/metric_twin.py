@@ -1,12 +1,12 @@
 """Metric depth from an individually normalised network, without being told the sample's depth range.
 
 Such a network puts out v in [0, 1], and mm are v (D_max - D_min) + D_min. The benchmark's *metric twin* of its row
-replaces the range of the test sample, which only the ground truth knows, by one of
+replaces the range of the test sample, which only the ground truth knows, by either
 
 - ``mean``: D_min and D_max averaged over the training split;
 - ``predicted``: a ridge regression from the mean and spread of each bottleneck channel to (D_min, D_max - D_min).
 
-Both need an object mask besides, for v = 0 means background and D_min at once: a logistic regression on the features
+Both also need an object mask, because v = 0 means both background and D_min: a logistic regression on the features
 of the last decoder layer (a 1x1 convolution). Depth is v span + D_min, held within the training set's range and a
 quarter of its width to either side, where the mask says object, and 0 elsewhere. The network itself stays as it is.
 Own definition; `fpp_ml_bench.baselines.range_heads.fit_heads` fits it.
@@ -79,8 +79,8 @@ class RangeHeads:
         if twin == "mean":
             low, high = self.mean_range_mm.tolist()
             return torch.tensor([[low, high - low]], dtype=torch.float64).expand(len(pooled), 2)
-        found = pooled @ self.range_weight + self.range_bias
-        return torch.stack([found[:, 0], found[:, 1].clamp(min=0)], dim=1)
+        predicted = pooled @ self.range_weight + self.range_bias
+        return torch.stack([predicted[:, 0], predicted[:, 1].clamp(min=0)], dim=1)
 
     def logits(self, probe: Probe, size: tuple[int, int]) -> Tensor:
         """Logit of being object of each pixel of the probed batch, float32 (B, 1, H, W)."""
@@ -97,8 +97,9 @@ class RangeHeads:
     def depth_mm(self, values: Tensor, probe: Probe, twin: Twin) -> Tensor:
         """Depth of the probed batch, float32 (B, 1, H, W) in mm, 0 = background."""
         depth = self.unmasked_mm(values.float(), self.depth_range_mm(probe, twin))
-        found = self.logits(probe, (values.shape[2], values.shape[3])) >= float(self.mask_threshold[TWINS.index(twin)])
-        return torch.where(found, depth, 0.0)
+        threshold = float(self.mask_threshold[TWINS.index(twin)])
+        is_object = self.logits(probe, (values.shape[2], values.shape[3])) >= threshold
+        return torch.where(is_object, depth, 0.0)
 
 
 def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads | None:
@@ -106,10 +107,10 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
     if not tensors:
         return None
     fields = RangeHeads.__dataclass_fields__
-    wrong = [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]
-    if wrong:
+    differing = [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]
+    if differing:
         raise WeightsError(
-            f"{name}: expected the range heads {', '.join(fields)}, differs in {wrong[0]}; fit them again"
+            f"{name}: expected the range heads {', '.join(fields)}, differs in {differing[0]}; fit them again"
         )
     features = tensors["range_weight"].shape[0] if tensors["range_weight"].dim() == 2 else 0
     channels = tensors["mask_weight"].numel()
@@ -119,6 +120,6 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
     }  # fmt: skip
     for key, shape in shapes.items():
         if tuple(tensors[key].shape) != shape or tensors[key].dtype != torch.float64:
-            came = f"{tensors[key].dtype} {tuple(tensors[key].shape)}"
-            raise WeightsError(f"{name}: range head {key}: expected float64 {shape}, got {came}; fit the heads again")
+            actual = f"{tensors[key].dtype} {tuple(tensors[key].shape)}"
+            raise WeightsError(f"{name}: range head {key}: expected float64 {shape}, got {actual}; fit the heads again")
     return RangeHeads(**tensors)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.model import Model
 from fpp_ml_bench.baselines.training.recipe import Loss
+from fpp_ml_bench.baselines.weights_file import ModelConfig
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.frames import PAPER_SEQUENCE
@@ -32,7 +33,7 @@ class NetworkMethod:
     are torch's, for the whole process. ``remark`` is added to the title, ``about`` to the settings. A network
     trained with the background removed needs frames that are 0 outside the object (``uses_ground_truth_mask``):
     `fpp_ml_bench.baselines.prediction.captured_frames` sees to that.
-    Raises `PredictionError` for a range or a frame that there is not.
+    Raises `PredictionError` for an unknown range or frame.
     """
 
     packages = ("numpy", "torch", "safetensors")
@@ -97,7 +98,7 @@ class NetworkMethod:
     @property
     def settings(self) -> Mapping[str, Setting]:
         config = self.model.config
-        found: dict[str, Setting] = {
+        entries: dict[str, Setting] = {
             "weights_sha256": self.model.sha256,
             "network": config.network,
             "width": config.options.get("width"),
@@ -113,7 +114,12 @@ class NetworkMethod:
             "threads": self.threads,
             "device": self.device,
         }
-        return {key: value for key, value in found.items() if value is not None} | self.about
+        return {key: value for key, value in entries.items() if value is not None} | self.about
+
+    @property
+    def weights_config(self) -> ModelConfig:
+        """What the weights file says of the network and its training data."""
+        return self.model.config
 
     @property
     def seeds(self) -> Mapping[str, int]:
@@ -159,5 +165,5 @@ def _checked_range(model: Model, depth_range: str | None) -> Any:
 
 
 def _loss(loss: Any) -> str | None:
-    """The recipe's loss in one word, as in the names of runs: ``hybrid_l1_0.7``."""
+    """The recipe's loss as in the names of runs: ``hybrid_l1_0.7``."""
     return Loss.model_validate(loss).label if isinstance(loss, dict) else loss

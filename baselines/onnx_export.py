@@ -50,21 +50,21 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
     try:
         # A file that appears under its name only when whole.
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:
-            whole = Path(folder) / target.name
+            unfinished = Path(folder) / target.name
             with _exportable(network), warnings.catch_warnings():
                 # The size rule is checked once, here, and is meant to be a constant of the file.
                 warnings.simplefilter("ignore")
                 torch.onnx.export(
                     network,
                     (example,),
-                    str(whole),
+                    str(unfinished),
                     dynamo=False,
                     input_names=[INPUT],
                     output_names=[OUTPUT],
                     dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}},
                     opset_version=OPSET,
                 )
-            whole.replace(target)
+            unfinished.replace(target)
     except OSError as error:
         raise FppBenchError(f"can't write {target}: {error.strerror or error}") from error
     return target
@@ -73,12 +73,12 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
 @contextlib.contextmanager
 def _exportable(network: nn.Module) -> Iterator[None]:
     """Evaluation mode in float32 for a while; the mode and type found are put back."""
-    found = next(network.parameters()).dtype
+    dtype = next(network.parameters()).dtype
     modes = {module: module.training for module in network.modules()}
     network.eval().float()
     try:
         yield
     finally:
-        network.to(found)
+        network.to(dtype)
         for module, training in modes.items():
             module.training = training

@@ -23,7 +23,7 @@ PREDICTION_SUFFIX = ".npy"
 
 @dataclass(frozen=True)
 class Run:
-    """What a run came to: samples written, median seconds a sample."""
+    """Result of a run: samples written, median seconds a sample."""
 
     samples: int
     seconds_per_sample: float
@@ -41,7 +41,7 @@ def predict_split(
     A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
     run that is not counted warms caches and compiled code up. The submission gives the median over the split.
 
-    Raises `PredictionError` for an ``out`` that holds something else than an unfinished run of the same samples, and
+    Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same samples, and
     `DatasetError` when the dataset lacks a frame that the method needs.
     """
     samples = opened.samples(split)
@@ -67,7 +67,7 @@ def predict_split(
 
 
 def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
-    """The sequence as the method may see it: its own frames, read into memory, and None for every other.
+    """The sequence with the frames that the method uses, read into memory, and None for every other frame.
 
     For a method that uses the ground-truth mask they are 0 outside the object (paper Section 5.3.4).
     """
@@ -88,13 +88,13 @@ def _prepare(out: Path, samples: list[str]) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
-    found = sorted(path.name for path in out.iterdir())
-    foreign = [name for name in found if name not in expected and not name.endswith(".tmp")]
+    file_names = sorted(path.name for path in out.iterdir())
+    foreign = [name for name in file_names if name not in expected and not name.endswith(".tmp")]
     if foreign:
         raise PredictionError(
             f"{out}: already holds {foreign[0]}{' and more' if len(foreign) > 1 else ''}; give a new or empty folder"
         )
-    for name in found:
+    for name in file_names:
         (out / name).unlink()
 
 
@@ -102,7 +102,7 @@ def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int
     if depth_mm.shape != size or depth_mm.dtype != np.float32:
         raise PredictionError(f"{path}: the method gave {depth_mm.dtype} {depth_mm.shape}, expected float32 {size}")
     if not np.isfinite(depth_mm).all():
-        raise PredictionError(f"{path}: the method gave depths that are not finite; that is a fault of the method")
+        raise PredictionError(f"{path}: the method gave depths that are not finite: a fault of the method")
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:
         np.save(file, depth_mm, allow_pickle=False)

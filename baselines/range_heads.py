@@ -23,7 +23,7 @@ TRAIN_PAIRS, VALIDATION_PAIRS = 240, 120
 PIXELS = 128
 """Pixels a training pair of the object, and as many of the background, that the mask is fitted to."""
 MARGIN = 0.25
-"""Depth is held within the training set's range and this share of its width to either side."""
+"""Depth is clipped to the training set's range, widened by this share of its width on either side."""
 RIDGE_STRENGTHS = tuple(10.0 ** (power / 2) for power in range(-8, 9))
 """Candidates, per training pair, on features of unit spread."""
 MASK_DECAY = 1e-6
@@ -61,7 +61,7 @@ def fit_heads(
 
 
 def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str | Path) -> None:
-    """The network of the file ``weights`` with heads fitted on the data it learnt from, as the file ``target``.
+    """Write the network of the file ``weights``, with heads fitted on its training data, as the file ``target``.
 
     Raises as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written.
     """
@@ -83,7 +83,7 @@ class _Batch:
 
 
 class _Pairs:
-    """The chosen pairs of one split, run through the network batch by batch, as often as asked."""
+    """The chosen pairs of one split; each `run` sends them through the network batch by batch."""
 
     def __init__(
         self, network: FringeNetwork, probe: Probe, config: ModelConfig, folder: str | Path, split: str, cap: int,
@@ -94,17 +94,17 @@ class _Pairs:
         if source.size != config.image_size or source.fingerprint != config.dataset_fingerprint:
             raise WeightsError(
                 f"{config.name}: was trained on dataset {config.dataset_fingerprint[:12]} of {config.image_size} px, "
-                f"{folder} is {source.fingerprint[:12]} of {source.size} px; fit them on the data it learnt from"
+                f"{folder} is {source.fingerprint[:12]} of {source.size} px; fit them on its training data"
             )
         # A sample without an object has no depth range.
-        able = [
+        usable = [
             index for index in range(len(self.data))
             if source.measured(self.data.samples[self.data.pair(index)[0]])["depth_max_mm"] > 0
         ]  # fmt: skip
-        if not able:
+        if not usable:
             raise WeightsError(f"{folder}: split {split} holds no object, so there is no range to learn")
-        places = np.linspace(0, len(able) - 1, min(cap, len(able))).round().astype(int)
-        self.order = [able[place] for place in places]
+        places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
+        self.order = [usable[place] for place in places]
         self.network, self.probe, self.name, self.progress = network, probe, config.name, progress
         self.device = next(network.parameters()).device
         height, width = source.size
@@ -133,24 +133,27 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
         layer = train.probe.pixels(train.size).flatten(2)
         for number, depth in enumerate(batch.depth_mm):
             for label in (True, False):
-                there = np.flatnonzero(object_mask(depth) == label)
-                if not there.size:
+                label_pixels = np.flatnonzero(object_mask(depth) == label)
+                if not label_pixels.size:
                     continue
-                chosen = np.sort(rng.choice(there, min(PIXELS, there.size), replace=False))
-                features.append(layer[number][:, torch.from_numpy(chosen)].T.double().cpu())
-                labels.append(np.full(chosen.size, label))
-                # Taken for the other, a pixel costs about its whole depth: what it has, or what it would be given.
-                cost = depth.ravel()[chosen] if label else np.full(chosen.size, batch.range_mm[number].sum())
-                costs.append(cost * (there.size / chosen.size))
-    known = np.concatenate(ranges)
-    lows, highs = known[:, 0], known.sum(axis=1)
+                sampled = np.sort(rng.choice(label_pixels, min(PIXELS, label_pixels.size), replace=False))
+                features.append(layer[number][:, torch.from_numpy(sampled)].T.double().cpu())
+                labels.append(np.full(sampled.size, label))
+                # A wrong label costs about the whole depth: the true depth of a missed object pixel, or the depth that
+                # a background pixel would get.
+                cost = depth.ravel()[sampled] if label else np.full(sampled.size, batch.range_mm[number].sum())
+                costs.append(cost * (label_pixels.size / sampled.size))
+    train_ranges = np.concatenate(ranges)
+    lows, highs = train_ranges[:, 0], train_ranges.sum(axis=1)
     margin = MARGIN * (highs.max() - lows.min())
     mask_weight, mask_bias = _logistic(
         torch.cat(features), torch.from_numpy(np.concatenate(labels)), torch.from_numpy(np.concatenate(costs)).double()
     )
-    seen = [(validation.probe.pooled().numpy(), batch.range_mm) for batch in validation.run()]
-    unseen, truth = (np.concatenate(part) for part in zip(*seen, strict=True))
-    strength, weight, bias, error_mm = _ridge(np.concatenate(pooled), known, unseen, truth)
+    validation_features = [(validation.probe.pooled().numpy(), batch.range_mm) for batch in validation.run()]
+    validation_pooled, validation_ranges = (np.concatenate(part) for part in zip(*validation_features, strict=True))
+    strength, weight, bias, error_mm = _ridge(
+        np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges
+    )
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
         mean_range_mm=torch.from_numpy(mean),
@@ -171,7 +174,7 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     best = {twin: tally.best() for twin, tally in tallies.items()}
     heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
     report = HeadReport(
-        mean_range_error_mm=_range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), truth),
+        mean_range_error_mm=_range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges),
         predicted_range_error_mm=error_mm,
         mask_iou=best["predicted"][2],
         mean_overall_mae_mm=best["mean"][1],
@@ -182,31 +185,34 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     return heads
 
 
-def _range_error_mm(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+def _range_error_mm(predicted: NDArray[np.float64], ranges: NDArray[np.float64]) -> float:
     """Mean of (|error of D_min| + |error of D_max|) / 2, from D_min and span."""
-    error = found - truth
+    error = predicted - ranges
     return float(np.mean(np.abs(error[:, 0]) + np.abs(error.sum(axis=1))) / 2)
 
 
 def _ridge(
-    pooled: NDArray[np.float64], known: NDArray[np.float64], unseen: NDArray[np.float64], truth: NDArray[np.float64]
+    pooled: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    validation_pooled: NDArray[np.float64],
+    validation_ranges: NDArray[np.float64],
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
     """Strength of least `_range_error_mm` on ``unseen`` (N, F) against ``truth`` (N, 2), weight (F, 2), bias (2,) and
     that error."""
     centre, spread = pooled.mean(axis=0), pooled.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
-    target = known.mean(axis=0)
+    target = ranges.mean(axis=0)
     u, s, vt = np.linalg.svd((pooled - centre) / scale, full_matrices=False)
-    aligned = u.T @ (known - target)
-    found = []
+    aligned = u.T @ (ranges - target)
+    candidates = []
     for strength in RIDGE_STRENGTHS:
         shrunk = s / (s * s + strength * len(pooled))
         weight = (vt.T @ (shrunk[:, None] * aligned)) / scale[:, None]
         bias = target - centre @ weight
-        guess = unseen @ weight + bias
-        guess[:, 1] = np.maximum(guess[:, 1], 0.0)
-        found.append((_range_error_mm(guess, truth), strength, weight, bias))
-    error_mm, strength, weight, bias = min(found, key=lambda candidate: candidate[0])
+        predicted = validation_pooled @ weight + bias
+        predicted[:, 1] = np.maximum(predicted[:, 1], 0.0)
+        candidates.append((_range_error_mm(predicted, validation_ranges), strength, weight, bias))
+    error_mm, strength, weight, bias = min(candidates, key=lambda candidate: candidate[0])
     return strength, weight, bias, error_mm
 
 
@@ -215,10 +221,10 @@ def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, 
     pixel's loss times what it costs to get it wrong."""
     centre, spread = features.mean(0), features.std(0, correction=0)
     scale = torch.where(spread > 0, spread, torch.ones_like(spread))
-    known = (features - centre) / scale
+    scaled = (features - centre) / scale
     share = costs / costs.sum()
     sign = labels.double() * 2 - 1
-    parameters = torch.zeros(known.shape[1] + 1, dtype=torch.float64, requires_grad=True)
+    parameters = torch.zeros(scaled.shape[1] + 1, dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS(
         [parameters], max_iter=200, tolerance_grad=1e-9, tolerance_change=1e-12, line_search_fn="strong_wolfe"
     )
@@ -226,7 +232,7 @@ def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, 
     def loss() -> Tensor:
         optimiser.zero_grad()
         with torch.enable_grad():
-            logit = known @ parameters[:-1] + parameters[-1]
+            logit = scaled @ parameters[:-1] + parameters[-1]
             value = (share * functional.softplus(-sign * logit)).sum() + MASK_DECAY * parameters[:-1].square().sum()
             value.backward()
         return value
@@ -238,7 +244,7 @@ def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, 
 
 @dataclass
 class _Tally:
-    """What every threshold on the logit would cost, gathered in bins of `LOGIT_STEP`."""
+    """Change of the absolute error by every threshold on the logit, summed in bins of `LOGIT_STEP`."""
 
     bins: int = round(2 * LOGIT_LIMIT / LOGIT_STEP)
     gain: NDArray[np.float64] = field(init=False)
@@ -250,14 +256,14 @@ class _Tally:
         self.gain, self.inside, self.outside = (np.zeros(self.bins) for _ in range(3))
 
     def add(self, logits: NDArray, depth_mm: NDArray, target_mm: NDArray) -> None:
-        """Pixels (B, H, W): logit, depth they would be given as object, true depth."""
-        place = np.floor((logits.astype(np.float64) + LOGIT_LIMIT) / LOGIT_STEP).clip(0, self.bins - 1).astype(int)
-        place, true = place.ravel(), target_mm.astype(np.float64).ravel()
+        """Pixels (B, H, W): logit, depth that they get as object, true depth."""
+        bins = np.floor((logits.astype(np.float64) + LOGIT_LIMIT) / LOGIT_STEP).clip(0, self.bins - 1).astype(int)
+        bins, true = bins.ravel(), target_mm.astype(np.float64).ravel()
         object_pixels = object_mask(target_mm).ravel()
         gain = np.abs(depth_mm.astype(np.float64).ravel() - true) - true
-        self.gain += np.bincount(place, gain, self.bins)
-        self.inside += np.bincount(place[object_pixels], minlength=self.bins)
-        self.outside += np.bincount(place[~object_pixels], minlength=self.bins)
+        self.gain += np.bincount(bins, gain, self.bins)
+        self.inside += np.bincount(bins[object_pixels], minlength=self.bins)
+        self.outside += np.bincount(bins[~object_pixels], minlength=self.bins)
         self.without += float(true.sum())
 
     def best(self) -> tuple[float, float, float]:
@@ -266,8 +272,8 @@ class _Tally:
         above = np.append(np.cumsum(self.gain[::-1])[::-1], 0.0)
         equal = np.flatnonzero(above == above.min())
         run = equal[: np.flatnonzero(np.diff(equal, append=-1) != 1)[0] + 1]
-        chosen = int(run[len(run) // 2])
+        best_bin = int(run[len(run) // 2])
         pixels = self.inside.sum() + self.outside.sum()
-        hit, false = self.inside[chosen:].sum(), self.outside[chosen:].sum()
+        hit, false = self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
         iou = float(hit / (self.inside.sum() + false))
-        return chosen * LOGIT_STEP - LOGIT_LIMIT, float((self.without + above[chosen]) / pixels), iou
+        return best_bin * LOGIT_STEP - LOGIT_LIMIT, float((self.without + above[best_bin]) / pixels), iou

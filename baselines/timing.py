@@ -1,4 +1,4 @@
-"""How long a method takes, measured: latency of one image, throughput of a batch, memory, on a named machine."""
+"""Measure a method: latency of one image, throughput of a batch, memory, on a named machine."""
 
 import ctypes
 import gc
@@ -52,31 +52,31 @@ def time_method(
     # A batch larger than the split holds its samples again: views, which cost no memory.
     stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
     device = str(getattr(method, "device", "cpu"))
-    wait = _synchronise(device)
+    synchronise = _synchronise(device)
 
-    def one(number: int) -> float:
-        wait()
+    def latency_s(number: int) -> float:
+        synchronise()
         started = perf_counter()
         method.predict(stacks[number % len(stacks)])
-        wait()
+        synchronise()
         return perf_counter() - started
 
     for number in range(WARM_UP):
-        one(number)
-    working_mib = _added_by(lambda: one(0))
+        latency_s(number)
+    working_mib = _added_by(lambda: latency_s(0))
     _reset_gpu_peak(device)
     latencies_ms = []
     for number in range(repeats):
-        latencies_ms.append(1000 * one(number))
+        latencies_ms.append(1000 * latency_s(number))
         progress(1)
-    many, batched = _batch_runner(method)
-    pictures: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
+    run_batch, batched = _batch_runner(method)
+    batch_stacks: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
     rates = []
     for number in range(1 + max(1, -(-repeats // batch))):
-        wait()
+        synchronise()
         started = perf_counter()
-        many(pictures)
-        wait()
+        run_batch(batch_stacks)
+        synchronise()
         if number or not batched:  # the first batch warms the batched path up
             rates.append(batch / (perf_counter() - started))
     low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
@@ -107,11 +107,11 @@ def _digits(value: float) -> float:
 
 
 def _batch_runner(method: Method) -> tuple[Callable[[list[Frames]], Any], bool]:
-    """What predicts a batch, and whether it takes the images at once."""
+    """A function that predicts a batch, and whether it takes all images in one call."""
     at_once = getattr(method, "predict_batch", None)
     if at_once is not None:
         return at_once, True
-    return lambda pictures: [method.predict(frames) for frames in pictures], False
+    return lambda stacks: [method.predict(frames) for frames in stacks], False
 
 
 def _peak_mib() -> float:
@@ -134,7 +134,7 @@ def _added_by(run: Callable[[], Any]) -> float | None:
 
 
 def _give_back_freed_memory() -> None:
-    """What earlier runs freed would hide what the next one takes; glibc gives it back on request (malloc_trim(3))."""
+    """Return memory that earlier runs freed to the system (malloc_trim(3)), so that the next run's use shows."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
@@ -147,7 +147,7 @@ def _status_mib(key: str) -> float:
 
 
 def _synchronise(device: str) -> Callable[[], object]:
-    """What waits until the device has done everything asked of it; a GPU answers before it has."""
+    """A function that waits until the device has finished: calls to a GPU return before their work is done."""
     if not device.startswith("cuda"):
         return lambda: None
     import torch

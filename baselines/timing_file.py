@@ -16,14 +16,18 @@ def check_target(path: Path, method: Method) -> None:
 
     Raises SubmissionError, which says what differs.
     """
-    about = read_result(path).submission if _is_result(path) else _described(path)
-    timed = {"method": method.name, "frames_used": list(method.frames_used), "settings": dict(method.settings)}
-    found = {"method": about.method, "frames_used": sorted(about.frames_used), "settings": dict(about.settings)}
-    for key, value in timed.items():
-        if found[key] != value:
+    submission = read_result(path).submission if _is_result(path) else _described(path)
+    method_entries = {"method": method.name, "frames_used": list(method.frames_used), "settings": dict(method.settings)}
+    file_entries = {
+        "method": submission.method,
+        "frames_used": sorted(submission.frames_used),
+        "settings": dict(submission.settings),
+    }
+    for key, value in method_entries.items():
+        if file_entries[key] != value:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(found[key])}, but {printable(value)} is what would "
-                "be timed; a time belongs to the very method that was scored: give the same options"
+                f"{printable(str(path), 500)}: {key} is {printable(file_entries[key])}, but {printable(value)} would "
+                "be timed; a time belongs to the method that was scored: give the same options"
             )
 
 
@@ -37,8 +41,8 @@ def write_timing(path: Path, timing: Timing) -> None:
     }
     if _is_result(path):
         result = read_result(path)
-        about = Submission.model_validate({**result.submission.model_dump(mode="json"), **measured})
-        write_result(result.model_copy(update={"submission": about}), path)
+        submission = Submission.model_validate({**result.submission.model_dump(mode="json"), **measured})
+        write_result(result.model_copy(update={"submission": submission}), path)
         return
     import yaml
 

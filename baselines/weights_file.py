@@ -1,8 +1,8 @@
-"""Trained weights on disk: one safetensors file that holds the tensors and the configuration that makes sense of them.
+"""Trained weights on disk: one safetensors file with the tensors and the configuration of their network.
 
 The file's metadata is ``format`` (``fpp-ml-bench``), ``version`` and ``config``, a `ModelConfig` as JSON. Tensors whose
 name starts with ``range_head.`` belong to the range heads (`fpp_ml_bench.baselines.metric_twin`), the others are the
-network's ``state_dict``. Pickles (``.pt``, ``.pth``) are never opened: to open one is to run what is in it.
+network's ``state_dict``. Pickles (``.pt``, ``.pth``) are never opened: opening a pickle can run code.
 
 The same tensors and configuration give the same bytes.
 """
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from fpp_ml_bench.baselines.training_data import TrainingBenchmark
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
 from fpp_ml_bench.evaluation.text import printable
@@ -43,10 +44,11 @@ class ModelConfig:
     """What a trained network is, and what it was trained on.
 
     ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is the representation it puts out,
-    ``image_size`` (H, W) in px the only size it is meant for (at another size the fringe period in px is another, and
-    so is the problem). ``data_config`` names the frames it was trained on, ``background_removed`` says that its input
-    is 0 outside the object. ``dataset_fingerprint`` is that of the training data, ``recipe`` the resolved training
-    recipe, ``epoch`` the one whose weights these are, ``validation`` its scores.
+    ``image_size`` (H, W) in px the only size it is meant for (the fringe period in px depends on the size).
+    ``data_config`` names the frames it was trained on, ``background_removed`` says that its input is 0 outside the
+    object. ``dataset_fingerprint`` is that of the training data, ``benchmark`` its name and version
+    (None for a dataset of the user's own, and in older files), ``recipe`` the resolved training recipe, ``epoch`` the
+    epoch of these weights, ``validation`` its scores.
 
     Raises ``ValueError`` for a value of the wrong type, an unknown normalisation or configuration.
     """
@@ -58,6 +60,7 @@ class ModelConfig:
     normalisation: Normalisation
     image_size: tuple[Pixels, Pixels]
     dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    benchmark: TrainingBenchmark | None = None
     data_config: Text = "single_shot"
     background_removed: bool = False
     recipe: dict[Text, Any] = field(default_factory=dict)
@@ -101,21 +104,23 @@ def save_weights(
     if clash is not None:
         raise WeightsError(f"{_shown(path)}: the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
     _check_tensors(path, config, tensors)
-    held = {HEAD_PREFIX + name: tensor.detach().cpu().contiguous().clone() for name, tensor in (heads or {}).items()}
-    _check_finite(path, held)
+    head_tensors = {
+        HEAD_PREFIX + name: tensor.detach().cpu().contiguous().clone() for name, tensor in (heads or {}).items()
+    }
+    _check_finite(path, head_tensors)
     metadata = {"format": FORMAT, "version": VERSION, "config": _CONFIG.dump_json(config).decode("utf-8")}
     from fpp_ml_bench.loaders.manifest import write_atomically
 
     try:
-        write_atomically(path, _ordered_header(save({**tensors, **held}, metadata)))
+        write_atomically(path, _ordered_header(save({**tensors, **head_tensors}, metadata)))
     except OSError as error:
         raise WeightsError(f"{_shown(path)} can't be written: {error.strerror}; give a folder that exists") from None
 
 
 def read_weights(path: str | Path) -> "tuple[ModelConfig, dict[str, Tensor]]":
     """Configuration and network tensors of a file, ready for ``load_state_dict``. Raises `WeightsError`."""
-    found = open_weights(path)
-    return found.config, found.tensors
+    weights = open_weights(path)
+    return weights.config, weights.tensors
 
 
 def open_weights(path: str | Path) -> WeightsFile:
@@ -136,10 +141,10 @@ def open_weights(path: str | Path) -> WeightsFile:
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
     config = _config(path, metadata)
-    held = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
+    head_tensors = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
     _check_tensors(path, config, tensors)
-    _check_finite(path, held)
-    heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in held.items()}
+    _check_finite(path, head_tensors)
+    heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in head_tensors.items()}
     return WeightsFile(path, config, tensors, heads, sha256(data).hexdigest())
 
 
@@ -149,8 +154,8 @@ def shipped_names(folder: Path | None = None) -> list[str]:
 
 
 def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
-    """Path of the file that ``name_or_path`` means: a path where it ends in ``.safetensors`` or leads somewhere, else
-    a name that ships in ``folder`` (None: `SHIPPED`). Raises `WeightsError`, listing what ships, for any other."""
+    """Path of the file that ``name_or_path`` means: a path if it ends in ``.safetensors`` or exists, else the name of
+    weights in ``folder`` (None: `SHIPPED`). Raises `WeightsError` for an unknown name and lists the known ones."""
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(SUFFIX) or "/" in text or "\\" in text:
         return Path(name_or_path)
@@ -160,8 +165,8 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
         return Path(text)
     from difflib import get_close_matches
 
-    near = get_close_matches(text, names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names) or 'none'};"
+    closest = get_close_matches(text, names, n=1)
+    hint = f"did you mean {closest[0]!r}?" if closest else f"there are {', '.join(names) or 'none'};"
     raise WeightsError(
         f"no weights called {printable(text, 100)!r} come with this package; {hint} or give the path of a {SUFFIX} file"
     )
@@ -169,8 +174,8 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
 
 def _read(path: Path) -> bytes:
     if not path.is_file():
-        came = "a folder" if path.is_dir() else "nothing"
-        raise WeightsError(f"{_shown(path)}: expected a weights file (*{SUFFIX}), found {came} there")
+        actual = "a folder" if path.is_dir() else "nothing"
+        raise WeightsError(f"{_shown(path)}: expected a weights file (*{SUFFIX}), found {actual} there")
     try:
         return path.read_bytes()
     except OSError as error:
@@ -242,11 +247,13 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
     for name in expected:
         if name not in tensors:
             raise WeightsError(f"{_shown(path)}: tensor {name} is missing, which {built} has; train or copy it again")
-        want, came = (
+        expected_form, actual_form = (
             f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (expected[name], tensors[name])
         )
-        if want != came:
-            raise WeightsError(f"{_shown(path)}: tensor {name}: expected {want} for {built}, got {came}")
+        if expected_form != actual_form:
+            raise WeightsError(
+                f"{_shown(path)}: tensor {name}: expected {expected_form} for {built}, got {actual_form}"
+            )
     _check_finite(path, tensors)
 
 

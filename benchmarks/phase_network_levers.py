@@ -20,7 +20,7 @@ from phase_route_stages import SHOWN
 
 from fpp_ml_bench.baselines.model import load
 from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
-from fpp_ml_bench.baselines.phase_network.route import Asked, Levers, NetworkRoute
+from fpp_ml_bench.baselines.phase_network.route import AnsweredObservation, Levers, NetworkRoute
 from fpp_ml_bench.baselines.phase_network.weights import DEFAULT
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
@@ -66,13 +66,13 @@ def compare(measurement: Measurement, route: NetworkRoute, target: np.ndarray) -
     }
 
 
-def measure_with_order_of(depth_mm: np.ndarray, observation: Asked, route: NetworkRoute) -> Measurement:
+def measure_with_order_of(depth_mm: np.ndarray, answered: AnsweredObservation, route: NetworkRoute) -> Measurement:
     """The phase route's depth with the candidate order nearest to the order of ``depth_mm``."""
-    seen = observation.seen
+    seen = answered.observation
     depth_order = np.rint((seen.layer.absolute_phase(np.maximum(depth_mm[seen.crop], 1.0)) - seen.phase_rad) / TAU)
     first, count = seen.candidates.first, seen.candidates.count
     order = np.clip(depth_order, first, first + np.maximum(count, 1) - 1).astype(np.int32)
-    return route.geometry.route.conclude(seen, order, np.zeros_like(observation.margin))
+    return route.geometry.route.conclude(seen, order, np.zeros_like(answered.margin))
 
 
 def unet(size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:

@@ -130,10 +130,10 @@ def test_methods_by_name(opened):
 
 
 def test_prediction_folder(opened, tmp_path):
-    out, seen = tmp_path / "out", []
+    out, samples_done = tmp_path / "out", []
     classical = ClassicalMethod(opened.rig, "vertical", 4)
-    run = predict_split(opened, classical, "validation", out, seen.append)
-    assert run.samples == 6 and run.seconds_per_sample > 0 and seen == [1] * 6
+    run = predict_split(opened, classical, "validation", out, samples_done.append)
+    assert run.samples == 6 and run.seconds_per_sample > 0 and samples_done == [1] * 6
     assert sorted(p.name for p in out.iterdir()) == sorted(
         [*(f"mug_A{a}.npy" for a in range(0, 360, 60)), "submission.yaml"]
     )

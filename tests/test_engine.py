@@ -62,17 +62,17 @@ def test_the_same_bits_again(uninterrupted, tiny, tmp_path):
     again = train(small(), tiny, tmp_path / "run", show=False)
     assert again.weights.read_bytes() == uninterrupted.weights.read_bytes()
     assert curve_of(again) == curve_of(uninterrupted)
-    other = train(small(seed=43, max_epochs=1), tiny, tmp_path / "other", show=False)
-    assert curve_of(other) != curve_of(uninterrupted)[:1]
+    of_another_seed = train(small(seed=43, max_epochs=1), tiny, tmp_path / "other", show=False)
+    assert curve_of(of_another_seed) != curve_of(uninterrupted)[:1]
 
 
 @pytest.mark.parametrize("batch_of_the_kill", [0, 3])
 def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monkeypatch, batch_of_the_kill):
-    seen = []
+    batches = []
 
     def kill(self):
-        seen.append(1)
-        if len(seen) == batch_of_the_kill + 1:
+        batches.append(1)
+        if len(batches) == batch_of_the_kill + 1:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):

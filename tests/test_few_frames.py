@@ -43,26 +43,26 @@ def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) 
     x, y = RIG.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
     lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, Lighting())
-    wanted = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
+    indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
     pixels = np.arange(x.size, dtype=np.uint32)
-    images = Exposure.of(RIG, Noise.of_sigma(noise)).expose(wanted, lit, pixels, (7, "plane", 0))
-    found: list[np.ndarray | None] = [None] * len(RIG.sequence)
-    for index, image in zip(wanted, images, strict=True):
-        found[index] = image.reshape(x.shape)
-    return found
+    images = Exposure.of(RIG, Noise.of_sigma(noise)).expose(indices, lit, pixels, (7, "plane", 0))
+    frames: list[np.ndarray | None] = [None] * len(RIG.sequence)
+    for index, image in zip(indices, images, strict=True):
+        frames[index] = image.reshape(x.shape)
+    return frames
 
 
 def scene(left_m: float, right_m: float) -> list[np.ndarray | None]:
     """A block before the calibrated plane, its left and right half at two distances."""
-    found: list[np.ndarray | None] = []
+    frames: list[np.ndarray | None] = []
     for back, left, right in zip(plane(RIG.background_m), plane(left_m), plane(right_m), strict=True):
         if back is None or left is None or right is None:
-            found.append(None)
+            frames.append(None)
             continue
         image, both = back.copy(), np.where(np.arange(SIZE) < HALF, left, right)
         image[OBJECT] = both[OBJECT]
-        found.append(image)
-    return found
+        frames.append(image)
+    return frames
 
 
 def exact_mm(left_m: float, right_m: float) -> np.ndarray:
@@ -98,21 +98,21 @@ def test_two_frames_solve_the_tied_fringe() -> None:
     assert np.abs(fit.phase_rad - phase)[inner].max() < 0.08  # where both are dark; a hundredth elsewhere
     assert np.abs(fit.phase_rad - phase)[inner].mean() < 0.01
     assert np.abs(fit.brightness - bright)[inner].mean() < 0.2
-    one = pair_fit(greys[:1], shifts[:1], np.ones(phase.shape, bool), start, 6.0, [Window(1.5)] * 3)
-    assert np.abs(one.phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
+    single = pair_fit(greys[:1], shifts[:1], np.ones(phase.shape, bool), start, 6.0, [Window(1.5)] * 3)
+    assert np.abs(single.phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("frames", [3, 4, 18])
 def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> None:
-    found = made(frames, direction).measure(plane(1.8, direction))
+    measurement = made(frames, direction).measure(plane(1.8, direction))
     middle = (slice(150, 330), slice(150, 330))
-    error = (found.depth_mm - 1800)[middle].astype(np.float64)
-    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(found.modulation[middle].mean()), 1.0)
+    error = (measurement.depth_mm - 1800)[middle].astype(np.float64)
+    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation[middle].mean()), 1.0)
     # Rounding adds a twelfth of a squared level to the noise; unequal steps weigh noise a little unevenly.
     assert 0.9 < error.std() / expected < 1.15
     assert abs(error.mean()) < 3 * expected / 180 + 0.05
-    assert (found.expected_error_mm - found.order_doubt_mm)[middle].mean() == pytest.approx(
+    assert (measurement.expected_error_mm - measurement.order_doubt_mm)[middle].mean() == pytest.approx(
         np.abs(error).mean(), rel=0.25
     )
 
@@ -120,10 +120,10 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
 @pytest.mark.parametrize("distance_m", [1.55, 1.8, 2.05])
 @pytest.mark.parametrize("frames", [2, 3])
 def test_a_plane_is_at_its_distance_without_gray_code(frames: int, distance_m: float) -> None:
-    found = made(frames).measure(plane(distance_m))
-    lit = found.modulation > 5
+    measurement = made(frames).measure(plane(distance_m))
+    lit = measurement.modulation > 5
     assert lit.mean() > 0.7
-    assert np.abs(found.depth_mm - distance_m * 1000)[lit].mean() < 1.5
+    assert np.abs(measurement.depth_mm - distance_m * 1000)[lit].mean() < 1.5
 
 
 def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
@@ -132,10 +132,10 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
     band = (slice(120, 360), slice(HALF - 4, HALF + 4))
     off = {}
     for count in (1, 2, 3):
-        found = made(count).measure(frames)
-        off[count] = np.abs(found.depth_mm - truth)[band].mean()
-        there = found.depth_mm > 0
-        assert (there != (truth > 0)).mean() < 0.004
+        measurement = made(count).measure(frames)
+        off[count] = np.abs(measurement.depth_mm - truth)[band].mean()
+        on_object = measurement.depth_mm > 0
+        assert (on_object != (truth > 0)).mean() < 0.004
     assert off[3] < 1.5
     assert off[2] < 0.5 * off[1]
     assert off[1] > 5 * off[3]
@@ -143,18 +143,18 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
 
 def test_frames_are_added_until_the_stated_error_is_expected() -> None:
     frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
-    every = FewestFrames(RIG, 1e-3).choose(frames).looks
-    assert [(one.frames, one.gray) for one in every] == [(1, False), (2, False), (3, False), (6, False), (18, False),
+    looks = FewestFrames(RIG, 1e-3).choose(frames).looks
+    assert [(look.frames, look.gray) for look in looks] == [(1, False), (2, False), (3, False), (6, False), (18, False),
                                                          (25, True)]  # fmt: skip
     # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
-    assert every[0].expected_mm > 2 * every[1].expected_mm
-    assert every[2].expected_mm == pytest.approx(every[4].expected_mm * 6**0.5, rel=0.2)
+    assert looks[0].expected_mm > 2 * looks[1].expected_mm
+    assert looks[2].expected_mm == pytest.approx(looks[4].expected_mm * 6**0.5, rel=0.2)
     for place in (0, 1):
-        error_mm = 1.001 * every[place].expected_mm
+        error_mm = 1.001 * looks[place].expected_mm
         chosen = FewestFrames(RIG, error_mm).choose(frames)
-        assert chosen.looks == every[: len(chosen.looks)]
+        assert chosen.looks == looks[: len(chosen.looks)]
         assert chosen.looks[-1].expected_mm <= error_mm
-        assert all(one.expected_mm > error_mm for one in chosen.looks[:-1])
+        assert all(look.expected_mm > error_mm for look in chosen.looks[:-1])
         assert len(chosen.frames_used) == chosen.looks[-1].frames
         assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
         assert chosen.report()["frames"] == len(chosen.frames_used)
@@ -164,7 +164,7 @@ def test_doubt_about_the_order_asks_for_the_gray_code() -> None:
     frames, truth = scene(1.8, 1.8), exact_mm(1.8, 1.8)
     chosen = FewestFrames(RIG, 2.0, shading=False).choose(frames)  # nothing but the range: two orders are as good
     assert chosen.looks[-1].gray and chosen.looks[-1].frames == 3 + RIG.sequence.bits("horizontal")
-    assert not any(one.gray for one in chosen.looks[:-1])
+    assert not any(look.gray for look in chosen.looks[:-1])
     assert chosen.looks[-2].order_mm > 2.0
     assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
 
@@ -227,6 +227,6 @@ def test_reports_lie_beside_the_predictions(tmp_path: Path) -> None:
     predict_split(opened, Reporting(), "test", out)
     reports = json.loads((out / REPORTS_FILE).read_text())
     assert list(reports) == opened.samples("test")
-    mean = np.mean([one["frames"] for one in reports.values()])
+    mean = np.mean([report["frames"] for report in reports.values()])
     assert read_submission(out).settings == {"error_mm": 3.0, "frames_mean": mean}
     assert len(evaluate(out, opened, "test").per_sample) == 2

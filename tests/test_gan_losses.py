@@ -60,8 +60,8 @@ def test_scale_invariant_log_at_its_ends():
     assert torch.autograd.gradcheck(lambda p: gan_losses.scale_invariant_log(p, target), prediction)
     for level in (-0.5, 0.0, 1.0):
         flat = torch.full_like(target, level).requires_grad_()
-        for other in (target, torch.zeros_like(target), torch.ones_like(target)):
-            value = gan_losses.scale_invariant_log(flat, other)
+        for depth in (target, torch.zeros_like(target), torch.ones_like(target)):
+            value = gan_losses.scale_invariant_log(flat, depth)
             value.backward()
             assert value.isfinite() and value >= 0
             assert flat.grad.isfinite().all()

@@ -70,6 +70,8 @@ def test_float32_sums_hold_at_full_size_in_mm(name):
     expected = loss_function(name)(shifted.double(), target.double())
     value = loss_function(name)(shifted, target)
     assert value.dtype == torch.float32
+    # Torch adds n terms in a tree of log2(n) levels, each with a rounding of eps / 2: 22 levels for 3.7 million pixels
+    # make 1.3e-6 at worst, if all roundings have one sign; 6e-8 was measured.
     assert value.item() == pytest.approx(expected.item(), rel=1e-6)
 
 
@@ -90,6 +92,7 @@ def test_half_precision_overflows_nowhere(name, alpha, dtype, scale):
     value = loss_function(name, alpha)(prediction, target)
     value.backward()
     assert value.dtype == torch.float32
+    # Sums of 462 float32 terms, in whatever order: 84 eps, where 462 is the most that any order can lose.
     assert value.item() == pytest.approx(paper(name, alpha, prediction.detach().float(), target.float()), rel=1e-5)
     assert prediction.grad.dtype == dtype
     assert prediction.grad.isfinite().all() and prediction.grad.any()
@@ -201,9 +204,9 @@ def test_wrong_names_and_alphas_are_refused():
 def test_wrong_tensors_are_refused(name, alpha):
     loss = loss_function(name, alpha)
     prediction, target = images()
-    for other in (target[:, 0], target[:1], target[..., :-1], target.expand(3, 2, 11, 14)):
+    for wrong_shape in (target[:, 0], target[:1], target[..., :-1], target.expand(3, 2, 11, 14)):
         with pytest.raises(ValueError, match=r"of one shape \(B, 1, H, W\)"):
-            loss(prediction, other)
+            loss(prediction, wrong_shape)
     for empty in (prediction[:0], prediction[..., :0]):
         with pytest.raises(ValueError, match="not empty"):
             loss(empty, empty)

@@ -35,14 +35,14 @@ class Discriminator(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.seen = []
+        self.inputs = []
         self.scales = nn.ModuleList(
             nn.ModuleList([nn.Conv2d(2, 8, 4, 2, 1), nn.Conv2d(8, 8, 4, 2, 1), nn.Conv2d(8, 1, 4, 1, 1)])
             for _ in range(2)
         )
 
     def forward(self, pair):
-        self.seen.append(pair.detach())
+        self.inputs.append(pair.detach())
         answers = []
         for layers in self.scales:
             features = [pair]
@@ -96,17 +96,17 @@ def weights(module):
 
 
 def test_regression_is_its_loss_on_its_network():
-    network, one = Generator(), batch()
+    network, sample_batch = Generator(), batch()
     objective = Regression(network, "hybrid_l1", 0.7)
     assert list(objective.modules) == ["network"]
-    [(name, loss, logged)] = objective.steps(one)
-    expected = loss_function("hybrid_l1", 0.7)(network(one.fringe), one.depth)
+    [(name, loss, logged)] = objective.steps(sample_batch)
+    expected = loss_function("hybrid_l1", 0.7)(network(sample_batch.fringe), sample_batch.depth)
     assert name == "network"
     assert loss == expected and loss.requires_grad
     assert logged == {"loss": expected.detach()}
-    prediction = network(one.fringe).detach()
-    values = objective.validation_losses(prediction, one)
-    assert torch.equal(values, sample_losses("hybrid_l1", 0.7, prediction, one.depth)) and values.shape == (2,)
+    prediction = network(sample_batch.fringe).detach()
+    values = objective.validation_losses(prediction, sample_batch)
+    assert torch.equal(values, sample_losses("hybrid_l1", 0.7, prediction, sample_batch.depth)) and values.shape == (2,)
 
 
 def test_regression_learns():
@@ -192,8 +192,8 @@ def test_the_discriminator_learns_on_two_fixed_distributions():
     assert not torch.equal(weights(objective.modules["discriminator"]), before)
     with torch.no_grad():
         unseen = batch(seed=1000)
-        made = objective.modules["network"](unseen.fringe)
-        for depth, expected in ((made, 0.0), (unseen.depth, 1.0)):
+        predicted = objective.modules["network"](unseen.fringe)
+        for depth, expected in ((predicted, 0.0), (unseen.depth, 1.0)):
             pair = torch.cat([unseen.fringe, depth], 1) * 2 - 1
             for scale in objective.modules["discriminator"](pair):
                 assert scale[-1].mean().item() == pytest.approx(expected, abs=0.3)
@@ -211,20 +211,20 @@ def test_the_generator_learns_from_the_discriminator_alone():
 
 
 def test_the_discriminator_sees_fringe_and_depth_in_minus_one_to_one():
-    one, discriminator = batch(), Discriminator()
+    sample_batch, discriminator = batch(), Discriminator()
     objective = Adversarial(Generator(), discriminator)
-    made = objective.modules["network"](one.fringe).detach()
-    list(objective.steps(one))
-    both, generated, real = discriminator.seen
-    assert torch.equal(both, torch.cat([generated, real]))
-    assert torch.equal(real, torch.cat([one.fringe * 2 - 1, one.depth * 2 - 1], dim=1))
-    assert torch.equal(generated, torch.cat([one.fringe * 2 - 1, made * 2 - 1], dim=1))
+    predicted = objective.modules["network"](sample_batch.fringe).detach()
+    list(objective.steps(sample_batch))
+    pairs, generated, real = discriminator.inputs
+    assert torch.equal(pairs, torch.cat([generated, real]))
+    assert torch.equal(real, torch.cat([sample_batch.fringe * 2 - 1, sample_batch.depth * 2 - 1], dim=1))
+    assert torch.equal(generated, torch.cat([sample_batch.fringe * 2 - 1, predicted * 2 - 1], dim=1))
 
 
 def test_the_generators_loss_is_the_weighted_sum():
     objective = Adversarial(Generator(), Discriminator())
-    (_, discriminator_loss, seen), (_, loss, terms) = objective.steps(batch())
-    halves = seen["discriminator_generated"] + seen["discriminator_real"]
+    (_, discriminator_loss, parts), (_, loss, terms) = objective.steps(batch())
+    halves = parts["discriminator_generated"] + parts["discriminator_real"]
     assert discriminator_loss.item() == pytest.approx(halves.item() / 2)
     expected = {"adversarial": 1, "feature_matching": 10, "l1": 10, "gradient_l1": 5, "scale_invariant_log": 2}
     assert set(terms) == {"loss", *expected}
@@ -233,19 +233,19 @@ def test_the_generators_loss_is_the_weighted_sum():
 
 
 def test_validation_looks_at_depth_alone():
-    one, objective = batch(), Adversarial(Generator(), Discriminator())
-    prediction = torch.rand_like(one.depth)
-    expected = (prediction - one.depth).abs().mean((1, 2, 3))
-    assert torch.allclose(objective.validation_losses(prediction, one), expected)
+    sample_batch, objective = batch(), Adversarial(Generator(), Discriminator())
+    prediction = torch.rand_like(sample_batch.depth)
+    expected = (prediction - sample_batch.depth).abs().mean((1, 2, 3))
+    assert torch.allclose(objective.validation_losses(prediction, sample_batch), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_gradients_are_finite_without_an_object(dtype):
     objective = Adversarial(Generator().to(dtype), Discriminator().to(dtype))
-    one = batch(empty=True)
+    sample_batch = batch(empty=True)
     for constant in (0.0, 1.0):
-        fringe = torch.full_like(one.fringe, constant).to(dtype)
-        for name, loss, _ in objective.steps(one._replace(fringe=fringe, depth=one.depth.to(dtype))):
+        fringe = torch.full_like(sample_batch.fringe, constant).to(dtype)
+        for name, loss, _ in objective.steps(sample_batch._replace(fringe=fringe, depth=sample_batch.depth.to(dtype))):
             assert loss.dtype == torch.float32 and loss.isfinite()
             objective.modules[name].zero_grad()
             loss.backward()
@@ -256,9 +256,9 @@ def test_gradients_are_finite_without_an_object(dtype):
 def test_nan_reaches_the_loss(place):
     objective = Adversarial(Generator(), Discriminator())
     for field in ("fringe", "depth"):
-        one = batch()
-        getattr(one, field)[0, 0][place] = math.nan
-        for _, loss, _ in objective.steps(one):
+        sample_batch = batch()
+        getattr(sample_batch, field)[0, 0][place] = math.nan
+        for _, loss, _ in objective.steps(sample_batch):
             assert loss.isnan()
 
 
@@ -294,18 +294,18 @@ def test_one_autocast_around_both_steps_uses_the_updated_discriminator():
         torch.manual_seed(3)
         objective = Adversarial(Generator(), Discriminator())
         optimiser = optimisers(objective, 0.01)
-        seen = []
+        logged = []
         with torch.autocast("cpu", torch.bfloat16, enabled=around_all):
             steps = objective.steps(batch())
             while True:
                 with torch.autocast("cpu", torch.bfloat16):
                     name, loss, values = next(steps, (None, None, None))
                 if name is None:
-                    return seen
+                    return logged
                 optimiser[name].zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser[name].step()
-                seen.append({key: value.item() for key, value in values.items()})
+                logged.append({key: value.item() for key, value in values.items()})
 
     assert losses(around_all=True) == losses(around_all=False)
 

@@ -45,31 +45,36 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     """Every depth is a candidate of the working range, moved by at most the bound, whatever the weights."""
     bound = 0.5
     settings = Settings(direction=direction)
-    learned = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
+    network_route = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    asked = learned.observe(image)
-    found = learned.conclude(asked)
-    seen, here = asked.seen, found.depth_mm[asked.seen.crop] > 0
-    assert here.sum() > 3000
-    absolute = seen.layer.absolute_phase(np.where(here, found.depth_mm[seen.crop], 1000.0))
-    order = np.rint((absolute - seen.phase_rad) / TAU)
-    off = (absolute - seen.phase_rad - TAU * order)[here]
-    assert np.abs(off).max() < bound + 1e-3
-    assert np.abs(off).max() > 0.9 * bound  # it did try
-    allowed = (order >= seen.candidates.first) & (order < seen.candidates.first + seen.candidates.count)
-    allowed |= order == asked.base
-    assert allowed[here].all()
-    assert len(np.unique((order - asked.base)[here])) > 1
+    answered = network_route.observe(image)
+    measurement = network_route.conclude(answered)
+    observation, on_object = answered.observation, measurement.depth_mm[answered.observation.crop] > 0
+    assert on_object.sum() > 3000
+    absolute = observation.layer.absolute_phase(np.where(on_object, measurement.depth_mm[observation.crop], 1000.0))
+    order = np.rint((absolute - observation.phase_rad) / TAU)
+    correction = (absolute - observation.phase_rad - TAU * order)[on_object]
+    assert np.abs(correction).max() < bound + 1e-3
+    assert np.abs(correction).max() > 0.9 * bound  # it did try
+    allowed = (order >= observation.candidates.first) & (
+        order < observation.candidates.first + observation.candidates.count
+    )
+    allowed |= order == answered.base
+    assert allowed[on_object].all()
+    assert len(np.unique((order - answered.base)[on_object])) > 1
 
 
 def test_without_its_levers_it_is_the_measured_route() -> None:
     image = photograph("cork", "A60").frames[0]
-    off = Levers(order=False, mask=False, phase=False)
-    measured, found = PhaseRoute(RIG, Settings()).measure(image), NetworkRoute(RIG, Settings(), wild(0.5), levers=off)
-    same = found.measure(image)
-    assert np.array_equal(same.depth_mm, measured.depth_mm)
-    assert np.array_equal(same.order, measured.order)
-    assert np.array_equal(same.confidence, measured.confidence)
+    no_levers = Levers(order=False, mask=False, phase=False)
+    measured, network_route = (
+        PhaseRoute(RIG, Settings()).measure(image),
+        NetworkRoute(RIG, Settings(), wild(0.5), levers=no_levers),
+    )
+    measurement = network_route.measure(image)
+    assert np.array_equal(measurement.depth_mm, measured.depth_mm)
+    assert np.array_equal(measurement.order, measured.order)
+    assert np.array_equal(measurement.confidence, measured.confidence)
 
 
 def test_an_empty_scene_has_no_depth() -> None:
@@ -83,31 +88,31 @@ def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None
     """Where the UNet collapses to background; at the benchmark's resolution, without background in view."""
     rig = part_of(paper_rig(960), 240)
     image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
-    found = PhaseNetMethod(rig, direction).route.measure(image)
-    assert (found.depth_mm > 0).mean() > 0.98
-    assert np.abs(found.depth_mm - 1000 * distance_m)[found.depth_mm > 0].mean() < 2.0
+    measurement = PhaseNetMethod(rig, direction).route.measure(image)
+    assert (measurement.depth_mm > 0).mean() > 0.98
+    assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
 
 
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
 def test_objects_at_unknown_distance_also_on_another_rig(rig: Rig) -> None:
     row = photograph("cracker_box", "A60", rig)
-    found = PhaseNetMethod(rig).route.measure(row.frames[0])
+    measurement = PhaseNetMethod(rig).route.measure(row.frames[0])
     target = row.depth_mm > 0
-    error = np.abs(found.depth_mm - row.depth_mm)[target]
+    error = np.abs(measurement.depth_mm - row.depth_mm)[target]
     assert np.median(error) < 3
     assert (error > 100).mean() < 0.02
-    assert (found.depth_mm[~target] > 0).mean() < 0.02
-    assert sum(found.counts.values()) == target.size
+    assert (measurement.depth_mm[~target] > 0).mean() < 0.02
+    assert sum(measurement.counts.values()) == target.size
 
 
 def test_method_is_registered_and_reports_itself() -> None:
-    made = method("phase-net", RIG, direction="vertical")
-    assert made.frames_used == (18,) and made.uses_ground_truth_range is False
-    assert "learned" in made.title and made.settings["weights_sha256"] == load_net().sha256
-    assert 100_000 < made.parameters < 1_000_000  # type: ignore[attr-defined]
+    phase_net = method("phase-net", RIG, direction="vertical")
+    assert phase_net.frames_used == (18,) and phase_net.uses_ground_truth_range is False
+    assert "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
+    assert 100_000 < phase_net.parameters < 1_000_000  # type: ignore[attr-defined]
     frames: list = [None] * 52
     frames[18] = photograph("cork", "A60").frames[18]
-    depth_mm = made.predict(frames)
+    depth_mm = phase_net.predict(frames)
     assert depth_mm.dtype == np.float32 and depth_mm.shape == (480, 480) and (depth_mm > 0).any()
 
 

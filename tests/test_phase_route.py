@@ -61,20 +61,20 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
     tilt = (0.1, -0.06)
     depth_m = plane_depth_m(rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt)
     for exact_m, slope in ((plane_depth_m(rig, distance_m), (0.0, 0.0)), (depth_m, tilt)):
-        found = route(direction, rig).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
-        lit = found.modulation > 5
+        measurement = route(direction, rig).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
+        lit = measurement.modulation > 5
         assert lit.mean() > 0.7  # the projector's field ends before the camera's
-        error = np.abs(found.depth_mm - exact_m * 1000)[lit]
+        error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
         assert error.mean() < 1.0
-        assert (found.depth_mm[lit] > 0).all()
+        assert (measurement.depth_mm[lit] > 0).all()
 
 
 def test_a_projector_that_is_turned_and_ahead() -> None:
     exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
-    found = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
-    lit = found.modulation > 5
+    measurement = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
+    lit = measurement.modulation > 5
     assert lit.mean() > 0.7
-    assert np.abs(found.depth_mm - exact_m * 1000)[lit].mean() < 1.0
+    assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
 def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
@@ -82,12 +82,12 @@ def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
     middle = (slice(180, 300), slice(180, 300))
     spread = {}
     for noise in (1.0, 3.0):
-        found = route("vertical").measure(plane_fringe(RIG, 18, exact_m, noise=noise))
-        error = (found.depth_mm - exact_m * 1000)[middle]
+        measurement = route("vertical").measure(plane_fringe(RIG, 18, exact_m, noise=noise))
+        error = (measurement.depth_mm - exact_m * 1000)[middle]
         spread[noise] = error.std()
         sigma_px = Settings().second_window * RIG.image_px_per_period("vertical")
         averaged = int(4 * np.pi * sigma_px**2)
-        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, found.modulation[middle].mean(), noise)
+        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation[middle].mean(), noise)
         # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice the even spread.
         assert 0.6 * predicted < spread[noise] < 2.5 * predicted
     assert 2.2 < spread[3.0] / spread[1.0] < 4
@@ -97,14 +97,14 @@ def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
 @pytest.mark.parametrize("name", ["cork", "cracker_box"])
 def test_objects_at_unknown_distance(name: str, rig: Rig) -> None:
     row = photograph(name, "A60", rig)
-    found = route("horizontal", rig).measure(row.frames[0])
+    measurement = route("horizontal", rig).measure(row.frames[0])
     target = row.depth_mm > 0
-    error = np.abs(found.depth_mm - row.depth_mm)[target]
+    error = np.abs(measurement.depth_mm - row.depth_mm)[target]
     assert np.median(error) < 3
     assert (error > 100).mean() < 0.02  # wrong orders, and object pixels taken for background
-    assert (found.depth_mm[~target] > 0).mean() < 0.02
-    assert found.background_share > 0.2
-    assert sum(found.counts.values()) == target.size
+    assert (measurement.depth_mm[~target] > 0).mean() < 0.02
+    assert measurement.background_share > 0.2
+    assert sum(measurement.counts.values()) == target.size
 
 
 def test_confidence_orders_errors_and_the_strict_mode_uses_it() -> None:
@@ -115,10 +115,10 @@ def test_confidence_orders_errors_and_the_strict_mode_uses_it() -> None:
     error, sure = np.abs(dense.depth_mm - row.depth_mm)[both], dense.confidence[both]
     halves = sure > np.median(sure)
     assert error[halves].mean() < 0.5 * error[~halves].mean()
-    kept = strict.depth_mm > 0
-    assert 0.3 < kept.sum() / both.sum() < 1
-    assert np.array_equal(strict.depth_mm[kept], dense.depth_mm[kept])
-    assert (strict.confidence[kept] >= 0.6).all()
+    confident = strict.depth_mm > 0
+    assert 0.3 < confident.sum() / both.sum() < 1
+    assert np.array_equal(strict.depth_mm[confident], dense.depth_mm[confident])
+    assert (strict.confidence[confident] >= 0.6).all()
     assert strict.counts["unsure"] > 0
 
 
@@ -129,19 +129,19 @@ def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
         places = random.integers(0, len(question.exists), question.inside.shape).astype(np.int32)
         return places, np.zeros(places.shape, np.float32)
 
-    chosen = PhaseRoute(RIG, Settings(), guess)
-    found = chosen.measure(photograph("cork", "A60").frames[0])
-    there = found.depth_mm > 0
-    layer = chosen.layer.at(there)
-    again = layer.depth_mm(found.wrapped_phase[there].astype(np.float64), found.order[there])
-    assert np.abs(again - found.depth_mm[there]).max() < 1e-2
+    random_route = PhaseRoute(RIG, Settings(), guess)
+    measurement = random_route.measure(photograph("cork", "A60").frames[0])
+    on_object = measurement.depth_mm > 0
+    layer = random_route.layer.at(on_object)
+    again = layer.depth_mm(measurement.wrapped_phase[on_object].astype(np.float64), measurement.order[on_object])
+    assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
 
 
 def test_nothing_is_measured_where_nothing_is() -> None:
     empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
-    found = route("horizontal").measure(empty)
-    assert not found.depth_mm.any()
-    assert found.counts["background"] == empty.size
+    measurement = route("horizontal").measure(empty)
+    assert not measurement.depth_mm.any()
+    assert measurement.counts["background"] == empty.size
     dark = np.full((SIZE, SIZE), round(Lighting().ambient_grey), np.uint8)
     assert not route("horizontal").measure(dark).depth_mm.any()
 
@@ -171,20 +171,20 @@ def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     sequence = replace(RIG.sequence, bits_vertical=8)
     rig = replace(RIG, working_range_mm=span, pitch_vertical_px=pitch, sequence=sequence)
     image = plane_fringe(rig, 18, plane_depth_m(rig, 1.8))
-    found = route("vertical", rig).measure(image)
-    lit = found.modulation > 5
-    assert found.candidates.most in ((1, 2) if pitch == 18 else (10, 11))
-    assert np.median(np.abs(found.depth_mm - 1800)[lit]) < 1
+    measurement = route("vertical", rig).measure(image)
+    lit = measurement.modulation > 5
+    assert measurement.candidates.most in ((1, 2) if pitch == 18 else (10, 11))
+    assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1
 
 
 def test_method_is_registered_and_reports_itself() -> None:
-    made = method("phase", RIG, direction="vertical", prior="standoff")
-    assert made.frames_used == (18,)
-    assert made.uses_ground_truth_range is False
-    assert made.settings["prior"] == "standoff" and "standoff" in made.title
+    phase_method = method("phase", RIG, direction="vertical", prior="standoff")
+    assert phase_method.frames_used == (18,)
+    assert phase_method.uses_ground_truth_range is False
+    assert phase_method.settings["prior"] == "standoff" and "standoff" in phase_method.title
     frames: list = [None] * 52
     frames[18] = photograph("cork", "A60").frames[18]
-    depth_mm = made.predict(frames)
+    depth_mm = phase_method.predict(frames)
     assert depth_mm.dtype == np.float32 and depth_mm.shape == (SIZE, SIZE)
 
 

@@ -57,9 +57,9 @@ def test_layer_is_triangulation(rig: Rig, direction: str) -> None:
     absolute = TAU * coordinate / rig.pitch(direction)
     assert np.abs(layer.absolute_phase(z) - absolute).max() < 1e-9
     order = np.floor(absolute / TAU + 0.5)
-    found = layer.depth_mm(absolute - TAU * order, order)
-    assert np.abs(found - z).max() < 1e-6
-    assert np.abs(found - depth_from_coordinate((x, y), coordinate, rig, direction)).max() < 1e-6
+    depth_mm = layer.depth_mm(absolute - TAU * order, order)
+    assert np.abs(depth_mm - z).max() < 1e-6
+    assert np.abs(depth_mm - depth_from_coordinate((x, y), coordinate, rig, direction)).max() < 1e-6
 
 
 def test_layer_to_50_digits() -> None:
@@ -74,8 +74,8 @@ def test_layer_to_50_digits() -> None:
             phase = 2 * mpmath.pi * u / rig.pitch_vertical_px
             order = int(mpmath.floor(phase / (2 * mpmath.pi)))
             wrapped = float(phase - 2 * mpmath.pi * order)
-            one = layer.at((row, column))
-            assert abs(one.depth_mm(wrapped, order) - z) < 1e-9
+            pixel_layer = layer.at((row, column))
+            assert abs(pixel_layer.depth_mm(wrapped, order) - z) < 1e-9
 
 
 def test_torch_equals_numpy_and_has_gradients(rig: Rig) -> None:
@@ -83,16 +83,16 @@ def test_torch_equals_numpy_and_has_gradients(rig: Rig) -> None:
     absolute = layer.absolute_phase(depths(rig))
     order = np.floor(absolute / TAU)
     phase = torch.tensor(absolute - TAU * order)
-    found = module(phase, torch.tensor(order)).numpy()
-    assert np.abs(found - layer.depth_mm(phase.numpy(), order)).max() < 1e-6
+    depth_mm = module(phase, torch.tensor(order)).numpy()
+    assert np.abs(depth_mm - layer.depth_mm(phase.numpy(), order)).max() < 1e-6
     assert not list(module.parameters())
-    some = torch.zeros_like(phase, dtype=torch.bool)
-    some[::40, ::40] = True
+    checked = torch.zeros_like(phase, dtype=torch.bool)
+    checked[::40, ::40] = True
 
     def depth_m(part: torch.Tensor) -> torch.Tensor:
-        return module(phase.masked_scatter(some, part), torch.tensor(order))[some] / 1000
+        return module(phase.masked_scatter(checked, part), torch.tensor(order))[checked] / 1000
 
-    assert torch.autograd.gradcheck(depth_m, phase[some].clone().requires_grad_(), eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(depth_m, phase[checked].clone().requires_grad_(), eps=1e-6, atol=1e-6)
 
 
 def test_float32_keeps_a_hundredth_of_a_millimetre() -> None:
@@ -101,14 +101,16 @@ def test_float32_keeps_a_hundredth_of_a_millimetre() -> None:
     z = depths(rig)
     absolute = layer.absolute_phase(z)
     order = np.floor(absolute / TAU)
-    found = module(torch.tensor(absolute - TAU * order, dtype=torch.float32), torch.tensor(order, dtype=torch.float32))
-    assert found.dtype == torch.float32
-    assert np.abs(found.numpy() - z).max() < 2e-3
+    depth_mm = module(
+        torch.tensor(absolute - TAU * order, dtype=torch.float32), torch.tensor(order, dtype=torch.float32)
+    )
+    assert depth_mm.dtype == torch.float32
+    assert np.abs(depth_mm.numpy() - z).max() < 2e-3
     # The same from the absolute phase in float32 loses most of that: why the residual form exists.
     naive = depth_from_coordinate(
         rig.camera.rays(), absolute.astype(np.float32) * np.float32(18 / TAU), rig, "vertical"
     )
-    assert np.abs(naive - z).max() > 2 * np.abs(found.numpy() - z).max()
+    assert np.abs(naive - z).max() > 2 * np.abs(depth_mm.numpy() - z).max()
 
 
 def test_layer_agrees_with_the_decoder_on_a_real_stack(opened: DatasetFolder) -> None:
@@ -119,9 +121,9 @@ def test_layer_agrees_with_the_decoder_on_a_real_stack(opened: DatasetFolder) ->
     good = decoded.depth_mm > 0
     absolute = measured.coordinate_px * TAU / rig.pitch_vertical_px
     order = np.rint((absolute - measured.phase) / TAU)
-    found = CalibrationLayer.of(rig, "vertical").depth_mm(measured.phase, order)
+    depth_mm = CalibrationLayer.of(rig, "vertical").depth_mm(measured.phase, order)
     assert good.any()
-    assert np.abs(found - decoded.depth_mm)[good].max() < 1e-3
+    assert np.abs(depth_mm - decoded.depth_mm)[good].max() < 1e-3
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])

@@ -48,7 +48,7 @@ class Picture(nn.Module):
         return torch.cat([picture, torch.ones_like(picture)], dim=1)
 
 
-class Told(FringeNetwork):
+class KnownNetwork(FringeNetwork):
     """Reads v off the frame; 0 outside the object."""
 
     name, stride, last_layer = "told", 1, "dec1"
@@ -74,12 +74,12 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config(dataset):
-    return config_of(Told(), image_size=SIZE, dataset_fingerprint=dataset.fingerprint)
+    return config_of(KnownNetwork(), image_size=SIZE, dataset_fingerprint=dataset.fingerprint)
 
 
 @pytest.fixture(scope="module")
 def fitted(dataset, config):
-    return fit_heads(Told(), config, dataset.path)
+    return fit_heads(KnownNetwork(), config, dataset.path)
 
 
 def known_range(dataset, split):
@@ -89,7 +89,7 @@ def known_range(dataset, split):
 
 def test_what_the_frame_tells_is_found(dataset, config, fitted):
     heads = heads_from_tensors(fitted, "told")
-    model = Model(Told().eval(), config, heads, torch.device("cpu"), "0" * 64)
+    model = Model(KnownNetwork().eval(), config, heads, torch.device("cpu"), "0" * 64)
     train, validation = known_range(dataset, "train"), known_range(dataset, "validation")
     np.testing.assert_allclose(heads.mean_range_mm.numpy(), train.mean(axis=0), rtol=1e-12)
     report = heads.validation
@@ -106,23 +106,25 @@ def test_what_the_frame_tells_is_found(dataset, config, fitted):
         by_mean = model.predict(frame, "mean")
         low, high = train.mean(axis=0)
         expected = np.where(depth > 0, np.clip(low + v * (high - low), *limits), 0)
+        # Three roundings of float32 a pixel (product, sum, the value itself), no sum over pixels: 8 eps.
         np.testing.assert_allclose(by_mean, expected, rtol=1e-6)
         predicted = model.predict(frame)
         assert predicted.dtype == np.float32 and not predicted[depth == 0].any()
         assert np.abs(predicted - depth).max() < 250 / STEPS  # half a grey level, and what little the ridge shrinks
         for twin, values in (("predicted", predicted), ("mean", by_mean)):
             errors[twin].append(np.abs(values.astype(float) - depth).mean())
+    # The errors are differences of float32 depths near 1700 mm, 1e-4 mm apart, and some mm on average.
     assert report.predicted_overall_mae_mm == pytest.approx(np.mean(errors["predicted"]), rel=1e-5)
     assert report.mean_overall_mae_mm == pytest.approx(np.mean(errors["mean"]), rel=1e-5)
 
 
 def test_fitting_is_deterministic_and_changes_nothing(dataset, config, fitted):
-    network = Told().train()
+    network = KnownNetwork().train()
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    seen = []
-    again = fit_heads(network, config, dataset.path, seen.append)
+    pairs_done = []
+    again = fit_heads(network, config, dataset.path, pairs_done.append)
     assert all(torch.equal(again[key], fitted[key]) and again[key].dtype == torch.float64 for key in fitted)
-    assert sum(seen) == len(dataset.samples("train")) + 2 * len(dataset.samples("validation"))
+    assert sum(pairs_done) == len(dataset.samples("train")) + 2 * len(dataset.samples("validation"))
     assert network.training and not network.rows._forward_hooks and not network.picture._forward_hooks
     assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
 
@@ -130,8 +132,8 @@ def test_fitting_is_deterministic_and_changes_nothing(dataset, config, fitted):
 def test_depth_is_held_within_limits(config, fitted):
     heads = heads_from_tensors(fitted, "told")
     values = torch.tensor([-100.0, 0.5, 100.0]).reshape(1, 1, 1, 3)
-    found = heads.unmasked_mm(values, torch.tensor([[1700.0, 100.0]]))
-    assert found.flatten().tolist() == pytest.approx([float(heads.limits_mm[0]), 1750.0, float(heads.limits_mm[1])])
+    depth_mm = heads.unmasked_mm(values, torch.tensor([[1700.0, 100.0]]))
+    assert depth_mm.flatten().tolist() == pytest.approx([float(heads.limits_mm[0]), 1750.0, float(heads.limits_mm[1])])
 
 
 @pytest.mark.parametrize("network", ["unet", "resunet"])
@@ -150,14 +152,14 @@ def test_a_real_network_has_what_the_heads_need(dataset, network):
 
 def test_what_can_not_be_fitted(dataset, config):
     with pytest.raises(WeightsError, match="output is metric"):
-        fit_heads(Told(), config_of(Told(), normalisation="raw"), dataset.path)
+        fit_heads(KnownNetwork(), config_of(KnownNetwork(), normalisation="raw"), dataset.path)
     with pytest.raises(WeightsError, match="was trained on dataset 000000"):
-        fit_heads(Told(), config_of(Told(), image_size=SIZE), dataset.path)
-    sick = Told()
-    sick.gain.data.fill_(float("inf"))
+        fit_heads(KnownNetwork(), config_of(KnownNetwork(), image_size=SIZE), dataset.path)
+    diverged = KnownNetwork()
+    diverged.gain.data.fill_(float("inf"))
     with pytest.raises(PredictionError, match="NaN or infinite"):
-        fit_heads(sick, config, dataset.path)
-    assert sick.training
+        fit_heads(diverged, config, dataset.path)
+    assert diverged.training
 
 
 def test_tensors_that_are_no_heads(fitted):
@@ -176,18 +178,25 @@ def test_tensors_that_are_no_heads(fitted):
 
 def test_ridge_solves_the_normal_equations():
     rng = np.random.default_rng(0)
-    known, unseen = rng.normal(3, [1, 5, 0.1], (20, 3)), rng.normal(3, [1, 5, 0.1], (9, 3))
-    truth, other = (
-        x @ rng.normal(size=(3, 2)) + [1700, 150] + rng.normal(0, 0.3, (len(x), 2)) for x in (known, unseen)
+    train_features, validation_features = rng.normal(3, [1, 5, 0.1], (20, 3)), rng.normal(3, [1, 5, 0.1], (9, 3))
+    train_ranges, validation_ranges = (
+        x @ rng.normal(size=(3, 2)) + [1700, 150] + rng.normal(0, 0.3, (len(x), 2))
+        for x in (train_features, validation_features)
     )
-    strength, weight, bias, error_mm = range_heads._ridge(known, truth, unseen, other)
+    strength, weight, bias, error_mm = range_heads._ridge(
+        train_features, train_ranges, validation_features, validation_ranges
+    )
     assert strength in range_heads.RIDGE_STRENGTHS
-    scaled = (known - known.mean(0)) / known.std(0)
-    solved = np.linalg.solve(scaled.T @ scaled + strength * 20 * np.eye(3), scaled.T @ (truth - truth.mean(0)))
-    expected = (unseen - known.mean(0)) / known.std(0) @ solved + truth.mean(0)
-    np.testing.assert_allclose(unseen @ weight + bias, expected, rtol=1e-10)
+    scaled = (train_features - train_features.mean(0)) / train_features.std(0)
+    solved = np.linalg.solve(
+        scaled.T @ scaled + strength * 20 * np.eye(3), scaled.T @ (train_ranges - train_ranges.mean(0))
+    )
+    expected = (validation_features - train_features.mean(0)) / train_features.std(0) @ solved + train_ranges.mean(0)
+    np.testing.assert_allclose(validation_features @ weight + bias, expected, rtol=1e-10)
     assert error_mm == pytest.approx(
-        np.mean(np.abs(np.stack([expected[:, 0], expected.sum(1)]) - [other[:, 0], other.sum(1)]))
+        np.mean(
+            np.abs(np.stack([expected[:, 0], expected.sum(1)]) - [validation_ranges[:, 0], validation_ranges.sum(1)])
+        )
     )
 
 
@@ -221,8 +230,8 @@ def test_the_threshold_is_the_best_one():
 
     assert mae_mm == pytest.approx(mae_at(threshold))
     assert mae_mm == pytest.approx(min(mae_at(limit) for limit in np.arange(-20, 20, range_heads.LOGIT_STEP)))
-    found = logits >= threshold
-    assert iou == pytest.approx((found & (target > 0)).sum() / (found | (target > 0)).sum())
+    is_object = logits >= threshold
+    assert iou == pytest.approx((is_object & (target > 0)).sum() / (is_object | (target > 0)).sum())
 
 
 def test_no_mask_where_every_depth_is_worse_than_none():

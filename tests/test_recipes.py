@@ -70,18 +70,18 @@ def test_the_gan_has_its_own_schedule():
 
 def test_a_recipe_of_yours(tmp_path):
     (tmp_path / "parent.yaml").write_text("extends: loss/l1\noptimizer: {learning_rate: 1e-3}\n")
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("extends: parent.yaml\nseed: 7\nschedule: {patience: 3}\n")
-    recipe = load_recipe(mine, "paper")
-    assert load_recipe(mine, "cpu").optimizer.learning_rate == 1e-3
-    assert load_recipe(mine, "cpu").width == 8
+    own_recipe = tmp_path / "mine.yaml"
+    own_recipe.write_text("extends: parent.yaml\nseed: 7\nschedule: {patience: 3}\n")
+    recipe = load_recipe(own_recipe, "paper")
+    assert load_recipe(own_recipe, "cpu").optimizer.learning_rate == 1e-3
+    assert load_recipe(own_recipe, "cpu").width == 8
     assert (recipe.seed, recipe.loss.name, recipe.optimizer.learning_rate) == (7, "l1", 1e-3)
     assert recipe.optimizer.weight_decay == 1e-5
     assert recipe.schedule == Plateau(name="plateau", factor=0.5, patience=3, minimum=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("learning_rat: 1e-3", "learning_rat: is not a key"),
         ("optimizer: {momentum: 0.9}", "optimizer.momentum: is not a key"),
@@ -108,11 +108,11 @@ def test_a_recipe_of_yours(tmp_path):
         ("batch: 4\nbatch: 5", "is given twice"),
     ],
 )
-def test_refused(tmp_path, text, said):
-    mine = tmp_path / "mine.yaml"
-    mine.write_text(text if "extends" in text or text.startswith("-") else f"extends: base\n{text}")
-    with pytest.raises(RecipeError, match=said):
-        load_recipe(mine)
+def test_refused(tmp_path, text, message):
+    own_recipe = tmp_path / "mine.yaml"
+    own_recipe.write_text(text if "extends" in text or text.startswith("-") else f"extends: base\n{text}")
+    with pytest.raises(RecipeError, match=message):
+        load_recipe(own_recipe)
 
 
 def test_unknown_names():

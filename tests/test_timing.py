@@ -37,7 +37,7 @@ class Scripted:
 
     clock: Clock
     takes: list[float]
-    seen: list = field(default_factory=list)
+    stacks: list = field(default_factory=list)
     name = title = "scripted"
     frames_used = (0,)
     uses_ground_truth_range = False
@@ -45,7 +45,7 @@ class Scripted:
     parameters = 1234
 
     def predict(self, frames):
-        self.seen.append(frames)
+        self.stacks.append(frames)
         self.clock.now += self.takes.pop(0) if self.takes else 1.0
         return np.zeros(frames[0].shape, np.float32)
 
@@ -57,15 +57,15 @@ def test_latency_is_that_of_the_runs_after_warm_up(small, monkeypatch):
     # Warm-up and the memory run are slow and must not show; then eleven runs; then three batches of four.
     method = Scripted(clock, [100.0] * (timing.WARM_UP + 1) + runs[::-1] + [0.25] * 16)
     steps = []
-    found = timing.time_method(small, method, batch=4, repeats=11, progress=steps.append)
-    assert found.latency_median_ms == 6.0 and found.repeats == 11 == len(steps)
-    assert (found.latency_p5_ms, found.latency_p95_ms) == (1.5, 10.5)  # numpy's linear interpolation of 1..11
-    assert found.throughput_per_s == 4.0 and found.batch == 4 and found.batched is False
-    assert found.parameters == 1234 and found.frames == 1 and found.image_size == [32, 40]
-    assert found.provenance == "measured" and found.device == "cpu" and found.gpu_memory_mib is None
-    assert found.hardware.cores >= 1 and "numpy" in found.software
-    for frames in method.seen:
-        assert frames[0] is not None and all(other is None for other in frames[1:])
+    measured = timing.time_method(small, method, batch=4, repeats=11, progress=steps.append)
+    assert measured.latency_median_ms == 6.0 and measured.repeats == 11 == len(steps)
+    assert (measured.latency_p5_ms, measured.latency_p95_ms) == (1.5, 10.5)  # numpy's linear interpolation of 1..11
+    assert measured.throughput_per_s == 4.0 and measured.batch == 4 and measured.batched is False
+    assert measured.parameters == 1234 and measured.frames == 1 and measured.image_size == [32, 40]
+    assert measured.provenance == "measured" and measured.device == "cpu" and measured.gpu_memory_mib is None
+    assert measured.hardware.cores >= 1 and "numpy" in measured.software
+    for frames in method.stacks:
+        assert frames[0] is not None and all(frame is None for frame in frames[1:])
 
 
 def test_a_method_that_takes_batches_gets_them_at_once(small, monkeypatch):
@@ -79,9 +79,9 @@ def test_a_method_that_takes_batches_gets_them_at_once(small, monkeypatch):
             clock.now += 50.0 if len(sizes) == 1 else 0.5  # the first batch warms up
             return [None] * len(stacks)
 
-    found = timing.time_method(small, Batched(clock, []), batch=6, repeats=12)  # more than the split's four samples
-    assert found.batched is True and set(sizes) == {6} and len(sizes) == 3
-    assert found.throughput_per_s == 12.0
+    measured = timing.time_method(small, Batched(clock, []), batch=6, repeats=12)  # more than the split's four samples
+    assert measured.batched is True and set(sizes) == {6} and len(sizes) == 3
+    assert measured.throughput_per_s == 12.0
 
 
 def test_working_memory_is_what_one_prediction_takes(small):
@@ -90,11 +90,11 @@ def test_working_memory_is_what_one_prediction_takes(small):
             self.clock.now += 1.0
             return np.ones(64 * 2**20 // 4, np.float32)[: frames[0].size].reshape(frames[0].shape).copy()
 
-    found = timing.time_method(small, Hungry(Clock(), []), repeats=1, batch=1)
-    if found.working_memory_mib is None:  # a kernel without /proc/self/clear_refs
+    measured = timing.time_method(small, Hungry(Clock(), []), repeats=1, batch=1)
+    if measured.working_memory_mib is None:  # a kernel without /proc/self/clear_refs
         pytest.skip("this kernel does not tell a process's memory peak")
-    assert 60 <= found.working_memory_mib <= 90
-    assert found.peak_memory_mib >= 64
+    assert 60 <= measured.working_memory_mib <= 90
+    assert measured.peak_memory_mib >= 64
 
 
 def test_nothing_to_time_and_frames_that_are_not_there(small):
@@ -140,11 +140,11 @@ def test_command_writes_its_block_everywhere(predicted, capsys):
 
 def test_a_time_is_not_written_into_another_methods_file(predicted, small, tmp_path, capsys):
     arguments, work = predicted
-    kept = (work / "result.json").read_bytes()
-    other = [*arguments[:3], "4", *arguments[4:]]
-    assert main(["time", *other, "--into", str(work / "result.json")]) == 2
+    result_bytes = (work / "result.json").read_bytes()
+    other_arguments = [*arguments[:3], "4", *arguments[4:]]
+    assert main(["time", *other_arguments, "--into", str(work / "result.json")]) == 2
     assert "frames_used is" in capsys.readouterr().err
-    assert (work / "result.json").read_bytes() == kept
+    assert (work / "result.json").read_bytes() == result_bytes
     folder = write_predictions(tmp_path / "p", small)
     assert main(["time", *arguments, "--into", str(folder / "submission.yaml")]) == 2
     assert "method is test, but classical" in capsys.readouterr().err

@@ -161,12 +161,12 @@ def test_a_pickle_is_never_opened(tmp_path, network, zipped):
 
 
 def test_nothing_is_written_that_could_not_be_read(tmp_path, network):
-    sick = tiny_network()
+    diverged = tiny_network()
     with torch.no_grad():
-        next(sick.parameters()).fill_(float("inf"))
+        next(diverged.parameters()).fill_(float("inf"))
     good = config_of(network)
     for net, config, heads, path, words in (
-        (sick, good, None, "a.safetensors", "not finite"),
+        (diverged, good, None, "a.safetensors", "not finite"),
         (network, config_of(network, options={"width": 8}), None, "a.safetensors", "expected float32"),
         (network, good, {"b": torch.tensor(float("nan"))}, "a.safetensors", "range_head.b holds values"),
         (network, good, None, "a.pt", "expected a name that ends in .safetensors"),

@@ -33,8 +33,8 @@ def _construct(label: str, cls: type, options: dict[str, object]) -> object:
     parameters = inspect.signature(cls).parameters
     unknown = sorted(set(options) - set(parameters))
     if unknown:
-        known = ", ".join(f"{p.name} (default {p.default})" for p in parameters.values())
-        raise NetworkError(f"{label} has no option {', '.join(map(repr, unknown))}; there are: {known}")
+        available = ", ".join(f"{p.name} (default {p.default})" for p in parameters.values())
+        raise NetworkError(f"{label} has no option {', '.join(map(repr, unknown))}; there are: {available}")
     return cls(**options)
 
 
@@ -50,8 +50,8 @@ def build(name: str, **options: int | float) -> "FringeNetwork":
     if name not in _CLASSES:
         raise NetworkError(f"unknown network {name!r}; there are {', '.join(NETWORKS)}")
     module, cls = _CLASSES[name]
-    found = getattr(importlib.import_module(f"{__name__}.{module}"), cls)
-    return _construct(f"network {name!r}", found, dict(options))  # type: ignore[return-value]
+    network_class = getattr(importlib.import_module(f"{__name__}.{module}"), cls)
+    return _construct(f"network {name!r}", network_class, dict(options))  # type: ignore[return-value]
 
 
 def discriminator(**options: int | float) -> "Discriminator":

@@ -1,4 +1,4 @@
-"""What all networks share: their input rule, the options that rebuild them, and the layers that others look into."""
+"""The base of all networks: input check, the options that rebuild them, and the layers for probes."""
 
 from abc import ABC, abstractmethod
 
@@ -55,10 +55,10 @@ class FringeNetwork(nn.Module, ABC):
         """Raises `NetworkError`, with the nearest sizes that would do, unless the network takes ``height x width``."""
         stride, least = self.stride, 2 * self.stride
         if height % stride or width % stride or height < least or width < least:
-            near = "x".join(_nearest(side, stride, least) for side in (height, width))
+            nearest = "x".join(_nearest(side, stride, least) for side in (height, width))
             raise NetworkError(
                 f"{self.name} takes heights and widths that are multiples of {stride}, at least {least} px; it was "
-                f"given {height}x{width}; the nearest it takes: {near}; crop, pad or build the dataset at such a size"
+                f"given {height}x{width}; the nearest it takes: {nearest}; crop, pad or build the dataset at that size"
             )
 
 

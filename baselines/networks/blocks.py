@@ -90,9 +90,9 @@ class DropPath(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if not self.training or self.rate == 0.0:
             return x
-        kept = 1.0 - self.rate
-        mask = x.new_empty((x.shape[0],) + (1,) * (x.dim() - 1)).bernoulli_(kept)
-        return x * mask.div_(kept)
+        keep_rate = 1.0 - self.rate
+        mask = x.new_empty((x.shape[0],) + (1,) * (x.dim() - 1)).bernoulli_(keep_rate)
+        return x * mask.div_(keep_rate)
 
     def extra_repr(self) -> str:
         return f"rate={self.rate:.3f}"

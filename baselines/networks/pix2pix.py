@@ -106,23 +106,23 @@ class Discriminator(nn.Module):
         scales = whole("discriminator", "scales", scales)
         super().__init__()
         self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
-        self.scales = nn.ModuleList(_patch_judge(width, layers) for _ in range(scales))
+        self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))
         initialise_normal(self)
 
     def forward(self, pair: Tensor) -> list[list[Tensor]]:
         features = []
-        for step, judge in enumerate(self.scales):
+        for step, patch_discriminator in enumerate(self.scales):
             if step:
                 pair = functional.avg_pool2d(pair, 3, stride=2, padding=1, count_include_pad=False)
             x, maps = pair, []
-            for stage in judge:  # type: ignore[attr-defined]
+            for stage in patch_discriminator:  # type: ignore[attr-defined]
                 x = stage(x)
                 maps.append(x)
             features.append(maps)
         return features
 
 
-def _patch_judge(width: int, layers: int) -> nn.ModuleList:
+def _patch_discriminator(width: int, layers: int) -> nn.ModuleList:
     """One scale: 4x4 convolutions, ``layers`` of stride 2, one of stride 1, then the judgement."""
     widths = [min(width * 2**level, 8 * width) for level in range(layers + 1)]
     stages = [nn.Sequential(nn.Conv2d(2, width, 4, 2, 2), nn.LeakyReLU(LEAK, inplace=True))]

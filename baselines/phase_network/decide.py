@@ -1,4 +1,4 @@
-"""From the network's answers to order, phase and mask of one image."""
+"""From the network's answers to order, phase and mask of an image."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ IMPOSSIBLE = -np.inf
 """Logit of an order that puts its pixel out of the working range."""
 
 DENIED = 5.0
-"""Logits below the threshold from which on a pixel of the measured route's mask is background after all."""
+"""A pixel of the measured route's mask stays object unless its logit is this far below the threshold."""
 
 
 @dataclass(frozen=True)
 class Answers:
-    """The network's answers as the image has them, maps (h, w) of the scene's crop.
+    """The network's answers in the image's own orientation, maps (h, w) of the scene's crop.
 
-    ``logits`` (3, h, w): of one order less than the base's, the base, and one more; ``object_logit``;
+    ``logits`` (3, h, w): of the base order minus one, the base order, and plus one; ``object_logit``;
     ``correction_rad``: to be added to the wrapped phase.
     """
 
@@ -30,9 +30,14 @@ class Answers:
     correction_rad: Image
 
 
-def ask(network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0) -> Answers:
-    """Run ``network`` on one scene; ``lead`` is added to the logit of the base, because in training, where wrong orders
-    are made up, it is wrong much more often than it is."""
+def network_answers(
+    network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0
+) -> Answers:
+    """Run ``network`` on a scene.
+
+    ``lead``: the base order's lead, added to its logit. Training windows get made-up wrong base orders (see `windows`),
+    so the network holds the base order wrong more often than it is; the lead, chosen on the validation split, makes up
+    for that."""
     settings, rotation = geometry.route.settings, geometry.rotation
     layer = geometry.layer.at(scene.crop)
     x, exists = channels(scene, layer, geometry.rig, rotation, geometry.route.period_px, settings.slack_mm)
@@ -42,8 +47,8 @@ def ask(network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = Tru
     stride = network.stride
     padded = np.pad(x, ((0, 0), (0, -height % stride), (0, -width % stride)))
     with torch.inference_mode():
-        given = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
-        order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(given))
+        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
+        order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(batch))
     order = np.where(exists, order + np.array([0, lead, 0], np.float32)[:, None, None], np.float32(IMPOSSIBLE))
     back = rotation.back
     signed = back(order) if rotation.sign > 0 else back(order)[::-1]
@@ -54,14 +59,14 @@ def ask(network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = Tru
 
 
 def decided_order(answers: Answers, scene: Scene) -> NDArray[np.int32]:
-    """The likeliest order of every pixel, int32 (h, w)."""
+    """The most likely order of every pixel, int32 (h, w)."""
     steps = np.array(STEPS, np.int32)
     return scene.order + steps[answers.logits.argmax(axis=0)]
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> NDArray[np.bool_]:
-    """Object: what the network holds likelier than ``threshold`` (a logit), and what the measured route's mask has and
-    the network does not clearly deny; where the fit has something to stand on."""
+    """Object pixels (h, w): those whose logit is above ``threshold``, and those of the measured route's mask whose
+    logit is at most `DENIED` below it; only where enough of the local fit's window lies on the object."""
     logit = answers.object_logit
-    found = (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
-    return found & (scene.weight > LEAST_WEIGHT)
+    is_object = (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
+    return is_object & (scene.weight > LEAST_WEIGHT)

@@ -1,12 +1,12 @@
-"""What the network sees of one image: maps that mean the same for any rig, fringe direction and distance.
+"""Input of the network: maps of one image that mean the same for any rig, fringe direction and distance.
 
 The measured route (`fpp_ml_bench.baselines.phase_route`) gives every pixel a wrapped phase and a first order, the
-*base*. The network is shown the base and its two neighbours, one order nearer and one further: how bright each would be
-against how bright it is, and whether it lies in the working range. Nothing it sees tells how far away an object stands,
-only what follows from a distance: that is why it works where objects stand elsewhere than in training.
+*base order*. The network gets three candidates, the base order and its two neighbours: how bright the pixel would be
+with each order against how bright it is, and whether the order's depth lies in the working range. No map holds a
+distance, only what follows from one, so the network also works at distances that training did not show.
 
-Maps are turned so that the fringe's phase grows along rows' normal (downwards) and a nearer surface has more of it. One
-network then serves both fringe directions.
+Maps are rotated so that the fringe's phase grows downwards and a nearer surface has more phase. The same network then
+serves both fringe directions.
 """
 
 from dataclasses import dataclass, replace
@@ -24,15 +24,15 @@ from fpp_ml_bench.rig import Rig
 Image = NDArray[np.float32]
 
 STEPS = (-1, 0, 1)
-"""The candidates: a period further than the base, the base, a period nearer."""
+"""The candidates: a period further than the base order, the base order, a period nearer."""
 SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
-"""Directions, rows and columns as the network has them, from which a pixel may take its phase instead."""
+"""Directions (rows, columns, in rotated maps) from which a pixel may take its phase instead."""
 SIDE_PERIODS = 0.45
-"""How far away the phase is taken from: a window there sees little of what lies on the pixel's other side."""
+"""Distance, in periods, from which the phase is taken: the fit's window there hardly reaches beyond the pixel."""
 LARGEST_RAD = 1.5708
 """Largest correction that is proposed."""
 AROUND_PX = 1.5
-"""Gaussian over which the misfit of a proposal is averaged: one pixel's light fits many phases."""
+"""Gaussian over which the misfit of a proposal is averaged: the light of a single pixel fits many phases."""
 CHANNELS = (
     "light", "plane light", "plane misfit", "classical mask", "cos", "sin", "brightness", "window share", "fit misfit",
     "slope along", "slope across", "further: brightness misfit", "base: brightness misfit",
@@ -42,11 +42,11 @@ CHANNELS = (
 )  # fmt: skip
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 SHADING = (6, 11, 12, 13)
-"""Channels that rest on one albedo for all surfaces; 0 for a network that is to do without."""
+"""Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
 LEAST_WEIGHT = 0.02
-"""Least share of the fit's window on the object where its answer counts."""
+"""Least share of the fit's window that must lie on the object for the fit to count."""
 RELIEF_RAD = 1.5
-"""Residual phase that counts as one: corrections are parts of it, and the network is to see them."""
+"""Unit of the channel ``relief``, small enough that the corrections show in it."""
 SINE_FLOOR = 0.1
 STEP_PX = 2
 """Brightness of the candidates is computed on every second pixel."""
@@ -54,8 +54,8 @@ STEP_PX = 2
 
 @dataclass(frozen=True)
 class Rotation:
-    """How maps (h, w) of an image are turned for the network: ``transposed``, then rows ``reversed``; ``sign`` of the
-    phase that makes a nearer surface have more of it."""
+    """How maps (h, w) of an image are rotated for the network: ``transposed``, then rows ``reversed``; ``sign``: factor
+    that makes the phase of a nearer surface larger."""
 
     transposed: bool
     reversed: bool
@@ -71,25 +71,25 @@ class Rotation:
         return cls(direction == "vertical", not grows, sign)
 
     def turn(self, image: NDArray) -> NDArray:
-        """Maps (..., h, w) as the network sees them."""
+        """Maps (..., h, w) rotated for the network."""
         turned = image.swapaxes(-1, -2) if self.transposed else image
         return turned[..., ::-1, :] if self.reversed else turned
 
     def back(self, image: NDArray) -> NDArray:
-        """Maps as the image has them, from maps as the network sees them."""
+        """Rotated maps as the image has them."""
         unturned = image[..., ::-1, :] if self.reversed else image
         return unturned.swapaxes(-1, -2) if self.transposed else unturned
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a part ``crop`` of an image shows, maps (h, w) as the image has them.
+    """The part ``crop`` of an image, maps (h, w) in the image's own orientation.
 
-    ``light`` and ``plane_light``: captured light less the ambient one, and what the empty scene predicts of it, as
-    multiples of a white plane at the standoff; ``noise`` in the same unit; ``inside``: classical mask; ``phase_rad`` in
-    [-pi, pi] and ``order``: the base; ``bright``: half the modulation, in units of light; ``weight``: of the fit's
-    window; ``slopes`` of the residual phase, rad a px along x and y; ``relief_rad``: residual phase of the object's
-    middle.
+    ``light``: captured light without the ambient light, and ``plane_light``: the empty scene's prediction of it, both
+    as multiples of a white plane at the standoff; ``noise`` in the same unit; ``inside``: mask of the measured route;
+    ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in units of light;
+    ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median
+    residual phase of the object.
     """
 
     crop: Crop
@@ -105,35 +105,36 @@ class Scene:
     middle_rad: float
 
     @classmethod
-    def of(cls, seen: Observation, order: NDArray[np.int32], rig: Rig) -> "Scene":
-        """From what the measured route saw, with its own ``order`` (h, w) as the base."""
-        background = seen.background
+    def of(cls, observation: Observation, order: NDArray[np.int32], rig: Rig) -> "Scene":
+        """From an observation of the measured route, with that route's ``order`` (h, w) as the base order."""
+        background = observation.background
         unit = np.float32(rig.standoff_m**2 / (background.strength / 2))
-        light = (seen.grey - np.float32(background.ambient_grey)) * unit
-        misfit = background.residual[seen.crop] * unit
-        residual = seen.layer.residual_phase(seen.phase_rad, order)
-        known = seen.inside & np.isfinite(residual)
-        middle = float(np.median(residual[known])) if known.any() else 0.0
+        light = (observation.grey - np.float32(background.ambient_grey)) * unit
+        misfit = background.residual[observation.crop] * unit
+        residual = observation.layer.residual_phase(observation.phase_rad, order)
+        on_object = observation.inside & np.isfinite(residual)
+        middle = float(np.median(residual[on_object])) if on_object.any() else 0.0
         return cls(
-            crop=seen.crop, light=light, plane_light=(light - misfit).astype(np.float32),
-            noise=float(background.noise_grey * unit), inside=seen.inside, phase_rad=seen.phase_rad, order=order,
-            bright=(seen.fit.brightness * unit).astype(np.float32), weight=seen.fit.weight, slopes=seen.slopes,
+            crop=observation.crop, light=light, plane_light=(light - misfit).astype(np.float32),
+            noise=float(background.noise_grey * unit), inside=observation.inside, phase_rad=observation.phase_rad,
+            order=order, bright=(observation.fit.brightness * unit).astype(np.float32),
+            weight=observation.fit.weight, slopes=observation.slopes,
             middle_rad=middle,
         )  # fmt: skip
 
     def window(self, rows: slice, columns: slice) -> "Scene":
-        """A part of it; slices of this scene's own maps, with start and stop."""
+        """A part of this scene; slices of its maps, with start and stop."""
         top, left = self.crop[0].start, self.crop[1].start
-        here = (rows, columns)
+        part = (rows, columns)
         return replace(
             self, crop=(slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)),
-            light=self.light[here], plane_light=self.plane_light[here], inside=self.inside[here],
-            phase_rad=self.phase_rad[here], order=self.order[here], bright=self.bright[here],
-            weight=self.weight[here], slopes=(self.slopes[0][here], self.slopes[1][here]),
+            light=self.light[part], plane_light=self.plane_light[part], inside=self.inside[part],
+            phase_rad=self.phase_rad[part], order=self.order[part], bright=self.bright[part],
+            weight=self.weight[part], slopes=(self.slopes[0][part], self.slopes[1][part]),
         )  # fmt: skip
 
     def half(self) -> "Scene":
-        """The same in half precision, to be kept; `single` before it is used."""
+        """The same in half precision, to save memory; call `single` before use."""
         return self._as(np.float16, np.int16)
 
     def single(self) -> "Scene":
@@ -149,7 +150,7 @@ class Scene:
 
 
 def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: float) -> Image:
-    """Brightness that each of `STEPS` would have, in units of light, (3, h, w) float32.
+    """Brightness with each candidate order (`STEPS`), in units of light, (3, h, w) float32.
 
     ``layer``: of the scene's part of the image. NaN where a candidate lies behind a device.
     """
@@ -171,9 +172,9 @@ def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: 
 def channels(
     scene: Scene, layer: CalibrationLayer, rig: Rig, rotation: Rotation, period_px: float, slack_mm: float
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Input of the network (`CHANNELS`, h', w') float32, turned, and which candidates exist, bool (3, h', w').
+    """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w').
 
-    The base always exists: where even it lies outside the range, nothing better is known.
+    The base order always exists, also where its depth lies outside the working range.
     """
     expected = candidate_brightness(scene, layer, rig, rotation.sign)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
@@ -191,7 +192,7 @@ def channels(
     misfit = (scene.light - scene.bright * (1 + cosine)) / np.maximum(bright, np.float32(0.05))
     plane_misfit = np.arcsinh((scene.light - scene.plane_light) / np.float32(scene.noise)) / 4
     relief = np.nan_to_num(rotation.sign * (residual - scene.middle_rad)) / RELIEF_RAD
-    # What a pixel's own light would say of the correction, were its brightness right: light = g (1 + cos(phase + c)).
+    # The correction c that a pixel's own light asks for if its brightness g is right: light = g (1 + cos(phase + c)).
     guess = -misfit * rotation.sign * sine / (sine * sine + SINE_FLOOR)
     unit = period_px / TAU
     along, across = (1, 0) if not rotation.transposed else (0, 1)
@@ -202,10 +203,10 @@ def channels(
         ratio[0], ratio[1], ratio[2], exists[0], exists[2], np.clip(relief, -4, 4), np.clip(guess, -1.5, 1.5),
     ]).astype(np.float32)  # fmt: skip
     fitted *= scene.weight > LEAST_WEIGHT
-    seen = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
-    whole = rotation.turn(np.nan_to_num(np.concatenate([seen, fitted])))
+    image_maps = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
+    turned_maps = rotation.turn(np.nan_to_num(np.concatenate([image_maps, fitted])))
     sides = from_the_sides(scene, layer, rotation, period_px)
-    return np.concatenate([whole, sides]), np.ascontiguousarray(rotation.turn(exists))
+    return np.concatenate([turned_maps, sides]), np.ascontiguousarray(rotation.turn(exists))
 
 
 def around(misfit: NDArray) -> Image:
@@ -215,8 +216,9 @@ def around(misfit: NDArray) -> Image:
 
 
 def from_the_sides(scene: Scene, layer: CalibrationLayer, rotation: Rotation, period_px: float) -> Image:
-    """The phase that each of `SIDES` would carry on to a pixel, less its own, and how badly its light then fits:
-    (17, h', w') float32, turned. Beside a depth edge the window of a pixel sees two surfaces; one further in sees one.
+    """The phase extrapolated to a pixel from each of `SIDES`, minus its own phase, and the misfit of its light with it:
+    (17, h', w') float32, rotated. Beside a depth edge the window of a pixel covers two surfaces, a window further in
+    only one.
     """
     turn, sign = rotation.turn, np.float32(rotation.sign)
     psi = turn(sign * wrapped(scene.phase_rad - layer.infinity_rad).astype(np.float32))
@@ -232,11 +234,11 @@ def from_the_sides(scene: Scene, layer: CalibrationLayer, rotation: Rotation, pe
     corrections, misfits = [], [around(light / np.maximum(maps[3], np.float32(0.05)) - 1 - np.cos(phase))]
     for row, column in SIDES:
         dy, dx = round(row * reach), round(column * reach)
-        there = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
-        known = there[4] > 0
-        step = wrapped(there[0] - there[1] * np.float32(dy) - there[2] * np.float32(dx) - psi)
-        step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * known
-        misfit = light / np.maximum(there[3], np.float32(0.05)) - 1 - np.cos(phase + step)
+        side_maps = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
+        on_object = side_maps[4] > 0
+        step = wrapped(side_maps[0] - side_maps[1] * np.float32(dy) - side_maps[2] * np.float32(dx) - psi)
+        step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * on_object
+        misfit = light / np.maximum(side_maps[3], np.float32(0.05)) - 1 - np.cos(phase + step)
         corrections.append(step)
-        misfits.append(around(np.where(known, misfit, np.float32(2))))
+        misfits.append(around(np.where(on_object, misfit, np.float32(2))))
     return np.stack(corrections + misfits).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetFile, load_net
+from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetConfig, NetFile, load_net
 from fpp_ml_bench.baselines.phase_route.measurement import Measurement
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -16,15 +16,15 @@ from fpp_ml_bench.frames import Direction
 from fpp_ml_bench.rig import Rig
 
 PERIOD_TOLERANCE = 2.2
-"""Factor by which an image's fringe period in px may differ from the one that the weights learned from."""
+"""Factor by which an image's fringe period in px may differ from that of the training images."""
 
 
 class PhaseNetMethod:
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
 
     ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
-    Raises `WeightsError` for weights that can't be used, and `PredictionError` for an option's value that there is not
-    and for a rig whose fringe period in the image is far from what the weights have seen.
+    Raises `WeightsError` for weights that can't be used, and `PredictionError` for an invalid option and for a rig
+    whose fringe period in the image is far from that of the training data.
     """
 
     name = "phase-net"
@@ -41,25 +41,26 @@ class PhaseNetMethod:
         self.options = Settings(direction=direction, min_confidence=min_confidence, shading=shading)
         self.file = weights if isinstance(weights, NetFile) else load_net(weights)
         self.rig, self.threads = rig, threads
-        learned, here = self.file.config.period_px.get(direction), rig.image_px_per_period(direction)
-        if learned is None:
+        trained_period_px = self.file.config.period_px.get(direction)
+        image_period_px = rig.image_px_per_period(direction)
+        if trained_period_px is None:
             raise PredictionError(
                 f"{self.file.path}: learned from {', '.join(self.file.config.period_px)} fringes only, not from "
                 f"{direction} ones; use other weights, or the measured route (phase)"
             )
-        if not learned / PERIOD_TOLERANCE < here < learned * PERIOD_TOLERANCE:
+        if not trained_period_px / PERIOD_TOLERANCE < image_period_px < trained_period_px * PERIOD_TOLERANCE:
             raise PredictionError(
-                f"{self.file.path}: learned from {direction} fringes of {learned:.1f} px a period in the image, this "
-                f"rig's have {here:.1f} px, beyond a factor of {PERIOD_TOLERANCE}; train weights for it (fpp-bench "
-                "train phase-net), or use the measured route (phase)"
+                f"{self.file.path}: learned from {direction} fringes of {trained_period_px:.1f} px a period in the "
+                f"image, this rig's have {image_period_px:.1f} px, beyond a factor of {PERIOD_TOLERANCE}; train "
+                "weights for it (fpp-bench train phase-net), or use the measured route (phase)"
             )
-        chosen = levers or Levers(shading=shading)
+        route_levers = levers or Levers(shading=shading)
         config = self.file.config
-        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, chosen, config.lead)
+        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, route_levers, config.lead)
 
     @property
     def frames_used(self) -> tuple[int, ...]:
-        """The one frame that must be captured."""
+        """The frame that must be captured."""
         return (self.rig.sequence.sinusoids(self.options.direction)[0],)
 
     @property
@@ -78,12 +79,17 @@ class PhaseNetMethod:
         }  # fmt: skip
 
     @property
+    def weights_config(self) -> NetConfig:
+        """What the weights file says of the network and its training data."""
+        return self.file.config
+
+    @property
     def parameters(self) -> int:
         """Numbers that were learned."""
-        return sum(one.numel() for one in self.file.network.parameters())
+        return sum(parameter.numel() for parameter in self.file.network.parameters())
 
     def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
-        """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
         import torch
 
         (index,) = self.frames_used

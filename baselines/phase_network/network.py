@@ -1,7 +1,7 @@
-"""The network: a small U-Net that works on 2 x 2 blocks of pixels and answers for every pixel.
+"""The network: a small U-Net on 2 x 2 blocks of pixels, with three answers for every pixel.
 
-Three answers a pixel: a logit for each of three neighbouring orders, a logit for being object, and a correction of the
-phase within ``bound_rad``.
+They are a logit for each of three neighbouring orders, a logit for being object, and a correction of the phase within
+``bound_rad``.
 """
 
 from copy import deepcopy
@@ -16,17 +16,17 @@ from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_SIDE, SI
 from fpp_ml_bench.errors import NetworkError
 
 BLOCK = 2
-"""Pixels along a block that the first layer takes at once."""
+"""Pixels along the side of a block that the first layer takes as one."""
 COARSE = 4
 """Pixels along a block that the order's branch averages."""
 ORDER_SHARE = 0.1
-"""Of the order's gradient that reaches the branch of phase and mask."""
-OWN = FIRST_SIDE + len(SIDES)
-"""First of the channels that say how badly no correction, and each that is proposed, fits."""
+"""Share of the order's gradient that reaches the branch of phase and mask."""
+FIRST_MISFIT = FIRST_SIDE + len(SIDES)
+"""First of the misfit channels: of no correction, and of each proposed correction."""
 TRUST = 6.0
-"""Logits by which a proposal falls behind for a misfit of its brightness, before anything is learned."""
-LEAD = 2.5
-"""Logit by which the base order, and no correction, lead before anything is learned."""
+"""Start value of the factor by which a proposal's brightness misfit lowers its logit."""
+FIRST_BIAS = 2.5
+"""Start value of the biases of the base order and of no correction."""
 
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
@@ -53,20 +53,20 @@ class UNet(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        kept, deep = [], x
+        skips, deep = [], x
         for level, block in enumerate(self.encoder):
             deep = block(functional.max_pool2d(deep, 2) if level else deep)
-            kept.append(deep)
-        for level, block in zip(reversed(range(len(kept) - 1)), self.decoder, strict=True):
-            deep = block(torch.cat([kept[level], functional.interpolate(deep, scale_factor=2.0)], dim=1))
+            skips.append(deep)
+        for level, block in zip(reversed(range(len(skips) - 1)), self.decoder, strict=True):
+            deep = block(torch.cat([skips[level], functional.interpolate(deep, scale_factor=2.0)], dim=1))
         return deep
 
 
 class PhaseNet(nn.Module):
     """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W).
 
-    The correction is an average of those that a pixel's surroundings propose (`inputs.SIDES`) and none, by weights that
-    the network decides, plus a part of its own of at most half of ``bound_rad``, cut off at ``bound_rad``.
+    The correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
+    none, with weights from the network, plus a free part of at most half of ``bound_rad``, clipped at ``bound_rad``.
 
     ``widths``: channels of each level, the first at half the image's resolution; ``squeezed`` and ``fine``: of the maps
     at full resolution, before and after them; ``order_widths``: of the branch that looks for the order, at a quarter of
@@ -100,32 +100,33 @@ class PhaseNet(nn.Module):
         self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
         nn.init.normal_(self.answer.weight, std=0.05)
         bias = torch.zeros(self.answer.out_channels)
-        bias[[1, 5]] = LEAD
+        bias[[1, 5]] = FIRST_BIAS
         self.answer.bias = nn.Parameter(bias)
 
     def folded(self) -> "PhaseNet":
-        """The same network for asking alone, its normalisation folded into the convolutions: less to compute."""
-        ready = deepcopy(self).eval()
-        for body in (ready.body, ready.order_body):
+        """The same network for inference, with the normalisation folded into the convolutions: less to compute."""
+        network = deepcopy(self).eval()
+        for body in (network.body, network.order_body):
             for block in (*body.encoder, *body.decoder):
-                for place in (0, 3):
-                    block[place] = fuse_conv_bn_eval(block[place], block[place + 1])
-                    block[place + 1] = nn.Identity()
-        return ready.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
+                for number in (0, 3):
+                    block[number] = fuse_conv_bn_eval(block[number], block[number + 1])
+                    block[number + 1] = nn.Identity()
+        return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
             raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
-        seen = self.squeeze(x)
-        deep = self.body(functional.pixel_unshuffle(seen, BLOCK))
+        squeezed = self.squeeze(x)
+        deep = self.body(functional.pixel_unshuffle(squeezed, BLOCK))
         pixels = functional.pixel_shuffle(self.spread(deep), BLOCK)
-        out = self.answer(self.fine(torch.cat([pixels, seen], dim=1)))
+        answers = self.answer(self.fine(torch.cat([pixels, squeezed], dim=1)))
         order = self.order_answer(self.order_body(functional.avg_pool2d(x, COARSE)))
         order = functional.interpolate(order, scale_factor=float(COARSE), mode="bilinear", align_corners=False)
-        # The order's loss is loud where a whole region is wrong; it must not drown the phase's in what they share.
-        order = order + ORDER_SHARE * out[:, :3] + (1 - ORDER_SHARE) * out[:, :3].detach()
-        proposed, misfits = x[:, FIRST_SIDE:OWN], x[:, OWN:]
-        shares = torch.softmax(out[:, 5:] - self.trust * misfits, dim=1)[:, 1:]
-        taken = (shares * proposed).sum(dim=1)
-        correction = taken + 0.5 * self.bound_rad * torch.tanh(out[:, 4])
-        return order, out[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)
+        # The order's loss is large where a whole region is wrong; it must not outweigh the phase's loss in the layers
+        # that both use.
+        order = order + ORDER_SHARE * answers[:, :3] + (1 - ORDER_SHARE) * answers[:, :3].detach()
+        proposed, misfits = x[:, FIRST_SIDE:FIRST_MISFIT], x[:, FIRST_MISFIT:]
+        shares = torch.softmax(answers[:, 5:] - self.trust * misfits, dim=1)[:, 1:]
+        proposed_mean = (shares * proposed).sum(dim=1)
+        correction = proposed_mean + 0.5 * self.bound_rad * torch.tanh(answers[:, 4])
+        return order, answers[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)

@@ -1,4 +1,4 @@
-"""How the network is trained: every number that changes the result, in one place."""
+"""The training recipe: every number that changes the result."""
 
 import hashlib
 import json
@@ -16,8 +16,8 @@ class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
 
     ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
-    ``unions``: how many unions of several objects are learned from for every sample; ``weight_*``: of the losses;
-    ``averaged``: decay of the weights' moving average, which is what is kept.
+    ``unions``: images that join several objects, made from each sample (see `unions`); ``weight_*``: of the losses;
+    ``averaged``: decay of the weights' moving average, which is what the weights file holds.
     Raises `RecipeError` for values that train nothing.
     """
 
@@ -51,15 +51,15 @@ class Recipe:
             raise RecipeError(f"unions {self.unions!r}: expected 0 to 100 for every sample")
         if not self.rate > 0 or not 0 <= self.averaged < 1:
             raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
-        if not self.directions or any(one not in DIRECTIONS for one in self.directions):
+        if not self.directions or any(direction not in DIRECTIONS for direction in self.directions):
             raise RecipeError(f"directions {self.directions}: expected some of {', '.join(DIRECTIONS)}")
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
         if step < self.warm_up:
             return self.rate * (step + 1) / self.warm_up
-        done = (step - self.warm_up) / max(1, self.steps - self.warm_up)
-        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain mapping of everything."""

@@ -1,6 +1,6 @@
-"""Training samples: what the measured route saw of each image beside the phase it should have seen.
+"""Training samples: the measured route's scene of each image, with the true phase.
 
-The route runs once an image; what the network needs of it is kept in half precision.
+The route runs once an image; the maps that the network needs are held in half precision.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,12 +21,12 @@ from fpp_ml_bench.pixel_sets import depth_edges, object_mask
 from fpp_ml_bench.rig import Rig
 
 EDGE_POINTS = 2000
-"""Places near depth edges that a sample keeps, for windows to be centred on."""
+"""Pixels near depth edges that a sample holds, as centres of training windows."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What all images of one rig and fringe direction share."""
+    """Route and rotation for all images of a rig and fringe direction."""
 
     rig: Rig
     route: PhaseRoute
@@ -44,10 +44,10 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Sample:
-    """One image of a training set: the ``scene``, and what is true there.
+    """An image of a training set: the ``scene`` and its ground truth.
 
-    ``missing_rad`` float16 (h, w): true absolute phase less that of the base, 0 outside the object; ``target``: object
-    pixels; ``edges`` int32 (n, 2): rows and columns beside depth edges and silhouettes.
+    ``missing_rad`` float16 (h, w): true absolute phase minus that of the base order, 0 outside the object; ``target``:
+    object pixels; ``edges`` int32 (n, 2): rows and columns beside depth edges and silhouettes.
     """
 
     name: str
@@ -58,26 +58,28 @@ class Sample:
     edges: NDArray[np.int32]
 
 
-def first_order(seen: Observation, rig: Rig, settings: Settings) -> tuple[NDArray[np.int32], Image]:
+def first_order(observation: Observation, rig: Rig, settings: Settings) -> tuple[NDArray[np.int32], Image]:
     """The measured route's own order of every pixel (h, w), and its margin."""
-    choice, margin = orders.by_shading_and_smoothness(seen.question, rig, settings)
-    return orders.spread_over_pixels(seen.question, choice, margin, seen.layer.residual_phase(seen.phase_rad, 0.0))
+    choice, margin = orders.by_shading_and_smoothness(observation.question, rig, settings)
+    return orders.spread_over_pixels(
+        observation.question, choice, margin, observation.layer.residual_phase(observation.phase_rad, 0.0)
+    )
 
 
 def sample_of(image: NDArray[np.uint8], depth_mm: Image, name: str, geometry: Geometry) -> Sample:
-    """Sample of one image uint8 (H, W) and its true depth in mm, 0 = background."""
+    """Sample of an image uint8 (H, W) and its true depth in mm, 0 = background."""
     settings = geometry.route.settings
-    seen = geometry.route.observe(image)
-    order, _ = first_order(seen, geometry.rig, settings)
-    scene = Scene.of(seen, order, geometry.rig)
-    part = depth_mm[seen.crop]
-    target = object_mask(part)
-    true = seen.layer.absolute_phase(np.where(target, part, 1000.0))
-    missing = np.where(target, true - seen.phase_rad - TAU * order, 0.0)
-    places = np.argwhere(depth_edges(part)).astype(np.int32)
-    chosen = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
+    observation = geometry.route.observe(image)
+    order, _ = first_order(observation, geometry.rig, settings)
+    scene = Scene.of(observation, order, geometry.rig)
+    crop_depth_mm = depth_mm[observation.crop]
+    target = object_mask(crop_depth_mm)
+    true_phase = observation.layer.absolute_phase(np.where(target, crop_depth_mm, 1000.0))
+    missing = np.where(target, true_phase - observation.phase_rad - TAU * order, 0.0)
+    places = np.argwhere(depth_edges(crop_depth_mm)).astype(np.int32)
+    sampled = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
     return Sample(
-        name, settings.direction, scene.half(), np.nan_to_num(missing).astype(np.float16), target, places[chosen]
+        name, settings.direction, scene.half(), np.nan_to_num(missing).astype(np.float16), target, places[sampled]
     )
 
 
@@ -86,8 +88,8 @@ def samples_of(
 ) -> list[Sample]:
     """Samples of ``names``, in their order."""
     frame = opened.sequence.sinusoids(geometry.route.settings.direction)[0]
-    found = []
+    samples = []
     for name in names:
-        found.append(sample_of(np.array(opened.frame(name, frame)), opened.depth_mm(name), name, geometry))
+        samples.append(sample_of(np.array(opened.frame(name, frame)), opened.depth_mm(name), name, geometry))
         progress(1)
-    return found
+    return samples

@@ -1,4 +1,4 @@
-"""The training loop: windows, three losses, a checkpoint every so often, and validation in mm on whole images."""
+"""The training loop: windows, three losses, checkpoints, and validation in mm on whole images."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines.phase_network.decide import Answers, ask, decided_mask, decided_order
+from fpp_ml_bench.baselines.phase_network.decide import Answers, decided_mask, decided_order, network_answers
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
@@ -47,18 +47,20 @@ class Batch:
     correction_rad: Tensor
     fitted: Tensor
     target: Tensor
-    known: Tensor
+    mask_valid: Tensor
 
     @classmethod
     def of(cls, windows: list[Window]) -> "Batch":
-        stacked = {name: np.stack([getattr(one, name) for one in windows]) for name in Window.__dataclass_fields__}
+        stacked = {
+            name: np.stack([getattr(window, name) for window in windows]) for name in Window.__dataclass_fields__
+        }
         tensors = {name: torch.from_numpy(values) for name, values in stacked.items()}
         tensors["x"] = tensors["x"].contiguous(memory_format=torch.channels_last)
         return cls(**tensors)
 
 
 @dataclass(frozen=True)
-class Done:
+class TrainedNetwork:
     """The averaged network after ``steps``, and a record of every validation."""
 
     network: PhaseNet
@@ -73,40 +75,44 @@ def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str
     pixels = batch.fitted.sum().clamp(min=1)
     by_order = functional.cross_entropy(logits, batch.order, ignore_index=IGNORED, reduction="sum") / pixels
     by_pixel = functional.binary_cross_entropy_with_logits(inside, batch.target.float(), reduction="none")
-    by_mask = (by_pixel * batch.known).sum() / batch.known.sum().clamp(min=1)
-    wanted = batch.correction_rad.clamp(-bound_rad, bound_rad)
-    by_phase = functional.smooth_l1_loss(correction, wanted, beta=SMALL_RAD, reduction="none")
+    by_mask = (by_pixel * batch.mask_valid).sum() / batch.mask_valid.sum().clamp(min=1)
+    target_rad = batch.correction_rad.clamp(-bound_rad, bound_rad)
+    by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
     return {"order": by_order, "mask": by_mask, "phase": (by_phase * batch.fitted).sum() / pixels}
 
 
 def scores(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> dict[str, float]:
-    """Means over whole images of what is being learned: object MAE mm, wrong orders %, missed %, invented px."""
+    """Means of `score` over the samples."""
     rows = []
     for sample in samples:
         geometry, scene = geometries[sample.direction], sample.scene.single()
-        rows.append(score(ask(network, scene, geometry), sample, geometry))
+        rows.append(score(network_answers(network, scene, geometry), sample, geometry))
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
 
 
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
-    """Scores of one sample; see `scores`. Lengths in mm, invented pixels in thousands."""
+    """Scores of one whole image with ``threshold`` on the mask's logit.
+
+    ``object_mae_mm`` counts a missed pixel with its whole depth; ``right_mae_mm`` is the MAE of the pixels with the
+    right order; ``wrong_percent`` and ``missed_percent`` are shares of the object's pixels; ``invented_kpx``:
+    background pixels with a depth, in thousands."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     order, inside = decided_order(answers, scene), decided_mask(answers, scene, threshold)
-    base = layer.residual_phase(scene.phase_rad, scene.order)
-    true_mm = layer.depth_of_residual_mm(base + sample.missing_rad)
-    off = TAU * (order - scene.order) + answers.correction_rad
-    found_mm = np.nan_to_num(layer.depth_of_residual_mm(base + off))
+    base_residual = layer.residual_phase(scene.phase_rad, scene.order)
+    true_mm = layer.depth_of_residual_mm(base_residual + sample.missing_rad)
+    phase_change = TAU * (order - scene.order) + answers.correction_rad
+    predicted_mm = np.nan_to_num(layer.depth_of_residual_mm(base_residual + phase_change))
     target = sample.target
-    left = off - sample.missing_rad
-    error = np.where(inside, np.minimum(np.abs(found_mm - true_mm), true_mm), true_mm)[target]
-    wrong = (np.abs(left) > np.pi)[target]
-    both = inside[target]
+    phase_error = phase_change - sample.missing_rad
+    error = np.where(inside, np.minimum(np.abs(predicted_mm - true_mm), true_mm), true_mm)[target]
+    wrong = (np.abs(phase_error) > np.pi)[target]
+    detected = inside[target]
     return {
         "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[both & ~wrong].mean()),
+        "right_mae_mm": float(error[detected & ~wrong].mean()),
         "wrong_percent": 100 * float(wrong.mean()),
-        "missed_percent": 100 * float((~both).mean()),
+        "missed_percent": 100 * float((~detected).mean()),
         "invented_kpx": float((inside & ~target).sum()) / 1000,
     }
 
@@ -131,9 +137,10 @@ def batches(
 
 def train(
     recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry], out: Path,
-    report: Callable[[list[dict[str, Any]]], None] = lambda history: None, tick: Callable[[int], None] = lambda n: None,
+    report: Callable[[list[dict[str, Any]]], None] = lambda history: None,
+    advance: Callable[[int], None] = lambda steps: None,
     minutes: float | None = None, start: PhaseNet | None = None,
-) -> Done:  # fmt: skip
+) -> TrainedNetwork:  # fmt: skip
     """Train to the recipe's end, or to the first validation after ``minutes``, from the checkpoint in ``out`` where
     there is one, else from the weights of ``start`` or none.
 
@@ -148,19 +155,19 @@ def train(
             raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
         network.load_state_dict(start.state_dict())
     averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
-    kept: PhaseNet = averaged.module  # type: ignore[assignment]
+    averaged_network: PhaseNet = averaged.module  # type: ignore[assignment]
     optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
     history: list[dict[str, Any]] = []
     first = _restore(out / CHECKPOINT_FILE, recipe, network, averaged, optimizer, history)
-    tick(first)
+    advance(first)
     weights = {"order": recipe.weight_order, "mask": recipe.weight_mask, "phase": recipe.weight_phase}
-    sums, since = dict.fromkeys(weights, 0.0), perf_counter()
+    sums, interval_started = dict.fromkeys(weights, 0.0), perf_counter()
     network.train()
     for step, batch in enumerate(batches(samples, geometries, recipe, first), start=first):
         for group in optimizer.param_groups:
             group["lr"] = recipe.rate_at(step)
-        found = losses(network, batch, recipe.bound_rad)
-        total = torch.stack([weights[name] * found[name] for name in weights]).sum()
+        step_losses = losses(network, batch, recipe.bound_rad)
+        total = torch.stack([weights[name] * step_losses[name] for name in weights]).sum()
         if not bool(torch.isfinite(total)):
             raise TrainingError(f"{out}: the loss is {float(total)} at step {step + 1}; lower the rate and start again")
         optimizer.zero_grad(set_to_none=True)
@@ -168,21 +175,22 @@ def train(
         torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
         optimizer.step()
         averaged.update_parameters(network)
-        sums = {name: sums[name] + float(found[name].detach()) for name in sums}
-        tick(1)
-        done = step + 1
-        if done % recipe.validate_every == 0 or done == recipe.steps:
-            count = done % recipe.validate_every or recipe.validate_every
-            record: dict[str, Any] = {"step": done, "rate": recipe.rate_at(step), "seconds": perf_counter() - since}
+        sums = {name: sums[name] + float(step_losses[name].detach()) for name in sums}
+        advance(1)
+        steps_done = step + 1
+        if steps_done % recipe.validate_every == 0 or steps_done == recipe.steps:
+            count = steps_done % recipe.validate_every or recipe.validate_every
+            seconds = perf_counter() - interval_started
+            record: dict[str, Any] = {"step": steps_done, "rate": recipe.rate_at(step), "seconds": seconds}
             record |= {f"loss_{name}": value / count for name, value in sums.items()}
-            record |= scores(kept.eval(), validation, geometries) if validation else {}
+            record |= scores(averaged_network.eval(), validation, geometries) if validation else {}
             history.append(record)
             report(history)
-            _save(out / CHECKPOINT_FILE, recipe, done, network, averaged, optimizer, history)
-            sums, since = dict.fromkeys(weights, 0.0), perf_counter()
+            _save(out / CHECKPOINT_FILE, recipe, steps_done, network, averaged, optimizer, history)
+            sums, interval_started = dict.fromkeys(weights, 0.0), perf_counter()
             if minutes is not None and perf_counter() - started > 60 * minutes:
-                return Done(kept.eval(), history, done)
-    return Done(kept.eval(), history, recipe.steps)
+                return TrainedNetwork(averaged_network.eval(), history, steps_done)
+    return TrainedNetwork(averaged_network.eval(), history, recipe.steps)
 
 
 def _save(

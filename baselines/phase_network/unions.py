@@ -1,8 +1,8 @@
-"""Several training objects in one place: depth jumps and creases that no single one of them has.
+"""Unions: several training objects in one image, for depth jumps and creases that no single object has.
 
-All objects of a dataset stand in the same field before the same lamp, so the nearer of two images at every pixel is
-what the rig would capture of both standing there, through each other where they meet, but for the light that one takes
-from the other. No new object, no renderer.
+All objects of a dataset are captured by the same rig in the same light. Taking, at every pixel, the image whose surface
+is nearer gives what the rig would capture of all of them together (they may intersect), except for the shadows that
+they cast on one another. This needs no new object and no renderer.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +14,8 @@ from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sampl
 from fpp_ml_bench.loaders.store import DatasetFolder
 
 SHADOW_GREY = 6.0
-"""Grey levels by which one background must be darker than the other to count as an object's shadow on the plane."""
-MOST = 3
+"""Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""
+MOST_OBJECTS = 3
 """Objects in one union, at most."""
 
 
@@ -24,7 +24,7 @@ def united(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Image uint8 (H, W) and depth in mm float32 (H, W), 0 = background, of all objects together.
 
-    The nearest surface counts; where none is, the first image's background, or another's where an object shadows it.
+    The nearest surface counts; without one, the first image's background, or another image's where it is in shadow.
     """
     ranges = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm])
     nearest = ranges.argmin(axis=0)
@@ -38,35 +38,35 @@ def united(
 
 
 def companions(objects: Mapping[str, str], sample: str, random: np.random.Generator) -> list[str]:
-    """One or two samples that show other objects than ``sample`` does, each another; fewer where there are none.
+    """One or two samples of objects that differ from that of ``sample`` and from each other; fewer if there are none.
 
-    ``objects``: the object of every sample that may be taken."""
-    here = [sample]
-    for _ in range(int(random.integers(1, MOST))):
-        seen = {objects[one] for one in here}
-        others = [one for one, shown in objects.items() if shown not in seen]
-        if others:
-            here.append(others[int(random.integers(len(others)))])
-    return here[1:]
+    ``objects``: the object of every sample to choose from."""
+    members = [sample]
+    for _ in range(int(random.integers(1, MOST_OBJECTS))):
+        shown_objects = {objects[member] for member in members}
+        candidates = [member for member, object_name in objects.items() if object_name not in shown_objects]
+        if candidates:
+            members.append(candidates[int(random.integers(len(candidates)))])
+    return members[1:]
 
 
 def unions_of(
     opened: DatasetFolder, names: Sequence[str], geometry: Geometry, count: int, seed: int,
     progress: Callable[[int], None] = lambda n: None,
 ) -> list[Sample]:  # fmt: skip
-    """``count`` unions of every one of ``names`` with others of them, the same objects for both fringe directions."""
+    """``count`` unions of each of ``names`` with others of them, the same objects for both fringe directions."""
     frame = opened.sequence.sinusoids(geometry.route.settings.direction)[0]
     objects = {name: str(opened.measured(name)["object"]) for name in names}
-    found = []
+    samples = []
     for number, name in enumerate(names):
         for copy in range(count):
             random = np.random.default_rng([seed, number, copy])
             members = [name, *companions(objects, name, random)]
             if len(members) > 1:
                 image, depth_mm = united(
-                    [np.asarray(opened.frame(one, frame)) for one in members],
-                    [opened.depth_mm(one) for one in members],
+                    [np.asarray(opened.frame(member, frame)) for member in members],
+                    [opened.depth_mm(member) for member in members],
                 )
-                found.append(sample_of(image, depth_mm, "+".join(members), geometry))
+                samples.append(sample_of(image, depth_mm, "+".join(members), geometry))
             progress(1)
-    return found
+    return samples

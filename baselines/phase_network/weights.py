@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from fpp_ml_bench.baselines.training_data import TrainingBenchmark
 from fpp_ml_bench.baselines.weights_file import SUFFIX, weights_path
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
@@ -32,10 +33,13 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 @checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class NetConfig:
-    """``options``: what `PhaseNet` takes; ``threshold``: logit from which on a pixel is object; ``lead``: logit that is
-    added to the first order's, both chosen on the validation split; ``period_px``: image px
-    per fringe period it learned from, by direction; ``recipe``: the resolved training recipe; ``dataset_fingerprint``;
-    ``validation``: scores."""
+    """What the network is, how its answers are used, and what it was trained on.
+
+    ``options``: arguments of `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added
+    to the logit of the base order (see `decide.network_answers`), both chosen on the validation split; ``period_px``:
+    image px per fringe period of the training images, by direction; ``dataset_fingerprint`` and ``benchmark``: training
+    data, the latter None for a dataset of the user's own and in older files; ``steps`` trained; ``recipe``: the
+    resolved training recipe; ``validation``: scores."""
 
     name: Text
     title: Text
@@ -43,6 +47,7 @@ class NetConfig:
     threshold: Finite
     period_px: dict[Text, Finite]
     dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    benchmark: TrainingBenchmark | None = None
     lead: Finite = 0.0
     steps: Count = 0
     recipe: dict[Text, Any] = field(default_factory=dict)
@@ -54,7 +59,7 @@ _CONFIG: TypeAdapter[NetConfig] = TypeAdapter(NetConfig)
 
 @dataclass(frozen=True)
 class NetFile:
-    """A checked file and the network in it, ready to be asked."""
+    """A checked file and the network in it, ready to run."""
 
     path: Path
     config: NetConfig
@@ -87,9 +92,10 @@ def save_net(path: Path, network: "PhaseNet", config: NetConfig) -> str:
 
 
 def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile:
-    """Configuration and network of shipped weights or of a file, float32; `PhaseNet.folded` for asking, or to go on.
+    """Configuration and network of shipped weights or of a file, float32; ``folded``: for inference alone
+    (`PhaseNet.folded`), False to train on.
 
-    Raises `WeightsError`, naming the file, what was expected, what came and the cure, for a file that is absent,
+    Raises `WeightsError`, naming the file, the expected and the actual content and the cure, for a file that is absent,
     damaged, of another kind or version, or whose tensors do not fit its configuration.
     """
     import torch
@@ -101,8 +107,8 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile
     path = weights_path(name_or_path, SHIPPED)
     shown = printable(str(path), 500)
     if not path.is_file():
-        came = "a folder" if path.is_dir() else "nothing"
-        raise WeightsError(f"{shown}: expected phase-net weights (*{SUFFIX}), found {came} there")
+        actual = "a folder" if path.is_dir() else "nothing"
+        raise WeightsError(f"{shown}: expected phase-net weights (*{SUFFIX}), found {actual} there")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -129,15 +135,16 @@ def _config(shown: str, data: bytes) -> NetConfig:
         if len(data) < 8 or length > len(data) - 8:
             raise ValueError(f"{len(data)} bytes, cut off or no {SUFFIX} at all")
         metadata = json.loads(data[8 : 8 + length].decode("utf-8"))["__metadata__"]
-        found = metadata["format"], metadata["version"]
+        header_format = metadata["format"], metadata["version"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise WeightsError(
             f"{shown}: damaged or no phase-net weights ({printable(str(error), 200)}); copy or train it again"
         ) from None
-    if found != (FORMAT, VERSION):
+    if header_format != (FORMAT, VERSION):
         raise WeightsError(
-            f"{shown}: expected {FORMAT} version {VERSION}, got {printable(' version '.join(map(str, found)), 100)}; "
-            "give a file that fpp-bench train phase-net wrote"
+            f"{shown}: expected {FORMAT} version {VERSION}, got "
+            f"{printable(' version '.join(map(str, header_format)), 100)}; give a file that fpp-bench train phase-net "
+            "wrote"
         )
     try:
         return _CONFIG.validate_json(metadata.get("config", ""))

@@ -1,10 +1,10 @@
 """Windows of training samples, varied as other scenes would vary them.
 
-Whole objects are put at another distance: the phase of every pixel moves by what the object's middle moves, its light
-changes as the calibrated lamp's would, and what the measured route got wrong there stays as wrong as it was. Wrong
-first orders are made up in patches and whole windows, for the training objects show few. Columns are mirrored, which
-is a lamp on the other side. Brightness varies a little, and now and then the brightness channels are left out, so that
-the network can be asked to do without them.
+Whole objects are moved to another distance: the phase of every pixel changes by as much as that of the object's middle,
+its light changes as the calibrated lamp's would, and the measured route's errors stay as they were. Wrong base orders
+are made up in patches and whole windows, because the training objects have few of them. Columns are mirrored, which
+corresponds to a projector on the other side. Brightness varies a little, and sometimes the brightness channels are set
+to 0, so that the network also works without them.
 """
 
 from dataclasses import dataclass, replace
@@ -30,16 +30,18 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.frames import Direction
 
 IGNORED = -100
-"""Class of a pixel whose order teaches nothing: background, or none of the three candidates is right."""
+"""Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
 _MIRRORED = CHANNELS.index("slope across")
 _PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
-_OWN = FIRST_SIDE + len(SIDES)
-_SWAPPED = [FIRST_SIDE + place for place in _PARTNERS] + [_OWN] + [_OWN + 1 + place for place in _PARTNERS]
+_FIRST_MISFIT = FIRST_SIDE + len(SIDES)
+_SWAPPED = (
+    [FIRST_SIDE + place for place in _PARTNERS] + [_FIRST_MISFIT] + [_FIRST_MISFIT + 1 + place for place in _PARTNERS]
+)
 
 
 @dataclass(frozen=True)
 class Variation:
-    """How often (0 to 1) and how much windows are varied; 0 throughout leaves them as they were captured."""
+    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured."""
 
     near_edge: float = 0.7
     shift: float = 0.5
@@ -54,8 +56,8 @@ class Variation:
 @dataclass(frozen=True)
 class Window:
     """One training example: ``x`` (C, n, n) float32, ``exists`` (3, n, n); ``order`` int64 (n, n), 0 to 2 or `IGNORED`;
-    ``correction_rad`` and ``fitted`` (n, n): what is left of the phase, and where it counts; ``target`` bool (n, n):
-    object; ``known``: where the mask counts, for light that was made up says nothing of it."""
+    ``correction_rad`` and ``fitted`` (n, n): error of the phase beside the order, and where it counts; ``target`` bool
+    (n, n): object; ``mask_valid``: where the mask's loss counts, False for an object that was moved."""
 
     x: Image
     exists: NDArray[np.bool_]
@@ -63,7 +65,7 @@ class Window:
     correction_rad: Image
     fitted: NDArray[np.bool_]
     target: NDArray[np.bool_]
-    known: NDArray[np.bool_]
+    mask_valid: NDArray[np.bool_]
 
 
 def draw(
@@ -90,7 +92,7 @@ def draw(
         x[list(SHADING)] = 0
     missing = geometry.rotation.turn(missing) * np.float32(geometry.rotation.sign)
     target = geometry.rotation.turn(target)
-    window = _labelled(x, exists, missing, target, size, known=not moved)
+    window = _labelled(x, exists, missing, target, size, mask_valid=not moved)
     return _mirrored(window) if random.random() < vary.mirror else window
 
 
@@ -111,26 +113,26 @@ def _moved(
 ) -> Scene:  # fmt: skip
     """The object at another distance within the working range."""
     near, far = geometry.rig.working_range_mm
-    true = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
-    middle = float(np.median(true[target]))
+    true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
+    middle = float(np.median(true_rad[target]))
     gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
     depth_m = random.uniform(near + vary.margin_mm, far - vary.margin_mm) / MM_PER_M
     delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
-    every = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
+    grid = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
     rows, columns = scene.crop
     where = (slice(rows.start, rows.stop, STEP_PX), slice(columns.start, columns.stop, STEP_PX))
-    coarse, slopes = layer.at(every), (scene.slopes[0][every], scene.slopes[1][every])
+    coarse, slopes = layer.at(grid), (scene.slopes[0][grid], scene.slopes[1][grid])
     with np.errstate(all="ignore"):
         before, after = (
             np.maximum(irradiance(coarse, residual, slopes, geometry.rig, where), 1e-3)
-            for residual in (true[every], true[every] + delta)
+            for residual in (true_rad[grid], true_rad[grid] + delta)
         )
         ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
     height, width = scene.light.shape
     ratio = ratio.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[:height, :width].astype(np.float32)
     ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
-    seen = scene.phase_rad + missing
-    light = ratio * (scene.light + scene.bright * (np.cos(seen + delta) - np.cos(seen)))
+    true_phase = scene.phase_rad + missing
+    light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
     phase = scene.phase_rad + delta
     carry = np.rint(phase / TAU)
     return replace(
@@ -144,7 +146,7 @@ def _wrong(
     scene: Scene, missing: Image, layer: CalibrationLayer, geometry: Geometry, vary: Variation,
     random: np.random.Generator,
 ) -> tuple[Scene, Image]:  # fmt: skip
-    """Wrong first orders, where the range allows them."""
+    """Wrong base orders, where the working range allows them."""
     height, width = scene.light.shape
     off = np.zeros((height, width), np.int32)
     middle = 0
@@ -167,7 +169,7 @@ def _wrong(
 
 
 def _labelled(
-    x: Image, exists: NDArray[np.bool_], missing: Image, target: NDArray[np.bool_], size: int, known: bool
+    x: Image, exists: NDArray[np.bool_], missing: Image, target: NDArray[np.bool_], size: int, mask_valid: bool
 ) -> Window:
     steps = np.rint(missing / TAU).astype(np.int64)
     possible = target & (np.abs(steps) <= 1)
@@ -180,7 +182,8 @@ def _labelled(
     return Window(
         np.pad(x, deep), np.pad(exists, deep, constant_values=True),
         np.pad(np.where(possible, place, IGNORED), pad, constant_values=IGNORED),
-        np.pad(correction, pad), np.pad(possible, pad), np.pad(target, pad), np.pad(np.full(target.shape, known), pad),
+        np.pad(correction, pad), np.pad(possible, pad), np.pad(target, pad),
+        np.pad(np.full(target.shape, mask_valid), pad),
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ TAU = 2 * np.pi
 
 @dataclass(frozen=True)
 class Lens:
-    """What a distorted projector adds: ``rays`` a (three maps), ``t`` in metres, the axis that the fringes measure."""
+    """Constants of a distorted projector: ``rays`` a (three maps), ``t`` in metres, ``axis`` across the fringes."""
 
     rays: tuple[Any, Any, Any]
     t: tuple[float, float, float]
@@ -108,7 +108,7 @@ class CalibrationLayer:
 
     def depth_mm(self, phase_rad: Any, order: Any) -> Any:
         """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or tensors of the maps' shape
-        (leading dimensions may be more). Not bounded: what lies behind a device comes out negative or infinite."""
+        (leading dimensions may be more). Not bounded: a point behind a device gets a negative or infinite depth."""
         return self.depth_of_residual_mm(self.residual_phase(phase_rad, order))
 
     def depth_of_residual_mm(self, residual_rad: Any) -> Any:
@@ -149,14 +149,14 @@ class Candidates:
 def orders_in_range(layer: CalibrationLayer, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
     """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none.
 
-    The rig decides how many there are: periods_in_range rounded up or down, one pixel more, one less.
+    Their number is the rig's `periods_in_range`, rounded up at some pixels and down at others.
     """
     phase = np.asarray(phase_rad, dtype=np.float64)
     ends = [layer.absolute_phase(end) for end in range_mm]
     low, high = np.minimum(*ends), np.maximum(*ends)
-    known = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
-    phase, low, high = (np.where(known, one, 0.0) for one in (phase, low, high))
+    defined = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
+    phase, low, high = (np.where(defined, values, 0.0) for values in (phase, low, high))
     first, last = np.ceil((low - phase) / TAU), np.floor((high - phase) / TAU)
-    count = np.where(known, np.maximum(last - first + 1, 0), 0)
+    count = np.where(defined, np.maximum(last - first + 1, 0), 0)
     first = np.where(count > 0, first, np.rint(((low + high) / 2 - phase) / TAU))
     return Candidates(first.astype(np.int32), count.astype(np.int32))

@@ -16,7 +16,7 @@ class TorchCalibrationLayer(nn.Module):
     """(wrapped phase rad, fringe order) -> depth in mm, (..., H, W) each, for one rig and fringe direction.
 
     ``dtype`` float32 keeps a micrometre (the residual phase is never a difference of large numbers); float64 equals the
-    NumPy layer to 1e-6 mm. Depth is not bounded: the working range is the business of whoever chooses the order.
+    NumPy layer to 1e-6 mm. Depth is not bounded: only the choice of the order respects the working range.
     """
 
     def __init__(self, rig: Rig, direction: Direction, dtype: torch.dtype = torch.float32) -> None:
@@ -27,8 +27,8 @@ class TorchCalibrationLayer(nn.Module):
         if layer.lens is not None:
             maps += layer.lens.rays
             names += ["ray_0", "ray_1", "ray_2"]
-        for name, one in zip(names, maps, strict=True):
-            self.register_buffer(name, torch.from_numpy(np.array(one)).to(dtype), persistent=False)
+        for name, values in zip(names, maps, strict=True):
+            self.register_buffer(name, torch.from_numpy(np.array(values)).to(dtype), persistent=False)
         self._layer = layer
 
     def layer(self) -> CalibrationLayer:

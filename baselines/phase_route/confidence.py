@@ -1,9 +1,9 @@
-"""How far off a pixel may be, in mm, and the reasons for which it should not be trusted.
+"""The expected error of each pixel in mm, and the reasons not to trust a pixel.
 
 The expected error adds three parts. Noise and misfit of the local fit: the window's rms misfit over brightness is a
-phase, and phase is depth by the calibration layer's slope. The rim: where half the window lies off the object, the fit
-carries on instead of averaging. The order: a margin of belief is a chance of being a period off, which is known in
-mm. A confidence of 1 / (1 + error / 5 mm) puts it between 0 and 1.
+phase error, and the calibration layer's slope turns it into depth. The rim: where half the window lies off the object,
+the fit extrapolates instead of averaging. The order: its margin gives the probability of being a period off, whose
+error in mm is known. The confidence, 1 / (1 + error / 5 mm), lies between 0 and 1.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ Image = NDArray[np.float32]
 
 HALF_CONFIDENCE_MM = 5.0
 LEAST_MARGIN = 0.1
-"""How clearly an order must have won, of 1 for brightness that rules the rival out, not to be called ambiguous."""
+"""Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""
 MARGIN_SCALE = 0.04
 """Margin by which the odds of two orders grow e-fold."""
 SATURATED_SHARE = 0.02
@@ -62,16 +62,18 @@ def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.boo
     return share
 
 
-def expected_error_mm(seen: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
-    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and its part that doubt about the order makes;
-    0 outside the mask."""
-    layer = seen.layer
+def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
+    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and its part that comes from the order; 0 outside
+    the mask."""
+    layer = observation.layer
     z = np.maximum(depth_mm, 1.0) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
-    wrong = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    whole = np.where(seen.inside, mm_per_rad * (seen.uncertainty_rad + TAU * wrong), 0).astype(np.float32)
-    return whole, np.where(seen.inside, mm_per_rad * TAU * wrong, 0).astype(np.float32)
+    wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
+    error_mm = np.where(observation.inside, mm_per_rad * (observation.uncertainty_rad + TAU * wrong_chance), 0).astype(
+        np.float32
+    )
+    return error_mm, np.where(observation.inside, mm_per_rad * TAU * wrong_chance, 0).astype(np.float32)
 
 
 def confidence_of(error_mm: Image) -> Image:
@@ -80,33 +82,41 @@ def confidence_of(error_mm: Image) -> Image:
 
 
 def reasons(
-    seen: Observation, margin: Image, sure: Image, depth_mm: NDArray, rig: Rig, settings: Settings, period_px: float
+    observation: Observation,
+    margin: Image,
+    confidence: Image,
+    depth_mm: NDArray,
+    rig: Rig,
+    settings: Settings,
+    period_px: float,
 ) -> NDArray[np.uint8]:
-    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` where nothing speaks against it.
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
 
-    A depth outside the working range speaks against it even where some order would have given one inside: a chooser
-    that corrects the phase can leave the range that its orders were chosen for.
+    A depth outside the working range is a reason also where another order would give a depth inside: a chooser that
+    corrects the phase can leave the range that its orders were chosen for.
     """
     near, far = rig.working_range_mm
     outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
-    slopes = seen.slopes
+    slopes = observation.slopes
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
     along = np.abs(TAU / period_px + slopes[axis]) * period_px / TAU
     across = np.abs(slopes[1 - axis]) * period_px / TAU
     frequency = np.hypot(along, across)
-    wide = cv2.morphologyEx(seen.inside.astype(np.uint8), cv2.MORPH_OPEN, disk(THIN_PERIODS / 2 * period_px)) > 0
-    code = np.full(seen.inside.shape, Reason.MEASURED, np.uint8)
+    thick = (
+        cv2.morphologyEx(observation.inside.astype(np.uint8), cv2.MORPH_OPEN, disk(THIN_PERIODS / 2 * period_px)) > 0
+    )
+    reason_map = np.full(observation.inside.shape, Reason.MEASURED, np.uint8)
     checks = (
-        (sure < settings.min_confidence, Reason.UNSURE),
+        (confidence < settings.min_confidence, Reason.UNSURE),
         (margin < LEAST_MARGIN, Reason.AMBIGUOUS),
         ((frequency < SLOWEST) | (frequency > FASTEST), Reason.TOO_STEEP),
-        (~wide, Reason.THIN),
-        ((seen.candidates.count == 0) | outside, Reason.OUT_OF_RANGE),
-        (seen.clipped > SATURATED_SHARE, Reason.SATURATED),
-        (seen.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
-        (~seen.inside, Reason.BACKGROUND),
+        (~thick, Reason.THIN),
+        ((observation.candidates.count == 0) | outside, Reason.OUT_OF_RANGE),
+        (observation.clipped > SATURATED_SHARE, Reason.SATURATED),
+        (observation.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
+        (~observation.inside, Reason.BACKGROUND),
     )
-    for where, reason in checks:
-        code[where] = reason
-    return code
+    for pixels, reason in checks:
+        reason_map[pixels] = reason
+    return reason_map

@@ -1,10 +1,10 @@
-"""The background plane as the rig predicts it, fitted to what one image shows of it.
+"""The background plane as the rig predicts it, fitted to the background in an image.
 
-The plane's distance is calibrated, so its phase is known at every pixel, and its brightness but for three things:
-ambient light, the lamp's strength, and a slow change of its sheen across the image. They are fitted to the image's own
-background. What then differs from the prediction by more than noise is not background. The lamp's strength is also what
-turns an object's brightness into distance and slope (`fpp_ml_bench.baselines.phase_route.shading`): the paper's plane
-and objects are of one material.
+The plane's distance is calibrated, so its phase is known at every pixel, and so is its brightness except for three
+things: ambient light, the lamp's strength, and a slow change of its sheen across the image. They are fitted to the
+image's own background. Pixels that then differ from the prediction by more than noise are not background. The lamp's
+strength also turns an object's brightness into distance and slope (`fpp_ml_bench.baselines.phase_route.shading`): the
+paper's plane and objects are of the same material.
 """
 
 from dataclasses import dataclass
@@ -17,27 +17,27 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.rig import Rig
 
 TILE_PX_PER_PERIOD = 1.1
-"""Tiles on which the plane is looked for: a little over one period, so that strength and ambient light part."""
+"""Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
 TILE_NOISE_GREY = 3.0
 """Largest misfit of a tile that may be background: three times the benchmark's noise."""
 LEAST_SHARE = 0.02
 """Of the image's tiles that must show background for the image to calibrate itself."""
 STRENGTH_TOLERANCE = 0.4
-"""Of the lamp's strength in one image against the calibrated one. A surface in range whose fringe happens to lie in
-phase with the plane's is two to four times as bright, and must not pass for it."""
+"""Relative deviation of the lamp's strength in an image from the calibrated strength. A surface in the working range
+whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
 SAMPLE_STEP_PX = 5
 FLOOR_NOISE_GREY = 0.3
-"""Rounding to whole grey levels alone."""
+"""Noise of rounding to whole grey levels."""
 
 
 def fall_off(rig: Rig, depth_m: float) -> NDArray[np.float64]:
     """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
     x, y = rig.camera.rays()
     centre = -rig.R.T @ rig.t
-    # The plane's normal is the camera's axis, whatever way the projector is turned.
-    to = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
-    squared = to[0] ** 2 + to[1] ** 2 + to[2] ** 2
-    return to[2] / (squared * np.sqrt(squared))
+    # The plane's normal is the camera's axis, however the projector is rotated.
+    from_lamp = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
+    squared = from_lamp[0] ** 2 + from_lamp[1] ** 2 + from_lamp[2] ** 2
+    return from_lamp[2] / (squared * np.sqrt(squared))
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Background:
 
     ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
     ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
-    the calibrated constants had to do; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
+    the calibrated constants were used; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
     """
 
     ambient_grey: float
@@ -58,7 +58,7 @@ class Background:
 
 
 class EmptyScene:
-    """What one rig and direction show of the background plane; made once, then fitted to every image.
+    """The background plane as a rig and direction show it; computed once, then fitted to every image.
 
     ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
     grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
@@ -84,27 +84,29 @@ class EmptyScene:
 
     def _tiles(self, image: NDArray) -> NDArray[np.float64]:
         """Means over whole tiles."""
-        t = self._tile
-        height, width = (length // t * t for length in image.shape)
-        rows = image[:height, :width].reshape(height, width // t, t).sum(axis=2, dtype=np.float64)
-        return rows.reshape(height // t, t, width // t).sum(axis=1) / (t * t)
+        tile = self._tile
+        height, width = (length // tile * tile for length in image.shape)
+        rows = image[:height, :width].reshape(height, width // tile, tile).sum(axis=2, dtype=np.float64)
+        return rows.reshape(height // tile, tile, width // tile).sum(axis=1) / (tile * tile)
 
     def fit(self, image: NDArray[np.uint8]) -> Background:
         """Background of ``image`` uint8 (H, W)."""
         grey = image.astype(np.float32)
-        good = self._background_tiles(grey)
-        share = float(good.mean())
+        plane_tiles = self._background_tiles(grey)
+        share = float(plane_tiles.mean())
         if share < LEAST_SHARE:
             residual = grey - self.ambient_grey - self.strength * self._terms[0]
             return Background(self.ambient_grey, self.strength, self.noise_grey, residual, 0.0, (self.strength,))
-        t = self._tile
-        chosen = np.zeros(image.shape, dtype=bool)
-        chosen[: good.shape[0] * t, : good.shape[1] * t] = good.repeat(t, axis=0).repeat(t, axis=1)
-        some = np.zeros_like(chosen)
-        some[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = chosen[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
-        terms = np.stack([np.ones(int(some.sum()))] + [term[some] for term in self._terms], axis=1).astype(np.float64)
-        solution = np.linalg.lstsq(terms, grey[some].astype(np.float64), rcond=None)[0]
-        misfit = grey[some] - terms @ solution
+        tile = self._tile
+        plane_pixels = np.zeros(image.shape, dtype=bool)
+        rows, columns = (count * tile for count in plane_tiles.shape)
+        plane_pixels[:rows, :columns] = plane_tiles.repeat(tile, axis=0).repeat(tile, axis=1)
+        sampled = np.zeros_like(plane_pixels)
+        sampled[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
+        ones = np.ones(int(sampled.sum()))
+        terms = np.stack([ones] + [term[sampled] for term in self._terms], axis=1).astype(np.float64)
+        solution = np.linalg.lstsq(terms, grey[sampled].astype(np.float64), rcond=None)[0]
+        misfit = grey[sampled] - terms @ solution
         noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
         residual = grey - np.float32(solution[0])
         for weight, term in zip(solution[1:], self._terms, strict=True):
@@ -130,9 +132,9 @@ class EmptyScene:
             covariance = self._tiles(grey * self._light) - mean * self._mean
             slope = covariance / spread
             misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
-            good = (misfit < TILE_NOISE_GREY) & (spread > 1e-2 * spread.max())
-            good &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
-        if not good.any():
-            return good
-        usual = float(np.median(slope[good]))
-        return good & (np.abs(slope / usual - 1) < 0.15)
+            plane_tiles = (misfit < TILE_NOISE_GREY) & (spread > 1e-2 * spread.max())
+            plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
+        if not plane_tiles.any():
+            return plane_tiles
+        typical = float(np.median(slope[plane_tiles]))
+        return plane_tiles & (np.abs(slope / typical - 1) < 0.15)

@@ -1,10 +1,10 @@
 """The fewest frames that a scene needs for a stated error, decided while capturing, without ground truth.
 
-Capture one fringe and look: the measurement says how far off it expects to be, through its phase and through doubt
-about its order. Where that is not good enough, capture what would help: another fringe or some for the phase, the Gray
-code for the order, and look again. Every level completes the one before it, so that no captured frame is wasted: 1, 2
-and 3 fringes a third of a period apart, then 6, then 18; the Gray code may join from 3 on. What was not captured is
-never looked at.
+Capture one fringe and measure: the measurement gives its expected error, from its phase and from its order. While that
+error is too large, capture the frames that reduce it (more fringes for the phase, the Gray code for the order) and
+measure again. Every level contains the frames of the level before it, so no captured frame is wasted: 1, 2 and 3
+fringes a third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured
+are never read.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,14 +24,15 @@ from fpp_ml_bench.rig import Rig
 Frames = Sequence[NDArray[np.uint8] | None]
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
-"""Of the error that doubt about the order makes one expect: what 1, 2, and 3 or more frames really had of it, over
-training views (``benchmarks/frames_choice.py --calibrate`` counts it again). A margin knows that an order is doubtful;
-that most doubtful orders are right, only counting tells."""
+"""Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
+(``benchmarks/frames_choice.py --calibrate`` measures it again). The margin of an order overestimates the probability
+that it is wrong; these factors correct that."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What was seen with ``frames`` frames captured, ``gray``: Gray code among them. Means over object pixels, mm."""
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: ``phase_mm`` from the phase and
+    ``order_mm`` from the order; ``gray``: whether the Gray code is among the frames."""
 
     frames: int
     gray: bool
@@ -44,19 +45,19 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """``depth_mm`` float32 (H, W) of the last look, the ``frames_used`` for it (indices, ascending), every look."""
+class FrameChoice:
+    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
 
     depth_mm: NDArray[np.float32]
     frames_used: tuple[int, ...]
     looks: tuple[Look, ...]
 
     def report(self) -> dict[str, Any]:
-        """JSON of one sample: how many frames, which, and what was expected at each look."""
+        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
         looks = [
-            {"frames": one.frames, "gray_code": one.gray, "expected_error_mm": round(one.expected_mm, 4),
-             "by_phase_mm": round(one.phase_mm, 4), "by_order_mm": round(one.order_mm, 4)}
-            for one in self.looks
+            {"frames": look.frames, "gray_code": look.gray, "expected_error_mm": round(look.expected_mm, 4),
+             "by_phase_mm": round(look.phase_mm, 4), "by_order_mm": round(look.order_mm, 4)}
+            for look in self.looks
         ]  # fmt: skip
         last = self.looks[-1]
         return {
@@ -66,14 +67,14 @@ class Chosen:
 
 
 def levels_of(steps: int) -> tuple[int, ...]:
-    """Numbers of fringes that can be captured one after the other, each completing the last: 1, 2, 3 and more where
-    ``steps`` divides into three, else one and then all."""
+    """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
+    multiple of three, else 1 and then all."""
     if steps % PIXELWISE:
         return (1, steps)
     levels = [1, 2, PIXELWISE]
-    for more in (6, steps):
-        if more > levels[-1] and set(steps_of(steps, levels[-1])) <= set(steps_of(steps, more)):
-            levels.append(more)
+    for fringes in (6, steps):
+        if fringes > levels[-1] and set(steps_of(steps, levels[-1])) <= set(steps_of(steps, fringes)):
+            levels.append(fringes)
     return tuple(levels)
 
 
@@ -103,8 +104,8 @@ class FewestFrames:
 
     @property
     def frames_used(self) -> tuple[int, ...]:
-        """All frames that a scene may need; most need few of them."""
-        fringes = {index for one in self.methods.values() for index in one.frames_used}
+        """All frames that a scene may need; most scenes need few of them."""
+        fringes = {index for method in self.methods.values() for index in method.frames_used}
         return tuple(sorted(fringes | set(self.gray)))
 
     @property
@@ -115,53 +116,53 @@ class FewestFrames:
     def settings(self) -> dict[str, Any]:
         return {"error_mm": self.error_mm} | {k: v for k, v in self.methods[1].settings.items() if k != "frames"}
 
-    def choose(self, frames: Frames) -> Chosen:
-        """Look, capture more, look again, until the expected error is at most ``error_mm`` or nothing is left."""
+    def choose(self, frames: Frames) -> FrameChoice:
+        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""
         looks: list[Look] = []
         levels = list(self.methods)
-        place, gray = 0, False
+        level, gray = 0, False
         while True:
-            count = levels[place]
-            made = self.methods[count]
-            found = made.measure(frames)
-            look = self._look(found, count)
-            depth_mm, used = found.depth_mm, made.frames_used
+            count = levels[level]
+            method = self.methods[count]
+            measurement = method.measure(frames)
+            look = self._look(measurement, count)
+            depth_mm, used = measurement.depth_mm, method.frames_used
             if gray:
                 decoded = decode_stack(frames, self.rig, direction=self.options.direction, steps=count)
-                depth_mm, used = decoded.depth_mm, tuple(sorted({*made.frames_used, *self.gray}))
+                depth_mm, used = decoded.depth_mm, tuple(sorted({*method.frames_used, *self.gray}))
                 look = replace(look, frames=len(used), gray=True, order_mm=0.0)
             looks.append(look)
             if look.expected_mm <= self.error_mm:
                 break
-            # The Gray code settles the order and nothing else: it is asked for when the phase is good enough already,
-            # or when there are no more fringes.
-            last = place + 1 == len(levels)
+            # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe is
+            # left.
+            last = level + 1 == len(levels)
             if not gray and count >= PIXELWISE and (look.phase_mm <= self.error_mm or last):
                 gray = True
             elif last:
                 break
             else:
-                place += 1
-        return Chosen(depth_mm, used, tuple(looks))
+                level += 1
+        return FrameChoice(depth_mm, used, tuple(looks))
 
-    def _look(self, found: Measurement, count: int) -> Look:
-        there = found.depth_mm > 0
-        if not there.any():
+    def _look(self, measurement: Measurement, count: int) -> Look:
+        on_object = measurement.depth_mm > 0
+        if not on_object.any():
             return Look(count, False, 0.0, 0.0)
-        order = float(found.order_doubt_mm[there].mean(dtype=np.float64))
-        whole = float(found.expected_error_mm[there].mean(dtype=np.float64))
-        return Look(count, False, whole - order, order * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
+        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
+        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
+        return Look(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
 
     def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Depth as `predict`, and the sample's report (see `Chosen.report`)."""
-        chosen = self.choose(frames)
-        return chosen.depth_mm, chosen.report()
+        choice = self.choose(frames)
+        return choice.depth_mm, choice.report()
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background."""
         return self.choose(frames).depth_mm
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-        """What a split's reports come to, for the submission's settings: frames a sample, mean and most."""
-        counts = [int(one["frames"]) for one in reports]
+        """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""
+        counts = [int(report["frames"]) for report in reports]
         return {"frames_mean": round(float(np.mean(counts)), 3), "frames_most": max(counts)}

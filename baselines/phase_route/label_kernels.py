@@ -1,7 +1,7 @@
 """Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") over a few candidates a pixel.
 
-Imported only where `fpp_ml_bench.acceleration` compiles; `label_sweeps` gives the same numbers in NumPy. Messages rest
-at the node that receives them: 0 from the left, 1 from above, 2 from the right, 3 from below.
+Imported only where `fpp_ml_bench.acceleration` compiles; `label_sweeps` gives the same numbers in NumPy. Messages are
+stored at the node that receives them: 0 from the left, 1 from above, 2 from the right, 3 from below.
 """
 
 import numpy as np
@@ -10,15 +10,16 @@ from fpp_ml_bench.acceleration import njit
 
 
 @njit
-def _send(own, back, mine, theirs, weight, limit, out):  # type: ignore[no-untyped-def]
-    """Message of ``own`` costs less what came ``back`` from there, over a truncated linear jump; least entry 0."""
-    count = own.shape[0]
+def _send(costs, returned, phases, neighbour_phases, weight, limit, out):  # type: ignore[no-untyped-def]
+    """Message to a neighbour: ``costs`` minus the message ``returned`` by it, over a truncated linear jump; least entry
+    0."""
+    count = costs.shape[0]
     least = np.float32(np.inf)
     for b in range(count):
         best = np.float32(np.inf)
         for a in range(count):
-            jump = min(abs(mine[a] - theirs[b]), limit) * weight
-            best = min(best, (own[a] - back[a]) + jump)
+            jump = min(abs(phases[a] - neighbour_phases[b]), limit) * weight
+            best = min(best, (costs[a] - returned[a]) + jump)
         out[b] = best
         least = min(least, best)
     for b in range(count):
@@ -35,7 +36,7 @@ def _gather(unary, messages, i, j, total):  # type: ignore[no-untyped-def]
 
 @njit
 def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ignore[no-untyped-def]
-    """``rounds`` passes forth and back over (H, W, K) costs; ``messages`` (H, W, 4, K) are updated in place."""
+    """``rounds`` forward and backward passes over (H, W, K) costs; ``messages`` (H, W, 4, K) are updated in place."""
     height, width, count = unary.shape
     total = np.empty(count, np.float32)
     none = np.float32(0.0)
@@ -76,22 +77,22 @@ def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ign
 
 @njit
 def decide(unary, phase, link_x, link_y, limit, messages, choice, margin):  # type: ignore[no-untyped-def]
-    """Labels in reading order, each knowing those before it; ``margin``: how much worse the second best is."""
+    """Labels in reading order, each given the labels before it; ``margin``: by how much the second best costs more."""
     height, width, count = unary.shape
     for i in range(height):
         for j in range(width):
-            best, second, place = np.float32(np.inf), np.float32(np.inf), 0
+            best, second, label = np.float32(np.inf), np.float32(np.inf), 0
             for a in range(count):
                 cost = unary[i, j, a] + (messages[i, j, 2, a] + messages[i, j, 3, a])
                 if j > 0:
-                    there = phase[i, j - 1, choice[i, j - 1]]
-                    cost += min(abs(there - phase[i, j, a]), limit) * link_x[i, j - 1]
+                    neighbour_phase = phase[i, j - 1, choice[i, j - 1]]
+                    cost += min(abs(neighbour_phase - phase[i, j, a]), limit) * link_x[i, j - 1]
                 if i > 0:
-                    there = phase[i - 1, j, choice[i - 1, j]]
-                    cost += min(abs(there - phase[i, j, a]), limit) * link_y[i - 1, j]
+                    neighbour_phase = phase[i - 1, j, choice[i - 1, j]]
+                    cost += min(abs(neighbour_phase - phase[i, j, a]), limit) * link_y[i - 1, j]
                 if cost < best:
-                    best, second, place = cost, best, a
+                    best, second, label = cost, best, a
                 elif cost < second:
                     second = cost
-            choice[i, j] = place
+            choice[i, j] = label
             margin[i, j] = second - best

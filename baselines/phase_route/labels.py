@@ -1,10 +1,10 @@
-"""Which candidate order each pixel takes: the least energy over the two or three that the rig allows.
+"""The candidate order of each pixel, by the least energy over the two or three candidates that the rig allows.
 
-The energy is a sum over pixels of what the candidate's brightness and the priors say, and over neighbours of how far
-their residual phases part, linear up to a limit: surfaces are smooth, and where they jump, a jump of any height costs
-the same. Smoothness is strong and brightness weak, pixel for pixel; plain belief propagation then freezes into whatever
-its first sweep found (a plane at 2.1 m came out a whole period too near although 97% of its pixels knew better). The
-tree-reweighted kind counts every pixel's opinion once, and gets it right.
+The energy is a sum over pixels of costs from brightness and priors, and over neighbours of the difference of their
+residual phases, linear up to a limit: surfaces are smooth, and where they jump, a jump of any height costs the same.
+For a single pixel smoothness is strong and brightness weak; plain belief propagation then keeps the result of its first
+sweep (it put a plane at 2.1 m a whole period too near although brightness favoured the right order at 97% of the
+pixels). The tree-reweighted kind counts the evidence of every pixel once and finds the right order.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ Image = NDArray[np.float32]
 
 ROUNDS = 10
 LARGE = np.float32(1e4)
-"""Cost of a candidate that there is not."""
+"""Cost of a candidate that does not exist."""
 
 
 def least_energy(
@@ -27,7 +27,7 @@ def least_energy(
     limit_rad: float,
     rounds: int = ROUNDS,
 ) -> tuple[NDArray[np.int32], Image]:
-    """Place of the chosen candidate, int32 (H, W), and its margin to the second best, float32 (at most `LARGE`).
+    """Index of the chosen candidate, int32 (H, W), and its margin to the second best, float32 (at most `LARGE`).
 
     ``unary`` (K, H, W): costs of K candidates; ``phase_rad`` (K, H, W): residual phase of each; ``link_x`` (H, W - 1)
     and ``link_y`` (H - 1, W): weight of the smoothness between neighbours, 0 where one of them is not object;

@@ -1,13 +1,13 @@
 """Local least squares of a fringe under a Gaussian window: phase, brightness and their uncertainty at every pixel.
 
 First fit, no photometry needed: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a
-carrier (a plane at the standoff) whose phase the answer corrects by ``atan2(-S, C)``. Second fit, once the carrier
+carrier (a plane at the standoff) whose phase the solution corrects by ``atan2(-S, C)``. Second fit, once the carrier
 follows the surface: ``I - ambient = g (1 + cos(theta + d))`` with g a plane. A projected fringe goes down to black, so
-its mean and its modulation are the same number g; knowing that keeps a slope of brightness from posing as phase.
+its mean and its modulation are the same number g; with that constraint a slope of brightness is not taken for phase.
 
-Everything a fit needs are moments of masked images under the window, and a Gaussian window separates: 19 images, each
-filtered along rows and columns. The window never reaches across the object mask, which is what Fourier methods do and
-what costs them twice the error (docs/phase_route.md).
+A fit needs only moments of masked images under the window, and a Gaussian window is separable: 19 images, each filtered
+along rows and columns. The window never reaches across the object mask; Fourier methods do, which doubles their error
+(docs/phase_route.md).
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ WINDOW_SIGMAS = 3.0
 RIDGE = 1e-6
 """Of the window's weight, added to the diagonal: fits of a few pixels stay finite."""
 LARGEST_STEP_RAD = 0.7
-"""Largest correction of the second fit: beyond it the linear model says nothing."""
+"""Largest correction of the second fit: beyond it the linear model does not hold."""
 
 
 class Window:
@@ -88,13 +88,13 @@ def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, wi
     m = window.moment
     w00 = m(weight)
     cc = m(by_cosine * cosine)
-    none = w00
+    unused = w00
     matrix = [
         [w00, m(weight, 1, 0), m(weight, 0, 1), m(by_cosine), m(by_sine)],
-        [none, m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
-        [none, none, m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
-        [none, none, none, cc, m(by_cosine * sine)],
-        [none, none, none, none, w00 - cc],
+        [unused, m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
+        [unused, unused, m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
+        [unused, unused, unused, cc, m(by_cosine * sine)],
+        [unused, unused, unused, unused, w00 - cc],
     ]
     right = [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
     answer = solve_symmetric(matrix, right)

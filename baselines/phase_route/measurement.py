@@ -1,4 +1,4 @@
-"""What the phase route says of one image: depth, how sure it is, and why it isn't."""
+"""The phase route's result for an image: depth, confidence, and reasons for a low confidence."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -12,7 +12,7 @@ Image = NDArray[np.float32]
 
 
 class Reason(IntEnum):
-    """Why a pixel is not to be trusted; of several the lowest that applies.
+    """Why a pixel should not be trusted; of several reasons the lowest.
 
     BACKGROUND: the empty scene explains it. LOW_MODULATION: too dark for a fringe, in shadow or turned away.
     SATURATED: clipped grey levels in the window. OUT_OF_RANGE: no order puts it in the working range. THIN: the object
@@ -36,10 +36,10 @@ class Measurement:
     """Maps (H, W) of one image; NaN or 0 where there is no object.
 
     ``wrapped_phase`` float32 rad in [-pi, pi]; ``modulation`` float32 grey levels; ``order`` int32; ``candidates``: the
-    orders that the working range allows; ``confidence`` float32, 0 to 1; ``expected_error_mm`` float32, what it is made
-    of, and ``order_doubt_mm``, its part that doubt about the order makes; ``depth_mm`` float32, 0 = background or
+    orders that the working range allows; ``confidence`` float32, 0 to 1, computed from ``expected_error_mm`` float32;
+    ``order_doubt_mm``: the part of that error that comes from the order; ``depth_mm`` float32, 0 = background or
     masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked or not; ``counts``: pixels per reason;
-    ``background_share``: of the image that calibrated its own brightness; ``seconds`` per stage.
+    ``background_share``: of the image's tiles that calibrated its brightness; ``seconds`` per stage.
     """
 
     wrapped_phase: Image

@@ -17,7 +17,7 @@ from fpp_ml_bench.rig import Rig
 class PhaseMethod:
     """Depth from one or more sinusoids of one direction; options are those of `Settings`.
 
-    Raises `PredictionError` for an option that there is not or a value it can't have.
+    Raises `PredictionError` for an unknown option or an invalid value.
     """
 
     name = "phase"
@@ -26,10 +26,10 @@ class PhaseMethod:
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         try:
-            chosen = Settings(**options)
+            settings = Settings(**options)
         except TypeError as error:
             raise PredictionError(f"phase: {error}; there are {', '.join(Settings.__dataclass_fields__)}") from None
-        self.rig, self.options, self.route = rig, chosen, PhaseRoute(rig, chosen)
+        self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
 
     @property
     def frames_used(self) -> tuple[int, ...]:
@@ -40,8 +40,8 @@ class PhaseMethod:
     @property
     def title(self) -> str:
         cues = ["range"] + ["shading"] * self.options.shading + ["standoff"] * (self.options.prior == "standoff")
-        many = len(self.frames_used)
-        count = f"one {self.options.direction} fringe" if many == 1 else f"{many} {self.options.direction} fringes"
+        frames = len(self.frames_used)
+        count = f"one {self.options.direction} fringe" if frames == 1 else f"{frames} {self.options.direction} fringes"
         return f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
 
     @property
@@ -49,12 +49,12 @@ class PhaseMethod:
         return asdict(self.options)
 
     def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
-        """Everything the route knows of a captured sequence; frames that are not in `frames_used` may be None."""
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
         images = []
         for index in self.frames_used:
             image = frames[index] if index < len(frames) else None
             if image is None:
-                needed = "that one fringe" if len(self.frames_used) == 1 else f"frames {self.frames_used}"
+                needed = "that fringe" if len(self.frames_used) == 1 else f"frames {self.frames_used}"
                 raise DecodeError(f"frame {index} is missing: the phase route needs {needed}")
             images.append(image)
         return self.route.measure(images)

@@ -1,9 +1,9 @@
-"""Which pixels are object: those whose grey level the empty scene does not explain.
+"""The object mask: pixels whose grey level the empty scene does not explain.
 
-Twice a period the object's fringe is as bright as the plane's would be, and there a pixel alone can't tell. Inside the
-object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete: the empty
-scene's, and that of the object's own fringe, carried on from the local fit beside it
-(`fpp_ml_bench.baselines.phase_route.local_fit`). The pixel goes to the one nearer its grey level.
+Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
+is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete:
+the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it
+(`fpp_ml_bench.baselines.phase_route.local_fit`). The prediction nearer to the pixel's grey level wins.
 """
 
 import cv2
@@ -14,16 +14,15 @@ from fpp_ml_bench.baselines.phase_route.empty_scene import Background
 from fpp_ml_bench.decode_blocks import MIN_MODULATION
 
 DIFFERENT_SIGMAS = 3.5
-"""A pixel this far from the empty scene is not background: noise alone does it to one in 2,000, which stay alone."""
+"""A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
 OBJECT_BONUS = 4.0
-"""Added to the plane's squared misfit, in sigmas: a pixel that both explain is object."""
+"""Added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object."""
 UNLIT_PERIODS = 0.8
 UNLIT_SIGMAS = 4.0
 """Brightest grey level, above ambient light, of what counts as unlit."""
 DARKEST_GREY = MIN_MODULATION / 4
-"""What is object and modulated less than this has no fringe at all: it lies in shadow or faces away, and gets no
-depth."""
+"""An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no depth."""
 LEAST_AREA_PERIODS = 0.1
 """Smallest object, and largest hole that is closed, in squares of one period."""
 
@@ -49,12 +48,12 @@ def different(background: Background) -> NDArray[np.bool_]:
 
 
 def object_region(background: Background, period_px: float) -> NDArray[np.bool_]:
-    """First mask (H, W): what differs, closed over the stripes where object and plane are equally bright."""
-    seen = different(background).astype(np.uint8)
-    closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, disk(CLOSING_PERIODS * period_px)) > 0
+    """First mask (H, W): pixels that differ, closed over the stripes where object and plane are equally bright."""
+    differing = different(background).astype(np.uint8)
+    closed = cv2.morphologyEx(differing, cv2.MORPH_CLOSE, disk(CLOSING_PERIODS * period_px)) > 0
     area = LEAST_AREA_PERIODS * period_px**2
-    found = without_small(closed, area)
-    return found | ~without_small(~found, area)
+    region = without_small(closed, area)
+    return region | ~without_small(~region, area)
 
 
 def unlit(grey: NDArray[np.float32], ambient: float, noise: float, period_px: float) -> NDArray[np.bool_]:
@@ -72,7 +71,7 @@ def refined(
     fringe_noise: NDArray[np.floating],
     reach_px: float,
 ) -> NDArray[np.bool_]:
-    """Mask (H, W) after the two predictions have competed within ``reach_px`` of the silhouette.
+    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette.
 
     ``predicted`` grey levels of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its
     uncertainty in grey levels, beside the image's own noise.
@@ -84,7 +83,7 @@ def refined(
         nearer = as_object < as_plane + OBJECT_BONUS
     ring = cv2.dilate(region.astype(np.uint8), disk(reach_px)) > 0
     clear = different(background)
-    # What differs stays; what does not is object where its fringe explains it better, background elsewhere at the rim.
+    # Pixels that differ stay. The others at the rim are object where the object's fringe explains them better.
     inner = cv2.erode(region.astype(np.uint8), disk(reach_px)) > 0
     votes = (clear & region) | inner | (ring & nearer)
     votes = without_small(votes, 4)

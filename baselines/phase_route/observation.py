@@ -1,4 +1,4 @@
-"""What the phase route sees of one image, before any fringe order has been decided."""
+"""What the phase route measures in an image before it chooses the fringe orders."""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -34,7 +34,7 @@ class Observation:
 
     ``frames``: how many were captured; ``grey`` float32 grey levels of the first; ``inside``: object; ``layer``:
     calibration layer of the crop; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase
-    in [-pi, pi]; ``residual_rad``: what is left of it when the phase at infinity is taken off, wrapped; ``slopes``: its
+    in [-pi, pi]; ``residual_rad``: that phase minus the phase at infinity, wrapped; ``slopes``: its
     change a px along x and y; ``uncertainty_rad`` float32: of the phase, order aside; ``clipped`` float32: share of
     the window's weight that is saturated; ``candidates``: the orders that the working range allows; ``question``: the
     same on a grid, for a `Chooser`. An image without an object has a crop of one pixel that is not ``inside``.

@@ -1,7 +1,7 @@
 """The route itself: fringe -> mask and phase -> candidates -> order -> calibration layer -> depth.
 
-Each stage is a function of its own module; this one hands arrays from one to the next, and times them. What depends on
-the rig alone is made once.
+Each stage is a function in a module of its own; this module passes arrays from stage to stage and times the stages.
+What depends on the rig alone is computed once.
 """
 
 from collections.abc import Sequence
@@ -35,11 +35,11 @@ Image = NDArray[np.float32]
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 MARGIN_PERIODS = 0.5
-"""Of the crop around the object: no window is needed beyond, the mask may grow into it."""
+"""Of the crop around the object: covers the windows, and the mask may grow into it."""
 RING_PERIODS = 0.14
-"""How far from the first mask's silhouette a pixel may change sides."""
+"""Distance from the first mask's silhouette within which a pixel may change between object and background."""
 FRINGE_NOISE = 0.03
-"""Uncertainty of a fringe carried on beyond its window, as a share of its brightness."""
+"""Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
 PAIR_ROUNDS = 2
 """Fits to two frames over the small window."""
 
@@ -66,16 +66,16 @@ class PhaseRoute:
             self._windows += [Window(self.settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
     def measure(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Measurement:
-        """Depth and all that it came from, of one captured fringe, uint8 (H, W), or of the frames of ``steps``.
+        """Depth and the maps behind it, from one captured fringe, uint8 (H, W), or from the frames of ``steps``.
 
         ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
         """
-        seen = self.observe(image, mask)
-        choice, margin = self.chooser(seen.question, self.rig, self.settings)
+        observation = self.observe(image, mask)
+        choice, margin = self.chooser(observation.question, self.rig, self.settings)
         order, margin = orders.spread_over_pixels(
-            seen.question, choice, margin, seen.layer.residual_phase(seen.phase_rad, 0.0)
+            observation.question, choice, margin, observation.layer.residual_phase(observation.phase_rad, 0.0)
         )
-        return self.conclude(seen, order, margin)
+        return self.conclude(observation, order, margin)
 
     def observe(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Observation:
         """Mask, phase and candidate orders of captured fringes; arguments as of `measure`."""
@@ -86,23 +86,24 @@ class PhaseRoute:
         region = object_region(background, self.period_px) if mask is None else mask
         crop = self._crop(region)
         watch.done("mask")
-        greys = [one[crop].astype(np.float32) for one in images]
-        given = None if mask is None else mask[crop]
+        greys = [frame[crop].astype(np.float32) for frame in images]
+        crop_mask = None if mask is None else mask[crop]
         layer = self.layer.at(crop)
         mean_grey = None
         if len(greys) < PIXELWISE:
-            inside, fit = self._locally(greys, region[crop], given, background, crop, watch)
+            inside, fit = self._local_fits(greys, region[crop], crop_mask, background, crop, watch)
         else:
             inside, fit, mean_grey = measure_pixels(
-                greys, self.shifts_rad, given, self._scene, background, crop, self._windows[1], self.period_px, watch
-            )
+                greys, self.shifts_rad, crop_mask, self._scene, background, crop, self._windows[1], self.period_px,
+                watch,
+            )  # fmt: skip
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
         near, far = self.rig.working_range_mm
         slack = self.settings.slack_mm
         candidates = orders_in_range(layer, phase, (near - slack, far + slack))
-        question = orders.ask(
+        question = orders.question_of(
             phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px,
             sharp=mean_grey is not None,
         )  # fmt: skip
@@ -125,35 +126,37 @@ class PhaseRoute:
         shape = (self.rig.camera.height, self.rig.camera.width)
         if len(images) != len(self.steps):
             raise DecodeError(f"expected {len(self.steps)} fringes, those of steps {self.steps}, got {len(images)}")
-        for one in images:
-            if np.asarray(one).dtype != np.uint8 or np.shape(one) != shape:
+        for frame in images:
+            if np.asarray(frame).dtype != np.uint8 or np.shape(frame) != shape:
                 raise DecodeError(
                     f"expected a fringe of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
-                    f"{np.asarray(one).dtype} {np.shape(one)}; use rig.scaled(width) for a resized image"
+                    f"{np.asarray(frame).dtype} {np.shape(frame)}; use rig.scaled(width) for a resized image"
                 )
         return images
 
-    def conclude(self, seen: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
-        """The measurement that an ``order`` int32 for each pixel of the observation's crop (h, w) makes of it;
-        ``margin`` (h, w): how clearly that order won, 0 a tie, 1 or more beyond doubt (see `orders.Chooser`).
+    def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
+        """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
+        ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
 
         Raises `DecodeError` for shapes that are not the crop's."""
-        if np.shape(order) != seen.inside.shape or np.shape(margin) != seen.inside.shape:
+        if np.shape(order) != observation.inside.shape or np.shape(margin) != observation.inside.shape:
             raise DecodeError(
-                f"expected an order and a margin for each of the {seen.inside.shape} pixels (h, w) around the object, "
-                f"got {np.shape(order)} and {np.shape(margin)}"
+                f"expected an order and a margin for each of the {observation.inside.shape} pixels (h, w) around the "
+                f"object, got {np.shape(order)} and {np.shape(margin)}"
             )
-        seen.watch.done("order")
-        depth_mm = np.where(seen.inside, seen.layer.depth_mm(seen.phase_rad, order), 0.0)
+        observation.watch.done("order")
+        depth_mm = np.where(observation.inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
         depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
-        seen.watch.done("depth")
-        error_mm, doubt_mm = confidence.expected_error_mm(seen, margin, depth_mm)
-        sure = confidence.confidence_of(error_mm)
-        reason = confidence.reasons(seen, margin, sure, depth_mm, self.rig, self.settings, self.period_px)
-        seen.watch.done("confidence")
-        return self._whole(seen, order, sure, error_mm, doubt_mm, depth_mm, reason)
+        observation.watch.done("depth")
+        error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
+        confidence_map = confidence.confidence_of(error_mm)
+        reason = confidence.reasons(
+            observation, margin, confidence_map, depth_mm, self.rig, self.settings, self.period_px
+        )
+        observation.watch.done("confidence")
+        return self._full_image(observation, order, confidence_map, error_mm, doubt_mm, depth_mm, reason)
 
-    def _locally(
+    def _local_fits(
         self, greys: Sequence[Image], region: NDArray[np.bool_], mask: NDArray[np.bool_] | None, background: Background,
         crop: Crop, watch: Stopwatch,
     ) -> tuple[NDArray[np.bool_], FringeFit]:  # fmt: skip
@@ -206,34 +209,35 @@ class PhaseRoute:
             inside, part, predicted.astype(np.float32), grey, FRINGE_NOISE * bright, RING_PERIODS * self.period_px
         )
 
-    def _whole(
-        self, seen: Observation, order: NDArray[np.int32], sure: NDArray, error_mm: NDArray, doubt_mm: NDArray,
-        depth_mm: NDArray, reason: NDArray[np.uint8],
+    def _full_image(
+        self, observation: Observation, order: NDArray[np.int32], confidence_map: NDArray, error_mm: NDArray,
+        doubt_mm: NDArray, depth_mm: NDArray, reason: NDArray[np.uint8],
     ) -> Measurement:  # fmt: skip
         """Maps of the whole image from those of the crop."""
 
         def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
-            whole: NDArray = np.full(seen.shape, outside, dtype=dtype)
-            whole[seen.crop] = np.where(seen.inside, part, outside)
-            return whole
+            image: NDArray = np.full(observation.shape, outside, dtype=dtype)
+            image[observation.crop] = np.where(observation.inside, part, outside)
+            return image
 
-        kept = depth_mm if self.settings.min_confidence == 0 else depth_mm * (sure >= self.settings.min_confidence)
+        least = self.settings.min_confidence
+        masked_mm = depth_mm if least == 0 else depth_mm * (confidence_map >= least)
         reasons = paste(reason, np.uint8, Reason.BACKGROUND)
         counts = np.bincount(reasons.ravel(), minlength=len(Reason))
-        allowed = seen.candidates
-        measured = Measurement(
-            wrapped_phase=paste(seen.phase_rad, np.float32, np.nan),
-            modulation=paste(seen.fit.brightness, np.float32, 0),
+        allowed = observation.candidates
+        measurement = Measurement(
+            wrapped_phase=paste(observation.phase_rad, np.float32, np.nan),
+            modulation=paste(observation.fit.brightness, np.float32, 0),
             order=paste(order, np.int32, 0),
             candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
-            confidence=paste(sure, np.float32, 0),
+            confidence=paste(confidence_map, np.float32, 0),
             expected_error_mm=paste(error_mm, np.float32, 0),
             order_doubt_mm=paste(doubt_mm, np.float32, 0),
-            depth_mm=paste(kept, np.float32, 0),
+            depth_mm=paste(masked_mm, np.float32, 0),
             reason=reasons,
-            counts={one.name.lower(): int(counts[one]) for one in Reason},
-            background_share=seen.background.share,
-            seconds=seen.watch.seconds,
+            counts={code.name.lower(): int(counts[code]) for code in Reason},
+            background_share=observation.background.share,
+            seconds=observation.watch.seconds,
         )
-        seen.watch.done("depth")
-        return measured
+        observation.watch.done("depth")
+        return measurement

@@ -1,4 +1,4 @@
-"""Everything that can be chosen about the phase route, with the values found on train and validation objects."""
+"""Settings of the phase route; the default values were chosen on train and validation objects."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,11 +13,11 @@ PRIORS: tuple[Prior, ...] = ("none", "standoff")
 
 @dataclass(frozen=True)
 class Settings:
-    """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what may choose the
-    order: ``shading`` and ``prior``; ``min_confidence``: pixels below it are 0 (0: dense, every object pixel gets a
-    depth).
+    """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
+    the order may use: ``shading`` and ``prior``; ``min_confidence``: pixels below it are 0 (0: dense, every object
+    pixel gets a depth).
 
-    ``prior`` "standoff" tells the route that objects stand near the rig's standoff, which is true of fixed placement;
+    ``prior`` "standoff" assumes that objects are near the rig's standoff, which is true of fixed placement;
     "none" leaves only the working range. Windows are in image px per fringe period: of the first fit, of the second,
     of the last one to two frames, and of the slopes. Costs (no unit): ``shading_cost`` a pixel for each
     ``shading_spread`` of log brightness, up to ``shading_limit`` of them; ``prior_cost`` a pixel for each 100 mm;

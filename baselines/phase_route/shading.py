@@ -1,10 +1,10 @@
-"""What each fringe order would mean for brightness: fall-off with distance, and the slope of the surface.
+"""The brightness that each candidate order predicts: fall-off with distance, and the slope of the surface.
 
 The phase fixes how fast 1/Z changes along the surface whatever the order; the order fixes Z itself. Together they give
-distance and normal of every candidate, and so how bright a matte surface would be there: cos(theta) / r^2 of the light
-that the background plane has calibrated. One order nearer is nearer to the lamp AND turned more towards it, so that the
-candidates differ by a third in brightness. This cue rests on one albedo for plane and objects, which the paper's scenes
-have (Section 2.2) and a painted object has not: `PhaseMethod(shading=False)` does without.
+distance and normal of every candidate, and so the brightness of a matte surface there: cos(theta) / r^2 of the light
+that the background plane has calibrated. A surface one order nearer is closer to the lamp and also turned more towards
+it, so the candidates differ by a third in brightness. This cue assumes the same albedo for plane and objects, which is
+true of the paper's scenes (Section 2.2) but not of painted objects: `PhaseMethod(shading=False)` works without it.
 """
 
 import cv2
@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 Crop = tuple[slice, slice]
 
 STEEPEST_RAD_PER_PX = 0.5
-"""Largest change of the residual phase a px that counts as slope; a fringe of the carrier changes by 0.28."""
+"""Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
 
 
 def wrapped(phase_rad: NDArray) -> NDArray:
@@ -54,7 +54,7 @@ def irradiance(
         rate = -layer.gain / (residual_rad * residual_rad * layer.forward)
     else:
         rate = (layer.depth_of_residual_mm(residual_rad + 1e-3) / MM_PER_M - z) / 1e-3
-    # At a fixed psi depth still changes with the pixel where the projector is turned against the camera.
+    # At a fixed psi depth still changes with the pixel where the projector is rotated against the camera.
     zx, zy = (
         (rate * slope + _drift(layer, residual_rad, z, axis, crop)).astype(np.float32)
         for axis, slope in ((1, slopes[0]), (0, slopes[1]))
@@ -76,7 +76,7 @@ def _drift(layer: CalibrationLayer, residual_rad: NDArray, z: Image, axis: int, 
     if min(layer.gain.shape) < 2:
         return 0.0
     step = crop[axis].step or 1
-    gain, forward = (np.gradient(one, axis=axis) / step for one in (layer.gain, layer.forward))
+    gain, forward = (np.gradient(values, axis=axis) / step for values in (layer.gain, layer.forward))
     if not gain.any() and not forward.any():
         return 0.0
     return (gain / residual_rad - z * forward) / layer.forward

@@ -1,4 +1,4 @@
-"""A training's whole state in one safetensors file: networks, optimisers, and where it stands. Never a pickle.
+"""A training's whole state in one safetensors file: networks, optimisers, schedule and history. Never a pickle.
 
 Written after every epoch, atomically; the history travels in it, so that the log is always that of the state.
 """
@@ -22,12 +22,12 @@ State = dict[str, Tensor]
 
 def optimizer_tensors(optimizer: Optimizer, prefix: str) -> State:
     """The optimiser's state as tensors, ``prefix.parameter number.key``."""
-    found: State = {}
+    tensors: State = {}
     for number, state in optimizer.state_dict()["state"].items():
         for key, value in state.items():
             if isinstance(value, Tensor):
-                found[f"{prefix}.{number}.{key}"] = value
-    return found
+                tensors[f"{prefix}.{number}.{key}"] = value
+    return tensors
 
 
 def restore_optimizer(optimizer: Optimizer, tensors: State, prefix: str) -> None:

@@ -1,4 +1,4 @@
-"""What a person sees of a training: a bar over its epochs, with losses, the score in mm, the rate and the time left."""
+"""The progress bar of a training: epochs, losses, the score in mm, the rate and the time left."""
 
 from types import TracebackType
 from typing import Any

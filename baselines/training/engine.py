@@ -1,8 +1,8 @@
-"""The one training loop: every recipe, on one processor or many, on what `accelerate` finds.
+"""The training loop of all recipes, on one processor or many, on the devices that `accelerate` finds.
 
     accelerate launch ...   several GPUs or machines; a batch of the recipe is then that of one process
 
-A training folder holds, after every epoch, all that is needed to go on: ``checkpoint.safetensors`` (everything),
+A training folder holds, after every epoch, all that is needed to resume: ``checkpoint.safetensors`` (everything),
 ``weights.safetensors`` (the epoch of the lowest validation loss), ``log.jsonl``, ``recipe.json``; at the end also
 ``curve.png`` and ``done.json``. On one processor type and number of threads, the same recipe and data give the same
 bits on the CPU, stopped and resumed or not.
@@ -47,14 +47,14 @@ from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 CHECKPOINT, WEIGHTS, RECIPE, DONE = "checkpoint.safetensors", "weights.safetensors", "recipe.json", "done.json"
 CHECK_EVERY = 16
-"""Steps between two looks at the losses: a look makes a GPU wait."""
+"""Steps between two checks of the losses: reading a loss makes a GPU wait."""
 DIVERGED = 1e6
-"""A loss this many times the first one will not come back."""
+"""Multiple of the first loss from which on a training counts as diverged."""
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What a training came to; ``finished`` is False when its minutes ran out: call `train` again to go on."""
+    """Files and epochs of a training; ``finished`` is False when its minutes ran out: call `train` again to resume."""
 
     weights: Path
     epochs: int
@@ -68,7 +68,7 @@ class TrainingRun:
 def train(
     recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
 ) -> TrainingRun:
-    """Train ``recipe`` on a dataset folder into ``out``, from where ``out`` stands; returns at once if that is the end.
+    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
 
     ``minutes``: stop, with everything saved, before an epoch that would outlast them; one epoch is always
     trained. ``show``: progress on stderr.
@@ -143,13 +143,13 @@ class _Training:
         with Display(self.recipe, len(self.loader), show and self.accelerator.is_main_process) as display:
             for record in self.history:
                 display.epoch_done(record)
-            took = 0.0
-            while not self.over and self._goes_on(took == 0 or _fits(started, took, minutes)):
-                began = perf_counter()
+            last_epoch_s = 0.0
+            while not self.over and self._agreed(last_epoch_s == 0 or _fits(started, last_epoch_s, minutes)):
+                epoch_started = perf_counter()
                 losses = self._train_epoch(display)
-                self._finish_epoch(losses, began)
+                self._finish_epoch(losses, epoch_started)
                 display.epoch_done(self.history[-1])
-                took = perf_counter() - began
+                last_epoch_s = perf_counter() - epoch_started
         seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process:
             history.write_log(self.out, self.history)
@@ -161,9 +161,9 @@ class _Training:
         best = self.best["epoch"] if self.history else 0
         return _run(self.out, self.epoch, best, seconds, self.over)
 
-    def _goes_on(self, wish: bool) -> bool:
-        """What the first process wishes: clocks differ, and all processes must take the same epochs."""
-        return bool(broadcast_object_list([wish])[0])
+    def _agreed(self, next_epoch: bool) -> bool:
+        """Whether the first process trains a next epoch: clocks differ, and all processes must train the same ones."""
+        return bool(broadcast_object_list([next_epoch])[0])
 
     def _train_epoch(self, display: Display) -> dict[str, float]:
         """One pass; the mean over batches of everything the objective logs."""
@@ -176,16 +176,16 @@ class _Training:
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = self.schedule.rate
-        waiting: list[tuple[int, Tensor, dict[str, Tensor]]] = []
+        unchecked: list[tuple[int, Tensor, dict[str, Tensor]]] = []
         sums: dict[str, float] = {}
         batches = 0
         for batch in self.loader:
-            waiting.append((batches, batch.row, self._step(batch)))
+            unchecked.append((batches, batch.row, self._step(batch)))
             batches += 1
-            if len(waiting) == CHECK_EVERY:
-                self._look(waiting, sums)
+            if len(unchecked) == CHECK_EVERY:
+                self._check_losses(unchecked, sums)
             display.step()
-        self._look(waiting, sums)
+        self._check_losses(unchecked, sums)
         return {name: value / batches for name, value in sums.items()}
 
     def _step(self, batch: FringeDepth) -> dict[str, Tensor]:
@@ -200,26 +200,26 @@ class _Training:
                 logged |= values
         return logged
 
-    def _look(self, waiting: list[tuple[int, Tensor, dict[str, Tensor]]], sums: dict[str, float]) -> None:
-        """Take in the losses of the last steps; stop at the first that is not finite or has run away."""
-        for number, rows, logged in waiting:
+    def _check_losses(self, unchecked: list[tuple[int, Tensor, dict[str, Tensor]]], sums: dict[str, float]) -> None:
+        """Add the losses of the last steps to ``sums``; raise for a loss that is not finite or has diverged."""
+        for number, rows, logged in unchecked:
             for name, value in logged.items():
-                found = float(value)
-                if name == "loss" and self.first_loss is None and math.isfinite(found):
-                    self.first_loss = max(found, 1e-6)
+                loss_value = float(value)
+                if name == "loss" and self.first_loss is None and math.isfinite(loss_value):
+                    self.first_loss = max(loss_value, 1e-6)
                 limit = DIVERGED * (self.first_loss or math.inf)
-                if not math.isfinite(found) or (name == "loss" and found > limit):
-                    what = "is not finite" if not math.isfinite(found) else f"is {DIVERGED:g} times the first one"
+                if not math.isfinite(loss_value) or (name == "loss" and loss_value > limit):
+                    fault = "is not finite" if not math.isfinite(loss_value) else f"is {DIVERGED:g} times the first one"
                     samples = sorted({self.training.samples[row] for row in rows.tolist()})
                     raise TrainingError(
-                        f"{self.out}: training diverged: {name} {what} ({found:.4g}) in epoch {self.epoch + 1}, batch "
-                        f"{number + 1}, samples {', '.join(samples)}. The last good state is kept "
+                        f"{self.out}: training diverged: {name} {fault} ({loss_value:.4g}) in epoch {self.epoch + 1}, "
+                        f"batch {number + 1}, samples {', '.join(samples)}. The last good state is kept "
                         f"({self.epoch} epochs); lower the learning rate, or look at those samples (fpp-bench show)"
                     )
-                sums[name] = sums.get(name, 0.0) + found
-        waiting.clear()
+                sums[name] = sums.get(name, 0.0) + loss_value
+        unchecked.clear()
 
-    def _finish_epoch(self, losses: dict[str, float], began: float) -> None:
+    def _finish_epoch(self, losses: dict[str, float], epoch_started: float) -> None:
         """Validate, set the rate of the next epoch, keep the best weights, save everything."""
         network = self.bare["network"]
         scores = validate(network, self.objective, self.validation, self.recipe, self.accelerator, self.out)
@@ -228,7 +228,7 @@ class _Training:
         loss = losses.pop("loss")
         record = {
             "epoch": self.epoch + 1, "learning_rate": rate, "training_loss": loss, **scores, **losses,
-            "seconds": round(perf_counter() - began, 3),
+            "seconds": round(perf_counter() - epoch_started, 3),
         }  # fmt: skip
         improved = not self.history or record["validation_loss"] < self.best["validation_loss"]
         self.history.append(record)
@@ -281,9 +281,9 @@ class _Training:
         self.resumed_at = len(self.history)
 
 
-def _fits(started: float, took: float, minutes: float | None) -> bool:
+def _fits(started: float, last_epoch_s: float, minutes: float | None) -> bool:
     """Whether another epoch like the last one ends in time."""
-    return minutes is None or perf_counter() - started + took < 60 * minutes
+    return minutes is None or perf_counter() - started + last_epoch_s < 60 * minutes
 
 
 def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
@@ -294,24 +294,24 @@ def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
 
 def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
     path = out / RECIPE
-    ours = recipe.to_dict()
-    content = {"recipe": ours, "fingerprint": data.source.fingerprint}
+    own_recipe = recipe.to_dict()
+    content = {"recipe": own_recipe, "fingerprint": data.source.fingerprint}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        existing = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
     except (OSError, ValueError) as error:
         raise TrainingError(f"{out}: expected a training folder, or a new one ({error})") from None
-    if found is None:
+    if existing is None:
         # A process that was killed while it wrote the recipe leaves a hidden temporary file.
         if any(not path.name.startswith(f".{RECIPE}.") for path in out.iterdir()):
             raise TrainingError(f"{out}: holds files but no {RECIPE}; give a new or empty folder")
         write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
-    elif found != content:
-        theirs = found.get("recipe", {}) if isinstance(found, dict) else {}
-        differs = [key for key, value in ours.items() if theirs.get(key) != value] or ["dataset"]
+    elif existing != content:
+        existing_recipe = existing.get("recipe", {}) if isinstance(existing, dict) else {}
+        differs = [key for key, value in own_recipe.items() if existing_recipe.get(key) != value] or ["dataset"]
         raise TrainingError(
             f"{path}: was made for another training, which differs in {', '.join(differs)}; give another folder, or "
-            f"remove {out} to train anew"
+            f"remove {out} to train again from the start"
         )
 
 
@@ -323,7 +323,7 @@ def _finished(out: Path) -> TrainingRun | None:
         summary = json.loads(path.read_text(encoding="utf-8"))
         return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
     except (OSError, ValueError, KeyError, TypeError):
-        raise TrainingError(f"{path}: is damaged; delete it, and the training is taken up where it stands") from None
+        raise TrainingError(f"{path}: is damaged; delete it, and the training resumes from its checkpoint") from None
 
 
 def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:

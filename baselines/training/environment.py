@@ -1,4 +1,4 @@
-"""What a training sets in its process, and puts back: reproducible kernels. Memory that is kept stays so."""
+"""Settings of the process while a training runs: reproducible kernels, undone afterwards, and memory kept for reuse."""
 
 import ctypes
 import sys
@@ -17,7 +17,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 @contextmanager
 def reproducible(recipe: Recipe) -> Iterator[None]:
     """Within: deterministic kernels on the CPU, the fastest ones on a GPU, and freed memory kept for the next step."""
-    # One process may train in fp32 after bf16; accelerate's shared state allows one precision a life.
+    # A process may train in fp32 after bf16, but accelerate's shared state allows only one precision.
     AcceleratorState._reset_state()
     keep_freed_memory()
     on_gpu = torch.cuda.is_available()

@@ -36,8 +36,13 @@ def feature_matching(generated: Features, real: Features) -> Tensor:
     The real image's features are taken as they are: no gradient flows into them.
     """
     scales = [
-        torch.stack([(_wide(mine) - _wide(theirs).detach()).abs().mean() for mine, theirs in layers]).sum()
-        for layers in (list(zip(g[:-1], r[:-1], strict=True)) for g, r in zip(generated, real, strict=True))
+        torch.stack(
+            [(_wide(generated_map) - _wide(real_map).detach()).abs().mean() for generated_map, real_map in layers]
+        ).sum()
+        for layers in (
+            list(zip(generated_maps[:-1], real_maps[:-1], strict=True))
+            for generated_maps, real_maps in zip(generated, real, strict=True)
+        )
     ]
     return torch.stack(scales).mean()
 

@@ -1,4 +1,4 @@
-"""What a training leaves for people: one line an epoch as JSON, and the curve as a picture."""
+"""The log of a training: a JSON line for each epoch, and the curve as a picture."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ def write_log(folder: Path, history: list[Record]) -> None:
 
 
 def draw_curve(folder: Path, history: list[Record], title: str) -> None:
-    """``curve.png``: losses, the validation object MAE and the learning rate over the epochs; the kept epoch marked."""
+    """``curve.png``: losses, the validation object MAE and the learning rate over the epochs; the best epoch marked."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -20,8 +20,8 @@ hybrid_l1    alpha masked_l1 + (1 - alpha) l1
   average samples, so validation must too.
 - e is under the root once, so an RMSE loss is never below 1e-4 in its representation (0.1 mm under global
   normalisation). It makes the gradient at zero residual 0 instead of 0/0, and is the reason why no score is a loss.
-- Without a single object pixel a masked part is exactly 0, with zero gradient: it says nothing, rather than 0/0. In a
-  batch the other samples decide. In `sample_losses` such a sample gives 0 too; it shifts a validation mean by the same
+- Without a single object pixel a masked part is exactly 0, with zero gradient, instead of 0/0. In a batch the loss then
+  depends on the other samples. In `sample_losses` such a sample gives 0 too; it shifts a validation mean by the same
   amount in every epoch.
 - A prediction or target that is NaN or infinite *anywhere* makes every loss NaN or infinite, outside the mask too:
   masking multiplies, it does not select. The training engine stops on it.

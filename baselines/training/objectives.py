@@ -1,4 +1,4 @@
-"""What a training minimises: an objective owns its networks and hands the engine one loss after the other.
+"""Training objectives: an objective owns its networks and gives the engine the losses to minimise, one by one.
 
 ::
 
@@ -8,7 +8,7 @@
         optimisers[module].step()
 
 Before training, the engine may put wrapped networks (several processes, mixed precision, compiled) in the place of
-``objective.modules[name]``: every call goes through that mapping. ``modules["network"]`` is the one that is kept.
+``objective.modules[name]``: every call goes through that mapping. The weights file holds ``modules["network"]``.
 """
 
 import math
@@ -40,7 +40,7 @@ class Objective(Protocol):
 
 
 class Regression:
-    """One network, one of the paper's losses on its output (Section 5.5).
+    """A network with one of the paper's losses on its output (Section 5.5).
 
     Raises `RecipeError` for a loss or ``alpha`` that `losses.loss_function` refuses.
     """
@@ -84,7 +84,7 @@ class Adversarial:
     ``generator`` maps a fringe image to depth, both in [0, 1], so the normalisation must be ``individual``.
     ``discriminator`` takes (B, 2, H, W), fringe and depth, each in [-1, 1], and answers as `gan_losses` says. A batch
     has two steps: the discriminator learns to tell the batch's depth from the generator's; then the generator is judged
-    by what the discriminator has just become. The generator runs forward once for both.
+    by the updated discriminator. The generator runs forward once for both.
     """
 
     def __init__(
@@ -114,10 +114,10 @@ class Adversarial:
         return "discriminator", loss, _detached(logged)
 
     def _generator_step(self, prediction: Tensor, generated: Tensor, real: Tensor, depth: Tensor) -> Step:
-        with _fixed(self.modules["discriminator"]) as judge:
-            on_generated = judge(generated)
+        with _fixed(self.modules["discriminator"]) as discriminator:
+            on_generated = discriminator(generated)
             with torch.no_grad():
-                on_real = judge(real)
+                on_real = discriminator(real)
         terms = {
             "adversarial": gan_losses.scores_against(on_generated, real=True),
             "feature_matching": gan_losses.feature_matching(on_generated, on_real),
@@ -131,7 +131,7 @@ class Adversarial:
 
 
 def _pairs(fringe: Tensor, depth: Tensor) -> Tensor:
-    """What the discriminator sees: (B, 2, H, W) in [-1, 1] of two images in [0, 1]."""
+    """Input of the discriminator: (B, 2, H, W) in [-1, 1] from two images in [0, 1]."""
     return torch.cat([fringe, depth.to(fringe.dtype)], dim=1) * 2 - 1
 
 
@@ -141,9 +141,9 @@ def _detached(values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 @contextmanager
 def _fixed(module: nn.Module) -> Iterator[nn.Module]:
-    """Forward passes in here lead gradients through ``module`` but none into its parameters.
+    """Within: gradients of forward passes flow through ``module`` but not into its parameters.
 
-    A graph remembers what needed a gradient when it was made, so the parameters are free again before the backward.
+    The graph records which parameters need a gradient, so they are free again before the backward pass.
     """
     free = [parameter for parameter in module.parameters() if parameter.requires_grad]
     for parameter in free:

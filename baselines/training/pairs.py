@@ -1,7 +1,7 @@
-"""Which (view, frame) pairs an epoch trains on and validation scores, and how a batch of them is read.
+"""The (view, frame) pairs of an epoch and of validation, and how a batch of them is read.
 
-The order of an epoch depends on the seed and its number alone, so that a resumed training goes on as if it had never
-stopped, whatever was drawn before.
+The order of an epoch depends on the seed and its number alone, so that a resumed training gives the same result as one
+that never stopped.
 """
 
 from collections.abc import Iterator
@@ -72,10 +72,10 @@ class EpochSampler(Sampler[int]):
 
 
 def _as_read(batch: Any) -> FringeDepth:
-    """`BatchRead` gives whole batches: nothing is left to collate."""
+    """`BatchRead` gives whole batches, so there is nothing to collate."""
     return batch
 
 
 def training_loader(source: FringeDepthDataset, sampler: EpochSampler, batch: int, pin: bool) -> DataLoader:
-    """Batches in the sampler's order, read in this process: a batch costs less than a step, and no worker can stall."""
+    """Batches in the sampler's order, read in this process: a batch takes less time than a step."""
     return DataLoader(BatchRead(source), batch_size=batch, sampler=sampler, collate_fn=_as_read, pin_memory=pin)

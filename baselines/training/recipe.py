@@ -1,7 +1,7 @@
-"""Recipes: one YAML file a row of a table, each only what differs from the recipe it extends (paper Sections 5.3-5.6).
+"""Recipes: a YAML file for each row of a table, with the differences from the recipe it extends (Sections 5.3-5.6).
 
-A recipe says what is trained and how; a preset (``cpu``, ``paper``) at what image size, and what the machine at hand
-changes. Resolved, the two are a `Recipe`: every number that the training depends on, with one digest.
+A recipe says what is trained and how; a preset (``cpu``, ``paper``) sets the image size and what depends on the
+machine. Resolved, the two are a `Recipe`: every number that the training depends on, with a digest.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ class Loss(StrictModel):
     alpha: Annotated[float, Field(ge=0, le=1)] | None = None
 
     @model_validator(mode="after")
-    def _known(self) -> "Loss":
+    def _check(self) -> "Loss":
         if self.name != GAN or self.alpha is not None:
             check_loss(self.name, self.alpha)
         return self
@@ -75,7 +75,7 @@ class Loss(StrictModel):
 class Recipe(StrictModel):
     """Everything that a training depends on.
 
-    ``size`` is the image's width and height in px. ``pairs_per_epoch`` pairs of frame and depth are drawn anew
+    ``size`` is the image's width and height in px. ``pairs_per_epoch`` pairs of frame and depth are drawn
     for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``options`` go to
     `networks.build`.
     """
@@ -120,7 +120,7 @@ class Recipe(StrictModel):
 
     @property
     def name(self) -> str:
-        """What runs and weights are called; rows that train the same thing have the same."""
+        """Name of runs and weights; rows that train the same network have the same name."""
         parts = [self.network, self.normalisation, self.loss.label]
         parts += ["bgremoved"] if self.background_removed else []
         parts += [self.frames] if self.frames != "single_shot" else []
@@ -128,7 +128,7 @@ class Recipe(StrictModel):
 
     @property
     def title(self) -> str:
-        """For people: network, normalisation, loss and what else is not the rule."""
+        """For people: network, normalisation, loss, and the settings that differ from the paper's usual ones."""
         parts = [_NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
         parts += ["background removed"] if self.background_removed else []
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
@@ -154,10 +154,10 @@ def table_rows(table: str) -> tuple[str, ...]:
 def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
     """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset.
 
-    The preset scales what the shipped recipes say; what a file of yours says is taken as it stands.
+    The preset scales the shipped recipes; the entries of your own file are used unchanged.
 
-    Raises RecipeError for a recipe or preset that there is not, an unknown key, an impossible value, a chain of
-    ``extends`` that does not end.
+    Raises RecipeError for an unknown recipe, preset or key, an impossible value, or an endless chain of
+    ``extends``.
     """
     path = _recipe_path(name_or_path)
     shipped, own = _resolved(path, 0)
@@ -193,34 +193,34 @@ def _recipe_path(name_or_path: str | Path) -> Path:
         from difflib import get_close_matches
 
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
-        near = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
+        closest = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
         raise RecipeError(
-            f"no recipe {printable(text, 100)!r}; near it: {', '.join(near)}. Give one of the shipped names (see "
+            f"no recipe {printable(text, 100)!r}; near it: {', '.join(closest)}. Give one of the shipped names (see "
             "fpp-bench reproduce --list) or a .yaml file"
         )
     return path
 
 
 def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Content of a recipe over that of those it extends: of the shipped ones, and of files of the user's."""
+    """Content of a recipe merged over the recipes it extends: that of shipped recipes, and that of the user's files."""
     if depth > _LONGEST_CHAIN:
         raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
     content = _read(path)
     parent = content.pop(_EXTENDS, None)
-    mine = not path.resolve().is_relative_to(RECIPES)
+    is_users_own = not path.resolve().is_relative_to(RECIPES)
     if parent is None:
-        return ({}, content) if mine else (content, {})
+        return ({}, content) if is_users_own else (content, {})
     if not isinstance(parent, str):
         raise RecipeError(f"{path}: extends: expected a recipe's name, like base, got {printable(repr(parent), 60)}")
     beside = path.parent / parent
     shipped, own = _resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1)
-    return (shipped, _merge(own, content)) if mine else (_merge(shipped, content), own)
+    return (shipped, _merge(own, content)) if is_users_own else (_merge(shipped, content), own)
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:
     """``above`` over ``below``; mappings key by key, but one with a ``name`` of its own, or ``options``, as a whole.
 
-    ``pick``: keys of nested mappings that ``below`` does not know are left out (what a preset says of another kind of
+    ``pick``: keys of nested mappings that ``below`` does not have are left out (a preset's entries for another kind of
     schedule).
     """
     merged = dict(below)

@@ -1,4 +1,4 @@
-"""The learning rate over the epochs, and when a training is over because of it. The rules themselves are torch's."""
+"""The learning rate over the epochs, and the end of a training by it. The rules themselves are torch's."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ _RELATIVE = 1e-9
 class Schedule:
     """``rate`` of the coming epoch; `step` after each epoch with its validation loss; ``finished`` when it says so.
 
-    One rate for all optimisers of a training: it is that of an optimiser which holds nothing.
+    All optimisers of a training share this rate: it is that of an optimiser without parameters.
     """
 
     def __init__(self, rule: Plateau | Linear, rate: float) -> None:
@@ -44,9 +44,9 @@ class Schedule:
         return self.rate <= self.rule.minimum * (1 + _RELATIVE)
 
     def step(self, validation_loss: float) -> None:
-        """Take in the validation loss of the epoch that ended."""
+        """Update the rate with the validation loss of the epoch that ended."""
         self.epochs += 1
-        self._holder.step()  # holds nothing; torch wants to see it before the scheduler
+        self._holder.step()  # no effect; torch warns unless it runs before the scheduler
         if isinstance(self.rule, Linear):
             self._scheduler.step()
         else:
@@ -63,7 +63,7 @@ class Schedule:
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Continue from the numbers of `state`."""
         if isinstance(self.rule, Linear):
             for _ in range(state["epochs"]):
                 self.step(0.0)

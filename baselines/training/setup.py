@@ -1,4 +1,4 @@
-"""From a recipe to what the engine runs: the data, the objective with its networks, the description of the weights."""
+"""From a recipe to the data, the objective with its networks, and the configuration in the weights file."""
 
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.training.objectives import Adversarial, Objective, Regression
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.baselines.training.tables import GAN
+from fpp_ml_bench.baselines.training_data import training_benchmark
 from fpp_ml_bench.baselines.weights_file import ModelConfig
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -16,7 +17,7 @@ from fpp_ml_bench.loaders.training import FringeDepthDataset
 
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
     """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
-    found = []
+    datasets = []
     for split in ("train", "validation"):
         data = FringeDepthDataset(dataset, split, recipe.data_config, recipe.normalisation, recipe.background_removed)
         if data.source.size != (recipe.size, recipe.size):
@@ -28,12 +29,12 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
             )
         if not len(data):
             raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
-        found.append(data)
-    return found[0], found[1]
+        datasets.append(data)
+    return datasets[0], datasets[1]
 
 
 def objective_of(recipe: Recipe) -> Objective:
-    """The recipe's networks, freshly initialised, and what they minimise. Seed torch first."""
+    """The objective of a recipe, with freshly initialised networks. Seed torch first."""
     network = networks.build(recipe.network, width=recipe.width, **recipe.options)
     if recipe.loss.name == GAN:
         return Adversarial(network, networks.discriminator(width=recipe.width))
@@ -43,7 +44,7 @@ def objective_of(recipe: Recipe) -> Objective:
 def model_config(
     recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: dict[str, Any]
 ) -> ModelConfig:
-    """What the weights file says of itself."""
+    """Configuration for the weights file."""
     return ModelConfig(
         name=recipe.name,
         title=recipe.title,
@@ -52,6 +53,7 @@ def model_config(
         normalisation=recipe.normalisation,
         image_size=(recipe.size, recipe.size),
         dataset_fingerprint=fingerprint,
+        benchmark=training_benchmark(fingerprint),
         data_config=recipe.data_config,
         background_removed=recipe.background_removed,
         recipe=recipe.to_dict(),

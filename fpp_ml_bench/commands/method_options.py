@@ -1,6 +1,7 @@
 """Which method, and its settings: the same for ``predict`` and ``time``."""
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,12 +53,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
-        "with one; may ask for the Gray code",
+        "with a single fringe; may need the Gray code",
     )
     phase.add_argument(
         "--prior",
         choices=("none", "standoff"),
-        help="standoff: tell it that objects stand near the rig's standoff, true of fixed placement (default: none)",
+        help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )
     phase.add_argument(
         "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
@@ -69,7 +70,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--weights",
         metavar="FILE",
         help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
-        "phase-net-fresh, which learned from other objects besides)",
+        "phase-net-fresh, trained on additional objects)",
     )
     network = parser.add_argument_group("trained networks")
     network.add_argument(
@@ -84,8 +85,23 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
-    """The method that ``args`` name, for the rig of ``opened``. Raises FppBenchError for one that there is not, and for
-    an option that it does not have."""
+    """The method that ``args`` name, for the rig of ``opened``.
+
+    Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
+    FppBenchError for an unknown method, and for an option that belongs to another one.
+    """
+    method = _method(args, opened)
+    config = getattr(method, "weights_config", None)
+    if config is not None:
+        from fpp_ml_bench.baselines.training_data import training_data_warning
+
+        warning = training_data_warning(config, opened.manifest)
+        if warning is not None:
+            print(f"warning: {config.name} was {warning}", file=sys.stderr)
+    return method
+
+
+def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
     from fpp_ml_bench.baselines.methods import METHODS, method
     from fpp_ml_bench.errors import PredictionError
 
@@ -93,11 +109,11 @@ def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method"
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     kind = args.method if args.method in METHODS else "network"
     weights = _weights(args.method, opened.size[1]) if kind == "network" else None
-    for other, options in _OPTIONS.items():
-        given = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
-        if given:
+    for owner, options in _OPTIONS.items():
+        foreign = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
+        if foreign:
             raise PredictionError(
-                f"{_flag(given[0])} is an option of {_KINDS[other]}, not of {args.method}; leave it out"
+                f"{_flag(foreign[0])} is an option of {_KINDS[owner]}, not of {args.method}; leave it out"
             )
     if weights is not None:
         return _network(weights, args, opened)
@@ -113,15 +129,15 @@ def weights_of_recipe(recipe: str, size: int) -> Path:
     from fpp_ml_bench.leaderboard.reproduce_training import current_weights
 
     resolved = [load_recipe(recipe, preset) for preset in PRESETS]
-    looked = []
+    searched = []
     for candidate in resolved:
         below = RUNS / candidate.preset
-        found = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
-        if found is not None and candidate.size == size:
-            return found
-        looked.append(f"{below / candidate.name} ({candidate.size} px)")
+        weights = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
+        if weights is not None and candidate.size == size:
+            return weights
+        searched.append(f"{below / candidate.name} ({candidate.size} px)")
     raise RecipeError(
-        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(looked)}; train it "
+        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(searched)}; train it "
         "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
     )
 
@@ -132,15 +148,15 @@ def _weights(name: str, size: int) -> Path:
     from fpp_ml_bench.baselines.weights_file import SUFFIX, shipped_names, weights_path
     from fpp_ml_bench.errors import PredictionError, WeightsError
 
-    named = name.split("/")[0] in TABLES and not name.endswith(SUFFIX)
-    if name.endswith(_RECIPE_SUFFIXES) or named:
+    row_of_a_table = name.split("/")[0] in TABLES and not name.endswith(SUFFIX)
+    if name.endswith(_RECIPE_SUFFIXES) or row_of_a_table:
         return weights_of_recipe(name, size)
     try:
         return weights_path(name)
     except WeightsError:
-        known = ", ".join((*METHODS, *shipped_names()))
+        methods = ", ".join((*METHODS, *shipped_names()))
         raise PredictionError(
-            f"unknown method {name!r}; there are {known}, and every .safetensors file of trained weights"
+            f"unknown method {name!r}; there are {methods}, and every .safetensors file of trained weights"
         ) from None
 
 
@@ -153,8 +169,8 @@ def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "
     if model.config.image_size != opened.size:
         raise WeightsError(
             f"{path}: was trained at {_size(model.config.image_size)} px (H x W), {opened.path} has images of "
-            f"{_size(opened.size)} px: at another size the fringe period in px is another, and so is the problem; use "
-            "weights trained at that size, or a dataset built at the weights' size"
+            f"{_size(opened.size)} px: the fringe period in px depends on the size, so a network works at one size "
+            "only; use weights trained at that size, or a dataset built at the weights' size"
         )
     return NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
 
@@ -163,8 +179,8 @@ def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, A
     steps = opened.sequence.steps if args.steps is None else args.steps
     if args.depth_noise is not None:
         steps = _steps_for(args, opened)
-    chosen = {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
-    return {**chosen, **({"fewest": True} if args.fewest else {})}
+    options = {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
+    return {**options, **({"fewest": True} if args.fewest else {})}
 
 
 def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
@@ -173,18 +189,18 @@ def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
     from fpp_ml_bench.fewest import fewest_steps
     from fpp_ml_bench.loaders.illumination import modulation_at
 
-    asked = args.depth_noise
+    depth_noise_mm = args.depth_noise
     noise_grey = opened.manifest.settings.get("noise_sigma_grey")
-    if args.steps is not None or not (asked > 0 and asked < float("inf")):
-        raise PredictionError(f"--depth-noise {asked:g}: expected mm above 0, and not together with --steps")
+    if args.steps is not None or not (depth_noise_mm > 0 and depth_noise_mm < float("inf")):
+        raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
     if noise_grey is None:
         raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
     modulation = modulation_at(opened.rig, opened.rig.working_range_mm[1])
-    steps = fewest_steps(opened.rig, args.direction or "both", asked, modulation, noise_grey)
+    steps = fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
     if steps is None:
         raise PredictionError(
-            f"--depth-noise {asked:g}: not even the {opened.sequence.steps} steps that were captured reach it; ask for "
-            "more, or for both directions"
+            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {opened.sequence.steps} steps that "
+            "were captured; allow more noise, or use both directions"
         )
     return steps
 
@@ -194,16 +210,16 @@ def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
 
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    chosen: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
-    chosen |= {"frames": args.frames, "error_mm": args.error_mm}
-    chosen["shading"] = None if args.no_shading is None else False
-    return {name: value for name, value in chosen.items() if value is not None}
+    options: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
+    options |= {"frames": args.frames, "error_mm": args.error_mm}
+    options["shading"] = None if args.no_shading is None else False
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _phase_net(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
-    chosen = {"direction": args.fringe, "min_confidence": args.min_confidence, "weights": args.weights}
-    chosen["shading"] = None if args.no_shading is None else False
-    return {"threads": args.threads} | {name: value for name, value in chosen.items() if value is not None}
+    options = {"direction": args.fringe, "min_confidence": args.min_confidence, "weights": args.weights}
+    options["shading"] = None if args.no_shading is None else False
+    return {"threads": args.threads} | {name: value for name, value in options.items() if value is not None}
 
 
 _MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net}
@@ -213,7 +229,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
     "network": ("depth_range", "frame", "device"),
 }
-"""What belongs to one kind of method only, by its name in the parsed arguments."""
+"""Options that belong to one kind of method only, by their name in the parsed arguments."""
 _KINDS = {"classical": "classical", "phase": "phase", "phase-net": "phase-net", "network": "trained networks"}
 
 

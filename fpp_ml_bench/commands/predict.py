@@ -47,26 +47,26 @@ def _run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.store import DatasetFolder
 
     opened = DatasetFolder(args.dataset)
-    chosen = chosen_method(args, opened)
+    method = chosen_method(args, opened)
     samples = len(opened.samples(args.split))
     with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
-        done = predict_split(opened, chosen, args.split, args.out, advance)
+        finished = predict_split(opened, method, args.split, args.out, advance)
     print(
-        f"{args.out}: {done.samples} predictions by {chosen.title}; {len(chosen.frames_used)} frames and "
-        f"{done.seconds_per_sample:.3f} s a sample (median)"
+        f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{finished.seconds_per_sample:.3f} s a sample (median)"
     )
-    how = f"--dataset {args.dataset} --split {args.split}{_scoring(chosen, opened)}"
+    how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
     print(f"next: fpp-eval {args.out} {how} --json result.json")
     from fpp_ml_bench.baselines.explain_predict import explain_predict
 
-    explain(args, lambda: explain_predict(opened, chosen, args.split))
+    explain(args, lambda: explain_predict(opened, method, args.split))
     return 0
 
 
-def _scoring(chosen: "Method", opened: "DatasetFolder") -> str:
+def _scoring(method: "Method", opened: "DatasetFolder") -> str:
     """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
     from, but against that depth the process that made it would score 0."""
-    mode, target = getattr(chosen, "mode", "standard"), getattr(chosen, "target", "depth_exact")
+    mode, target = getattr(method, "mode", "standard"), getattr(method, "target", "depth_exact")
     if target == "depth_exact" and not opened.has_exact:
         target = "depth"
     return (f" --mode {mode}" if mode != "standard" else "") + (f" --target {target}" if target != "depth" else "")

@@ -41,8 +41,8 @@ def _count(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Time, write what was asked for, print the figures. Raises FppBenchError before timing for a file that can't be
-    written into."""
+    """Time the method, write the timing files, print the figures. Raises FppBenchError, before timing, for a file that
+    can't be written into."""
     import json
 
     from fpp_ml_bench.linear_algebra import limit_threads

@@ -22,25 +22,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net"
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to go on with")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume"
+    )
     parser.add_argument(
         "--preset", choices=PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
     )
     parser.add_argument(
-        "--minutes", type=float, metavar="M", help="stop before an epoch that would outlast them, everything saved"
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="stop before an epoch that would not finish in time, everything saved",
     )
     parser.add_argument(
         "--extra",
         type=Path,
         metavar="DATASET",
-        help="phase-net: a dataset whose training split is learned from besides",
+        help="phase-net: another dataset whose training split is added",
     )
-    parser.add_argument("--steps", type=int, metavar="N", help="phase-net: how long (default: as the shipped weights)")
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)"
+    )
     parser.add_argument(
         "--unions",
         type=int,
         metavar="N",
-        help="phase-net: unions of objects for every sample (default: as for --steps)",
+        help="phase-net: images that join several objects, made from each sample (default: as the shipped weights)",
     )
     parser.add_argument(
         "--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)"
@@ -49,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, make the weights usable on their own, say what came out. Raises FppBenchError for what can't be done."""
+    """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
     from accelerate import PartialState
 
     from fpp_ml_bench.baselines.range_heads import save_with_heads
@@ -66,18 +73,18 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, option) is not None:
             raise RecipeError(f"--{option} is an option of phase-net; leave it out")
     recipe = load_recipe(args.recipe, args.preset)
-    done = train(recipe, args.dataset, args.out, minutes=args.minutes)
+    trained = train(recipe, args.dataset, args.out, minutes=args.minutes)
     if not PartialState().is_main_process:
-        return 0 if done.finished else CHECK_FAILED
-    if not done.finished:
-        print(f"{args.out}: stopped after {done.epochs} epochs, everything saved; the same command goes on")
+        return 0 if trained.finished else CHECK_FAILED
+    if not trained.finished:
+        print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
-    weights = done.weights
+    weights = trained.weights
     if recipe.normalisation == "individual" and not recipe.background_removed:
         weights = args.out / MODEL
-        save_with_heads(done.weights, args.dataset, weights)
-    print(f"{weights}: {recipe.title}, epoch {done.best_epoch} of {done.epochs}, {done.seconds:.0f} s")
-    print(f"curve: {done.curve}")
+        save_with_heads(trained.weights, args.dataset, weights)
+    print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
+    print(f"curve: {trained.curve}")
     print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
     return 0
 
@@ -88,13 +95,14 @@ def _phase_net(args: argparse.Namespace) -> int:
     from fpp_ml_bench.commands import CHECK_FAILED
     from fpp_ml_bench.commands.console import progress_bar
 
-    chosen = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = Recipe(**chosen)
-    done = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
-    if done.weights is None:
-        print(f"{args.out}: stopped after {done.steps} of {recipe.steps} steps, all saved; the same command goes on")
+    options = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
+    recipe = Recipe(**options)
+    trained = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
+    if trained.weights is None:
+        steps = f"{trained.steps} of {recipe.steps} steps"
+        print(f"{args.out}: stopped after {steps}, all saved; run the same command to resume")
         return CHECK_FAILED
-    scores = ", ".join(f"{key} {value:.3g}" for key, value in done.validation.items())
-    print(f"{done.weights}: {done.steps} steps, mask threshold {done.threshold:g}; validation: {scores}")
-    print(f"next: fpp-bench predict phase-net {args.dataset} --weights {done.weights} --out predictions")
+    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
+    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
+    print(f"next: fpp-bench predict phase-net {args.dataset} --weights {trained.weights} --out predictions")
     return 0
