@@ -217,7 +217,7 @@ class Reporting:
         return self.predict(frames), {"frames": int(frames[0][0, 0]) % 3 + 1}
 
     def summary(self, reports):  # type: ignore[no-untyped-def]
-        return {"frames_mean": sum(one["frames"] for one in reports) / len(reports)}
+        return {"frames_mean": sum(report["frames"] for report in reports) / len(reports)}
 
 
 def test_reports_lie_beside_the_predictions(tmp_path: Path) -> None:

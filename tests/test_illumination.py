@@ -260,14 +260,14 @@ def test_ground_truth_error_by_hand():
     decoded[4, 4:16] = 0  # twelve pixels of the rim
     decoded[10, 10] += 3
     decoded[5, 5] -= 1
-    found = ground_truth_error(decoded, exact)
-    assert found["exact_px"] == 144 and found["undecoded_px"] == 12
-    assert found["gt_mae_mm"] == pytest.approx(4 / 132)
-    assert found["gt_rmse_mm"] == pytest.approx(np.sqrt(10 / 132))
-    assert found["gt_bias_mm"] == pytest.approx(2 / 132)
-    assert found["gt_max_mm"] == 3
-    assert found["gt_interior_px"] == 36  # 12 - 2 x 3 px on each side
-    assert found["gt_interior_mae_mm"] == pytest.approx(3 / 36)
+    errors = ground_truth_error(decoded, exact)
+    assert errors["exact_px"] == 144 and errors["undecoded_px"] == 12
+    assert errors["gt_mae_mm"] == pytest.approx(4 / 132)
+    assert errors["gt_rmse_mm"] == pytest.approx(np.sqrt(10 / 132))
+    assert errors["gt_bias_mm"] == pytest.approx(2 / 132)
+    assert errors["gt_max_mm"] == 3
+    assert errors["gt_interior_px"] == 36  # 12 - 2 x 3 px on each side
+    assert errors["gt_interior_mae_mm"] == pytest.approx(3 / 36)
     empty = ground_truth_error(np.zeros_like(exact), exact)
     assert empty["gt_mae_mm"] is None and empty["gt_max_mm"] is None and empty["undecoded_px"] == 144
 
@@ -297,10 +297,10 @@ def test_storing_fewer_frames_changes_no_byte_of_the_rest():
 
 def test_seed_changes_the_frames_but_not_the_exact_depth():
     mesh = solid(trimesh.creation.icosphere(3, 0.12))
-    one, two = (studio(noise_sigma_grey=1.0, seed=s).photograph(mesh, "A0") for s in (1, 2))
-    np.testing.assert_array_equal(one.depth_exact_mm, two.depth_exact_mm)
-    for index in one.frames:
-        share = (one.frames[index] != two.frames[index]).mean()
+    first, second = (studio(noise_sigma_grey=1.0, seed=s).photograph(mesh, "A0") for s in (1, 2))
+    np.testing.assert_array_equal(first.depth_exact_mm, second.depth_exact_mm)
+    for index in first.frames:
+        share = (first.frames[index] != second.frames[index]).mean()
         assert share > 0.3
 
 

@@ -21,9 +21,9 @@ def wedge():
     return trimesh.convex.convex_hull(points)
 
 
-def corner_distance(found, expected):
+def corner_distance(points, expected):
     """Largest distance from a vertex of either set to the nearest of the other (STL repeats vertices)."""
-    apart = np.linalg.norm(found[:, None] - expected[None], axis=2)
+    apart = np.linalg.norm(points[:, None] - expected[None], axis=2)
     return max(apart.min(axis=0).max(), apart.min(axis=1).max())
 
 

@@ -141,9 +141,9 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
     options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
     assert main(["reliance", "classical", str(tiny), *options, "--into", str(row), "--json", str(tmp_path / "b")]) == 0
-    found = read_result(row).reliance
-    assert found is not None and found.score > 0.9 and found.interval == [None, None]  # one test object
-    assert Reliance(**json.loads((tmp_path / "b").read_text())) == found
+    reliance = read_result(row).reliance
+    assert reliance is not None and reliance.score > 0.9 and reliance.interval == [None, None]  # one test object
+    assert Reliance(**json.loads((tmp_path / "b").read_text())) == reliance
     assert "phase reliance, 0 to 1" in capsys.readouterr().out
     assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
     assert "very method that was scored" in capsys.readouterr().err

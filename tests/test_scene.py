@@ -89,11 +89,11 @@ def test_bounds_are_tight():
 
 
 def test_placement_depends_on_seed_object_and_view_alone():
-    one, other = box(0.1, 0.1, 0.1), solid(trimesh.creation.box((0.1, 0.1, 0.1)), "other")
+    mesh, other = box(0.1, 0.1, 0.1), solid(trimesh.creation.box((0.1, 0.1, 0.1)), "other")
     draw = {
         key: place(mesh, view, RIG, "varied", seed)[1]
         for key, (mesh, view, seed) in {
-            "a": (one, "A0", 1), "again": (one, "A0", 1), "seed": (one, "A0", 2), "view": (one, "A60", 1),
+            "a": (mesh, "A0", 1), "again": (mesh, "A0", 1), "seed": (mesh, "A0", 2), "view": (mesh, "A60", 1),
             "name": (other, "A0", 1),
         }.items()
     }  # fmt: skip

@@ -44,9 +44,9 @@ def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
     build(tmp_path / "on", settings, workers=1)
     with skipping(False):
         build(tmp_path / "off", settings, workers=1)
-    one, other = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
-    assert sorted(one) == sorted(other) and sum(name.endswith(".arrow") for name in one) in (1, 4)
-    assert [name for name in one if one[name] != other[name]] == []
+    skipped, whole = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
+    assert sorted(skipped) == sorted(whole) and sum(name.endswith(".arrow") for name in skipped) in (1, 4)
+    assert [name for name in skipped if skipped[name] != whole[name]] == []
 
 
 def counting(monkeypatch):
@@ -91,10 +91,10 @@ def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
     covered = traced.primary(PixelRays.of(rig.camera)).pixels
     backdrop, counts = Backdrop(rig, lighting), counting(monkeypatch)
     fewer = backdrop.behind(traced, covered)
-    asked = counts["rays"]
+    traced_rays = counts["rays"]
     with skipping(False):
         every = backdrop.behind(traced, covered)
-    assert 0 < asked == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - asked)
+    assert 0 < traced_rays == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - traced_rays)
     elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
     elsewhere[covered] = False
     np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
@@ -178,16 +178,16 @@ def test_a_mask_costs_nothing_in_exactness_however_much_it_covers(share):
     whole = decode_stack(frames, PAPER)
     with skipping(False):
         off = decode_stack(frames, PAPER, mask=mask)
-    for found in (off, decode_stack(frames, PAPER, mask=mask)):
-        np.testing.assert_array_equal(found.depth_mm, np.where(mask, whole.depth_mm, 0))
-        np.testing.assert_array_equal(found.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
-        assert sum(found.counts.values()) == mask.size and found.counts["not_asked"] == (~mask).sum()
+    for decoded in (off, decode_stack(frames, PAPER, mask=mask)):
+        np.testing.assert_array_equal(decoded.depth_mm, np.where(mask, whole.depth_mm, 0))
+        np.testing.assert_array_equal(decoded.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
+        assert sum(decoded.counts.values()) == mask.size and decoded.counts["not_asked"] == (~mask).sum()
 
 
 def test_an_image_without_object_never_reads_the_second_direction():
     frames = capture(PAPER, np.full((PAPER.camera.height, PAPER.camera.width), 3.2))
-    found = decode_stack(frames, PAPER, reasons=False, threads=2)
-    assert found.second_px == 0 and not found.depth_mm.any()
+    decoded = decode_stack(frames, PAPER, reasons=False, threads=2)
+    assert decoded.second_px == 0 and not decoded.depth_mm.any()
 
 
 # ---- reading
@@ -208,15 +208,15 @@ def test_memory_of_a_split_that_is_gone_through_does_not_grow_with_its_samples(t
     own = tmp_path / "dataset"  # other tests of this process may have the shared one mapped
     shutil.copytree(tiny, own)
     opened = DatasetFolder(own)
-    size, kept, resident = TINY_SIZE**2, [], []
+    size, copies, resident = TINY_SIZE**2, [], []
     for sample in opened.samples("all"):
-        kept.append([image.copy() for image in (*opened.frames(sample, range(52)), opened.depth_mm(sample))])
+        copies.append([image.copy() for image in (*opened.frames(sample, range(52)), opened.depth_mm(sample))])
         opened.release(sample)
         resident.append(mapped_bytes(own))
     # Opening a file maps what stands between its images; that is there from the first sample on.
     assert len(resident) == 24 and max(resident) <= resident[0] + 56 * size < 24 * 56 * size / 4
     # Views of what was let go are still good, and count again.
-    for images, sample in zip(kept, opened.samples("all"), strict=True):
+    for images, sample in zip(copies, opened.samples("all"), strict=True):
         for image, again in zip(images, (*opened.frames(sample, range(52)), opened.depth_mm(sample)), strict=True):
             np.testing.assert_array_equal(image, again)
     assert mapped_bytes(own) > 24 * 56 * size

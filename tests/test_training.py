@@ -120,8 +120,8 @@ def test_batches_reuse_one_buffer_and_hold_what_items_hold(tiny):
         assert len(batch.fringe) == len(expected)
         for place, index in enumerate(expected):
             item = dataset[index]
-            for found, alone in zip(batch, item, strict=True):
-                assert torch.equal(found[place], alone)
+            for batched, alone in zip(batch, item, strict=True):
+                assert torch.equal(batched[place], alone)
         seen += len(expected)
     assert seen == 7 and len(places) == 1
     assert sum(len(b.row) for b in dataset.batches(50)) == 216
@@ -134,10 +134,10 @@ def test_batches_reuse_one_buffer_and_hold_what_items_hold(tiny):
 def test_items_own_their_memory(tiny):
     dataset = FringeDepthDataset(tiny, "train")
     first = dataset[0]
-    kept = first.fringe.clone()
+    copy = first.fringe.clone()
     first.depth.zero_()
     dataset[1]
-    assert torch.equal(first.fringe, kept)
+    assert torch.equal(first.fringe, copy)
     assert dataset[0].depth.max() == 1  # the file is untouched
 
 

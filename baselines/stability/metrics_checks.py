@@ -96,12 +96,12 @@ def sample(scale_mm: float, stored: str) -> Outcome:
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
     try:
-        found = score_sample(prediction, target)
+        scores = score_sample(prediction, target)
     except PredictionError as error:
         return Outcome(None, flagged=1.0, note=str(error))
     outcomes = []
     inside = target > 0
-    for stats, where in zip((found.object, found.background), (inside, ~inside), strict=True):
+    for stats, where in zip((scores.object, scores.background), (inside, ~inside), strict=True):
         if not where.any():  # a target of 1e-160 mm is 0 in float32
             outcomes.append(Outcome(0.0 if stats == EMPTY else math.inf, 0.0))
             continue
@@ -181,8 +181,8 @@ def flawless() -> Outcome:
     """A perfect prediction scores exactly 0, and an empty set nothing, never 0."""
     target = np.zeros((64, 64), np.float32)
     target[10:40, 10:40] = 1234.567
-    found = score_sample(target, target)
+    scores = score_sample(target, target)
     empty = score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
-    parts = found.overall, found.object, found.background
+    parts = scores.overall, scores.object, scores.background
     good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == EMPTY
     return Outcome(0.0 if good else math.inf, 0.0)
