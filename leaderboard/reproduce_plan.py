@@ -138,11 +138,11 @@ def planned(tables: Sequence[str], preset: str) -> list[Job]:
     return list(jobs.values())
 
 
-def differing(first: Recipe, two: Recipe) -> str:
+def differing(first: Recipe, second: Recipe) -> str:
     """The settings in which two recipes differ, with both values."""
-    first, second = first.to_dict(), two.to_dict()
-    keys = [key for key in {**first, **second} if first.get(key) != second.get(key)]
-    return ", ".join(f"{key} ({first.get(key)} and {second.get(key)})" for key in keys)
+    a, b = first.to_dict(), second.to_dict()
+    keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
+    return ", ".join(f"{key} ({a.get(key)} and {b.get(key)})" for key in keys)
 
 
 def common_size(jobs: Iterable[Job]) -> int:
