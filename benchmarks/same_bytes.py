@@ -11,6 +11,7 @@ kernels. Prints a fingerprint for each; exit status 1 if two differ. With no opt
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -45,7 +46,9 @@ def fingerprint(way: str, settings: list[str], work: Path) -> str:
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{way}: the build failed:\n{done.stderr}")
-    return str(json.loads((folder / "manifest.json").read_text())["fingerprint"])
+    content = json.loads((folder / "manifest.json").read_text())
+    shutil.rmtree(folder)
+    return str(content["fingerprint"])
 
 
 def main() -> int:
