@@ -10,32 +10,32 @@ import math
 import numpy as np
 
 from fpp_ml_bench.acceleration import njit
+from fpp_ml_bench.portable import ATAN_BOTTOM as BOTTOM
+from fpp_ml_bench.portable import ATAN_TOP as TOP
+from fpp_ml_bench.portable import TAN_EIGHTH
 from fpp_ml_bench.triangulation import GAUSS_NEWTON_STEPS, LEAST_PARALLAX
 
 TILE = 1024
 _HALF_PI = math.pi / 2
 _TAU = 2 * math.pi
-_TAN_EIGHTH = math.tan(math.pi / 8)
 
 
 @njit
 def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
     """-atan2(y, x) in [-pi, pi) to 2 ulp without a call into the C library, which would stop vectorisation.
 
-    Rational approximation of atan on [0, tan(pi/8)] from Cephes (Moshier 1989), the rest by symmetry.
+    Rational approximation of atan on [0, tan(pi/8)] (`portable.ATAN_TOP`), the rest by symmetry.
     """
     ax, ay = abs(x), abs(y)
     small, large = min(ax, ay), max(ax, ay)
-    upper = small > _TAN_EIGHTH * large
+    upper = small > TAN_EIGHTH * large
     top = small - large if upper else small
     bottom = small + large if upper else large
     bottom = bottom if bottom > 0.0 else 1.0
     t = top / bottom
     z = t * t
-    p = (((-8.750608600031904122785e-1 * z - 1.615753718733365076637e1) * z - 7.500855792314704667340e1) * z
-         - 1.228866684490136173410e2) * z - 6.485021904942025371773e1  # fmt: skip
-    q = ((((z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2) * z + 4.328810604912902668951e2) * z
-         + 4.853903996359136964868e2) * z + 1.945506571482613964425e2  # fmt: skip
+    p = (((TOP[4] * z + TOP[3]) * z + TOP[2]) * z + TOP[1]) * z + TOP[0]
+    q = ((((z + BOTTOM[4]) * z + BOTTOM[3]) * z + BOTTOM[2]) * z + BOTTOM[1]) * z + BOTTOM[0]
     angle = t + t * z * (p / q)
     angle = angle + math.pi / 4 if upper else angle
     angle = _HALF_PI - angle if ay > ax else angle

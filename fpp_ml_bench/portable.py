@@ -6,6 +6,7 @@ multiplication, division, square root), each rounded on its own.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,18 +16,20 @@ _SINE = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(9)]
 _EXPONENTIAL = [1.0 / math.factorial(k) for k in range(15)]
 _LOGARITHM = [2.0 / (2 * k + 1) for k in range(12)]
 """Taylor coefficients; the first one left out is below 2^-56 of the result over the reduced range of each function."""
-_ATAN_TOP = [
+ATAN_TOP = (
     -6.485021904942025371773e1, -1.228866684490136173410e2, -7.500855792314704667340e1, -1.615753718733365076637e1,
     -8.750608600031904122785e-1,
-]  # fmt: skip
-_ATAN_BOTTOM = [
+)  # fmt: skip
+ATAN_BOTTOM = (
     1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2, 1.650270098316988542046e2,
     2.485846490142306297962e1, 1.0,
-]  # fmt: skip
+)  # fmt: skip
+"""Cephes (Moshier 1989): atan(t) = t + t z P(z) / Q(z) with z = t^2 on [0, tan(pi/8)], lowest coefficient first."""
+TAN_EIGHTH = math.sqrt(2.0) - 1.0
 _LN2 = 0.6931471805599453
 
 
-def _polynomial(x: NDArray[np.float64], coefficients: list[float]) -> NDArray[np.float64]:
+def _polynomial(x: NDArray[np.float64], coefficients: Sequence[float]) -> NDArray[np.float64]:
     """Horner's rule, lowest coefficient first."""
     total = np.full(x.shape, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -62,16 +65,15 @@ def sine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
 def arctangent2(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """atan2(``y``, ``x``) in [-pi, pi], float64, to 2 units in the last place; 0 where both are 0.
 
-    Rational approximation of atan on [0, tan(pi/8)] from Cephes (Moshier 1989), the rest by symmetry; the same
-    operations as in `fpp_ml_bench.decode_kernels`.
+    The same operations as in `fpp_ml_bench.decode_kernels`, which is faster.
     """
     ax, ay = np.abs(x), np.abs(y)
     small, large = np.minimum(ax, ay), np.maximum(ax, ay)
-    upper = small > math.tan(math.pi / 8) * large
+    upper = small > TAN_EIGHTH * large
     top, bottom = np.where(upper, small - large, small), np.where(upper, small + large, large)
     t = top / np.where(bottom > 0.0, bottom, 1.0)
     z = t * t
-    angle = t + t * z * (_polynomial(z, _ATAN_TOP) / _polynomial(z, _ATAN_BOTTOM))
+    angle = t + t * z * (_polynomial(z, ATAN_TOP) / _polynomial(z, ATAN_BOTTOM))
     angle = np.where(upper, angle + math.pi / 4, angle)
     angle = np.where(ay > ax, math.pi / 2 - angle, angle)
     angle = np.where(x < 0.0, math.pi - angle, angle)

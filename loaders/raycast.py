@@ -14,6 +14,8 @@ from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.scene import SolidMesh
 from fpp_ml_bench.pinhole import Pinhole
 
+SLACK = 1e-9
+"""Boxes are widened by this, in m or normalised units: far above float64's rounding, far below a pixel."""
 _SHADOW_OFFSET_M = 1e-4
 
 
@@ -102,9 +104,8 @@ class TracedObject:
             return (0, rays.x.shape[0]), (0, rays.x.shape[1])
         spans = []
         for bounds, across in ((rays.rows, self._corners[..., 1] / z), (rays.columns, self._corners[..., 0] / z)):
-            slack = 1e-9
-            first = np.searchsorted(bounds[0], across.min() - slack, "left")
-            behind = np.searchsorted(bounds[1], across.max() + slack, "right")
+            first = np.searchsorted(bounds[0], across.min() - SLACK, "left")
+            behind = np.searchsorted(bounds[1], across.max() + SLACK, "right")
             spans.append((int(first), int(behind)))
         return spans[0], spans[1]
 
@@ -118,9 +119,9 @@ class TracedObject:
         around = self._vertices_m - light_m
         if around[:, 2].min() <= 0:
             return np.ones(z.size, dtype=bool)
-        possible, slack = z > 0, 1e-9
+        possible = z > 0
         for along, across in ((x, around[:, 0] / around[:, 2]), (y, around[:, 1] / around[:, 2])):
-            possible &= (along >= (across.min() - slack) * z) & (along <= (across.max() + slack) * z)
+            possible &= (along >= (across.min() - SLACK) * z) & (along <= (across.max() + SLACK) * z)
         return possible
 
     def shadowed(self, points_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
