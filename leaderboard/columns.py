@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.assumptions import assumption
-from fpp_ml_bench.leaderboard.groups import TOLD, Ranked
+from fpp_ml_bench.leaderboard.groups import TOLD, Ranked, assumption
 from fpp_ml_bench.leaderboard.paper import PaperRow, PaperTable
 from fpp_ml_bench.leaderboard.rows import Entry
 

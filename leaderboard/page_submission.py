@@ -6,8 +6,7 @@ from fpp_ml_bench.evaluation.report_html import data_uri, escaped, page
 from fpp_ml_bench.evaluation.report_scores import html_table, sample_table, score_table
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.assumptions import assumption_sentences
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, Group, Ranked
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, Group, Ranked, assumption_sentences
 from fpp_ml_bench.leaderboard.page_scatter import ERROR
 from fpp_ml_bench.leaderboard.page_table import badge, milliseconds
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry, picture_of

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from fpp_ml_bench.evaluation.numbers import millimetres
 from fpp_ml_bench.evaluation.report_html import escaped
 from fpp_ml_bench.evaluation.report_scores import interval_text
-from fpp_ml_bench.leaderboard.assumptions import assumption
 from fpp_ml_bench.leaderboard.columns import NOT_MEASURED, RANK_NOTE, device, reliance, reliance_interval
-from fpp_ml_bench.leaderboard.groups import Group, Ranked
+from fpp_ml_bench.leaderboard.groups import Group, Ranked, assumption
 from fpp_ml_bench.leaderboard.page_scatter import ERROR, provenance_class
 
 _PLOT_WIDTH, _PLOT_HEIGHT = 150, 18

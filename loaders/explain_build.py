@@ -6,6 +6,8 @@ explained as well; `tests/test_skipping.py` counts what really happens and finds
 
 import numpy as np
 
+from fpp_ml_bench import __version__
+from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.explain import Explanation, LeftOut, explained, saved_by
 from fpp_ml_bench.loaders.illumination import lit_object
 from fpp_ml_bench.loaders.manifest import GENERATED, Manifest
@@ -47,10 +49,18 @@ class SingleView:
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
-    """The account of a built dataset. Takes a second or two: it makes one view several times."""
+    """The account of a built dataset. Takes a second or two: it makes one view several times.
+
+    Raises `BuildError` for a dataset of an earlier version, which counted something else.
+    """
     if manifest.origin != GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
+    if any("shadow_rays" not in row for row in rows):
+        raise BuildError(
+            f"--explain: expected a dataset of version {__version__}, this one was built by version "
+            f"{manifest.generator.get('version')} and did not count shadow rays; delete it and build it again"
+        )
     view = SingleView(manifest, settings)
     rule = RULE.format(sample=view.row["sample"])
     rig, views = settings.rig, len(rows)

@@ -1,12 +1,14 @@
 """``--explain`` counts agree with the data, and ``--no-skip`` changes no result."""
 
 import json
+from dataclasses import replace
 
 import pytest
-from conftest import TINY_SIZE, file_bytes
+from conftest import TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.commands import main
 from fpp_ml_bench.commands.evaluate import main as evaluate
+from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.explain import Explanation, LeftOut, explained, saved_by
 from fpp_ml_bench.loaders.explain_build import explain_build
 from fpp_ml_bench.loaders.store import DatasetFolder
@@ -69,6 +71,17 @@ def test_build_and_its_account(tmp_path, capsys):
     assert (frames["done"], frames["left_out"], frames["bytes_saved"]) == (6, 306, 306 * PIXELS)
     exposures = lines["exposures (49 unstored frames off the object, 2 everywhere)"]
     assert exposures["done"] + exposures["left_out"] == 6 * 52 * PIXELS and exposures["seconds_saved"] > 0
+
+
+def test_a_dataset_of_an_earlier_version_is_refused_in_words(tiny):
+    manifest = DatasetFolder(tiny).manifest
+    rows = {
+        split: [{key: value for key, value in row.items() if key != "shadow_rays"} for row in part]
+        for split, part in manifest.samples.items()
+    }
+    earlier = replace(manifest, samples=rows, generator={"name": "fpp-ml-bench", "version": "0.1.0"})
+    with pytest.raises(BuildError, match=r"built by version 0\.1\.0 .* build it again"):
+        explain_build(earlier, tiny_settings())
 
 
 def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):

@@ -12,8 +12,7 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.commands import main
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences
-from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE
+from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE, assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.ranking import rank, rank_ranges, read_entries, shipped_rows
