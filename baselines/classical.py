@@ -10,19 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding import Decoded, Directions, decode_stack
+from fpp_ml_bench.decoding import Decoded, Directions, choose_steps, decode_stack, fewest_gray_bits
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.fewest import fewest_gray_bits
-from fpp_ml_bench.frames import DIRECTIONS, Direction
-from fpp_ml_bench.phase import choose_steps
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 
 @dataclass(frozen=True)
 class ClassicalMethod:
     """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned.
 
-    ``fewest``: of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.fewest`)."""
+    ``fewest``: of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.decoding.fewest`)."""
 
     rig: Rig
     direction: Directions = "both"

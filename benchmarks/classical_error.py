@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import edge_distance_px
+from fpp_ml_bench.depth import edge_distance_px
+from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 STEPS = (3, 4, 6, 9, 18)
 EDGE_BAND_PX = 3

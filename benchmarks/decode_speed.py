@@ -35,11 +35,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.acceleration import SWITCH, numba_enabled
-from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.patterns import pattern_image
-from fpp_ml_bench.rig import Rig, paper_rig
-from fpp_ml_bench.triangulation import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.compiled import SWITCH, numba_enabled
+from fpp_ml_bench.decoding import decode_stack, depth_from_both, depth_from_coordinate
+from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
 
 ALBEDO, AMBIENT, NOISE = 0.45, 4.0, 1.0
 

@@ -32,10 +32,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
 from fpp_ml_bench.evaluation.protocol import HEADLINE
-from fpp_ml_bench.frames import PAPER_SEQUENCE
-from fpp_ml_bench.loaders.manifest import Manifest, ShardFile
-from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.storage import Manifest, Row, ShardFile, ShardWriter, plan_shards
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 COVER = 0.1
 COMMAND = Path(sys.executable).with_name("fpp-eval")

@@ -20,15 +20,12 @@ import cv2
 import numpy as np
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.phase_route.frame_choice import FewestFrames
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
-from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
-from fpp_ml_bench.baselines.phase_route.several_frames import PIXELWISE
-from fpp_ml_bench.baselines.prediction import captured_frames
-from fpp_ml_bench.commands.console import progress_bar
+from fpp_ml_bench.baselines.phase_route import PIXELWISE, FewestFrames, Measurement, PhaseMethod
+from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
-from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 
 @dataclass(frozen=True)

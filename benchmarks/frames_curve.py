@@ -25,13 +25,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import cv2
 import numpy as np
 
-from fpp_ml_bench.baselines.methods import Method, method
-from fpp_ml_bench.baselines.prediction import captured_frames
-from fpp_ml_bench.commands.console import progress_bar
+from fpp_ml_bench.baselines.method import Method, method
+from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
-from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 FRAME_COUNTS = (1, 2, 3, 4, 6, 9, 18)
 STEPS = (3, 4, 6, 9, 18)

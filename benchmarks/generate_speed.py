@@ -2,7 +2,7 @@
 
     python benchmarks/generate_speed.py [--size 960] [--objects 16] [--workers 2] [--folder DIR]
 
-Ours is the real builder (`fpp_ml_bench.loaders.build.build`): ray casting, 52 exposures with shot and read noise,
+Ours is the real builder (`fpp_ml_bench.loaders.render.builder`): ray casting, 52 exposures with shot and read noise,
 ground-truth decoding, Arrow shards with checksums. It runs twice, once into ``--folder`` and once into memory
 (``/dev/shm``): the difference is the disk's share. A first build that is not counted compiles the kernels.
 
@@ -26,16 +26,19 @@ import numpy as np
 
 from fpp_ml_bench.constants import OBJECTS, split_of
 from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.hardware import describe_hardware
-from fpp_ml_bench.loaders.build import build
-from fpp_ml_bench.loaders.illumination import hit_points_m, lit_object
-from fpp_ml_bench.loaders.meshes import solid_mesh
-from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.scene import place
-from fpp_ml_bench.loaders.settings import BuildSettings
-from fpp_ml_bench.loaders.view import Studio
-from fpp_ml_bench.patterns import pattern_image
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.render import (
+    BuildSettings,
+    PixelRays,
+    Studio,
+    TracedObject,
+    build,
+    hit_points_m,
+    lit_object,
+    place,
+    solid_mesh,
+)
+from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.optics import paper_rig, pattern_image
 
 FULL_IMAGES = 15_600
 

@@ -15,11 +15,11 @@ import shlex
 import sys
 from pathlib import Path
 
-from fpp_ml_bench.commands import main as fpp_bench
-from fpp_ml_bench.commands.evaluate import main as fpp_eval
-from fpp_ml_bench.evaluation.report_sheet import write_sheet
-from fpp_ml_bench.evaluation.result_io import read_result
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.cli import main as fpp_bench
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.evaluation.report import write_sheet
+from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 ROWS = Path(__file__).resolve().parent.parent / "leaderboard" / "rows"
 CLASSICAL = (

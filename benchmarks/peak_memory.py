@@ -25,7 +25,7 @@ _RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); from fpp_ml_bench.{modu
 
 
 def command(name: str, *arguments: str) -> list[str]:
-    module = "commands.evaluate" if name == "fpp-eval" else "commands"
+    module = "cli.evaluate" if name == "fpp-eval" else "cli"
     first = [] if name == "fpp-eval" else [name]
     return [sys.executable, "-c", _RUN.format(module=module), str(ROOT), *first, *arguments]
 

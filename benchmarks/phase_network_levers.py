@@ -18,14 +18,11 @@ import torch
 from phase_pictures import draw_panels
 from phase_route_stages import SHOWN
 
-from fpp_ml_bench.baselines.model import load
-from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
-from fpp_ml_bench.baselines.phase_network.route import AnsweredObservation, Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_network.weights import DEFAULT
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.baselines.networks.model import load
+from fpp_ml_bench.baselines.phase_network import DEFAULT, AnsweredObservation, Levers, NetworkRoute, PhaseNetMethod
+from fpp_ml_bench.baselines.phase_route import TAU, Measurement
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 NOTHING = Levers(order=False, mask=False, phase=False)
 NOTHING_LEARNED = "nothing learned"

@@ -16,11 +16,9 @@ import cv2
 import numpy as np
 from phase_pictures import draw_panels
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
-from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.baselines.phase_route import TAU, Measurement, PhaseMethod
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 SHOWN = ("container_bottle_A60", "large_clamp_A120", "wooden_boards_A0")
 VARIANTS: dict[str, dict] = {

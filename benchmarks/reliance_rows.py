@@ -23,24 +23,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneSet
-from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
-from fpp_ml_bench.baselines.inference import fringe_batch, probed, represent
-from fpp_ml_bench.baselines.methods import METHODS, Method, method
-from fpp_ml_bench.baselines.metric_twin import TWINS
-from fpp_ml_bench.baselines.model import Model, load
-from fpp_ml_bench.baselines.network_method import NetworkMethod
-from fpp_ml_bench.baselines.weights_file import shipped_names, weights_path
+from fpp_ml_bench.baselines.diagnostics import VIEWS_PER_OBJECT, SceneSet, measure
+from fpp_ml_bench.baselines.method import METHODS, Method, method
+from fpp_ml_bench.baselines.networks.inference import fringe_batch, probed, represent
+from fpp_ml_bench.baselines.networks.metric_twin import TWINS
+from fpp_ml_bench.baselines.networks.model import Model, load
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.training import shipped_names, weights_path
+from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.evaluation.numbers import millimetres
-from fpp_ml_bench.evaluation.reliance import RELIANCE_VERSION
+from fpp_ml_bench.evaluation.report import millimetres
+from fpp_ml_bench.evaluation.result import RELIANCE_VERSION
 from fpp_ml_bench.leaderboard.columns import reliance_interval
 from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
-from fpp_ml_bench.loaders.manifest import write_atomically
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.normalisation import denormalise
+from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
 
 REFUSED = 2
 

@@ -37,9 +37,9 @@ WAYS: dict[str, dict[str, str]] = {
 
 MESHES = """\
 import hashlib, sys
-from fpp_ml_bench.commands import main
+from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import OBJECTS
-from fpp_ml_bench.loaders.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
 digest = hashlib.sha256()
 for name in OBJECTS:
     mesh = solid_mesh(name)

@@ -32,16 +32,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import trimesh
 
-from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.baselines.phase_route import PhaseRoute
 from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.evaluation.scores import score_sample
-from fpp_ml_bench.hardware import describe_hardware
-from fpp_ml_bench.loaders.build import build
-from fpp_ml_bench.loaders.manifest import file_hash
-from fpp_ml_bench.loaders.meshes import single_mesh
-from fpp_ml_bench.loaders.settings import BuildSettings
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.loaders.render import BuildSettings, build, single_mesh
+from fpp_ml_bench.loaders.storage import DatasetFolder, file_hash
+from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.optics import paper_rig
 from fpp_ml_bench.skipping import skipping
 
 Work = Callable[[], Any]

@@ -40,8 +40,8 @@ import torch
 from train_ways import Epoch, Job, Ours, Plain, PngAndMat, run_epoch, start, step_seconds, surround
 
 from fpp_ml_bench.constants import OBJECTS, VALIDATION_OBJECTS, split_of
-from fpp_ml_bench.hardware import describe_hardware
 from fpp_ml_bench.loaders.training import FringeDepthDataset
+from fpp_ml_bench.machine import describe_hardware
 
 TABLE = {"width": (8, 16, 32), "size": (160, 224, 320), "batch": (1, 2, 4, 8)}
 QUICK_TABLE = {"width": (8, 16), "size": (160, 224), "batch": (1, 4)}

@@ -12,12 +12,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training import environment
+from fpp_ml_bench.baselines.training import Recipe, environment, load_recipe, open_data
 from fpp_ml_bench.baselines.training.engine import _Training
-from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe
-from fpp_ml_bench.baselines.training.setup import open_data
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
-from fpp_ml_bench.loaders.published_layout import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
+from fpp_ml_bench.loaders.published import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.training import FringeDepth
 
 ENOUGH_S = 3.0

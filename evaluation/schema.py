@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.text import printable, text_problem
+from fpp_ml_bench.files import printable, text_problem
 
 MAX_PROBLEMS = 50
 Model = TypeVar("Model", bound="StrictModel")

@@ -65,7 +65,7 @@ def sine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
 def arctangent2(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """atan2(``y``, ``x``) in [-pi, pi], float64, to 2 units in the last place; 0 where both are 0.
 
-    The same operations as in `fpp_ml_bench.decode_kernels`, which is faster.
+    The same operations as in `fpp_ml_bench.decoding.kernels`, which is faster.
     """
     ax, ay = np.abs(x), np.abs(y)
     small, large = np.minimum(ax, ay), np.maximum(ax, ay)

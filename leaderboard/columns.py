@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fpp_ml_bench.evaluation.numbers import millimetres, percent, seconds
 from fpp_ml_bench.evaluation.protocol import HEADLINE
-from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.groups import TOLD, Ranked, assumption
 from fpp_ml_bench.leaderboard.paper import PaperRow, PaperTable
 from fpp_ml_bench.leaderboard.rows import Entry

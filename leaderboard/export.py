@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import NOTE, PAPER_TITLES, columns, device, paper_cells, paper_note
 from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, Group, Ranked, assumption_sentences
 from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperTable

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.leaderboard.rows import Entry
-from fpp_ml_bench.loaders.benchmark import benchmark_of
+from fpp_ml_bench.loaders.storage import benchmark_of
 
 LEGACY_FINGERPRINTS = frozenset(
     {

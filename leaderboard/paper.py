@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from fpp_ml_bench.baselines.training.tables import TABLES
+from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
-from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.files import printable
 
 PAPER_FILE = Path(__file__).resolve().parent / "paper_rows.json"
 PAPER_HEADING = "reported by the paper on other data (not measured here)"

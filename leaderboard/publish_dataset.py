@@ -9,13 +9,20 @@ from typing import Any
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DatasetError, PublishError
 from fpp_ml_bench.leaderboard.export import markdown_text
-from fpp_ml_bench.leaderboard.publish import MARK, Publication, mark_bytes
-from fpp_ml_bench.leaderboard.publish_parquet import PREVIEW, columns, data_shards, write_shard
 from fpp_ml_bench.leaderboard.publish_tasks import BENCHMARK, FRAMEWORK, SCORE_TEXT, tasks_of
-from fpp_ml_bench.loaders.card import RIG_FILE, data_version
-from fpp_ml_bench.loaders.export_dataset import MESH_FOLDER
-from fpp_ml_bench.loaders.manifest import file_hash, write_atomically
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes
+from fpp_ml_bench.loaders.storage import (
+    MESH_FOLDER,
+    PREVIEW,
+    RIG_FILE,
+    DatasetFolder,
+    columns,
+    data_shards,
+    data_version,
+    file_hash,
+    write_atomically,
+    write_shard,
+)
 
 EVAL_FILE = "eval.yaml"
 OWNED = ("data/", f"{MESH_FOLDER}/")
@@ -89,7 +96,7 @@ def stage_dataset(
             raise DatasetError(f"{source}: missing or damaged, it isn't published; build the dataset again")
         (folder / MESH_FOLDER).mkdir(exist_ok=True)
         shutil.copyfile(source, folder / mesh.path)
-    from fpp_ml_bench.rig_io import save_rig
+    from fpp_ml_bench.optics import save_rig
 
     save_rig(dataset.rig, folder / RIG_FILE)
     write_atomically(folder / "README.md", _card(dataset, repo, licence).encode())

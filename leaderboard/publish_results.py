@@ -9,12 +9,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from fpp_ml_bench.errors import PublishError
-from fpp_ml_bench.evaluation.numbers import millimetres, percent
+from fpp_ml_bench.evaluation.report import millimetres, percent
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.leaderboard.publish import Publication
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.publish_tasks import BENCHMARK, SCORE_TEXT, score, task_of
 from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.loaders.hub import Publication
 
 FOLDER = ".eval_results"
 

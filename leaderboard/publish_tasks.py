@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.frames import CONFIGS
-from fpp_ml_bench.loaders.schema import SINGLE_SHOT_FRAME
+from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
+from fpp_ml_bench.optics import CONFIGS
 
 BENCHMARK = "FPP-ML-Bench"
 FRAMEWORK = "fpp-ml-bench"

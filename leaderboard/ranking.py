@@ -6,8 +6,8 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS, SIGNED
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.evaluation.uncertainty import Interval, ranks_with_ties
+from fpp_ml_bench.evaluation.score import Interval, ranks_with_ties
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry

@@ -3,15 +3,13 @@
 from typing import TYPE_CHECKING
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.reliance import Reliance
-from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.result_io import result_content, write_result
+from fpp_ml_bench.evaluation.result import Reliance, Result, result_content, write_result
 from fpp_ml_bench.evaluation.schema import validate
-from fpp_ml_bench.evaluation.text import printable
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.methods import Method
+    from fpp_ml_bench.baselines.method import Method
 
 _OF_THE_MACHINE = ("threads", "device")
 

@@ -7,8 +7,8 @@ cut at a word. The names of a group differ from each other.
 from collections.abc import Sequence
 
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.frames import CONFIGS
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.optics import CONFIGS
 
 LONGEST_NAME = 36
 """Characters of a short name."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import VIEWS, sample_name
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.frames import DIRECTIONS
-from fpp_ml_bench.loaders.schema import stored_frames
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import DIRECTIONS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,10 +96,7 @@ def _save(save: Callable[..., None], path: Path) -> None:
 
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     """The mesh seen from above and the side, lit from the viewer; uint8 (size, size)."""
-    from fpp_ml_bench.loaders.meshes import load_user_mesh
-    from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
-    from fpp_ml_bench.loaders.scene import turned
-    from fpp_ml_bench.loaders.settings import UserMesh
+    from fpp_ml_bench.loaders.render import PixelRays, TracedObject, UserMesh, load_user_mesh, turned
 
     mesh = load_user_mesh(UserMesh(path.stem, str(path), centre=False))
     vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)

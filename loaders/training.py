@@ -9,13 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from fpp_ml_bench.acceleration import numba_enabled
+from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.frames import CONFIGS
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.normalisation import NORMALISATIONS, Normalisation, normalise
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import CONFIGS
 
 
 class FringeDepth(NamedTuple):
@@ -43,7 +42,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     config : the frames that form pairs: ``single_shot`` (frame 0), ``horizontal``, ``vertical``,
         ``sinusoidal`` or ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
     normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] per sample, from its own D_min and D_max; a
-        flat sample is 0 throughout). See `fpp_ml_bench.normalisation`.
+        flat sample is 0 throughout). See `fpp_ml_bench.depth`.
     background_removed : set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
 
     Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. In a single

@@ -5,8 +5,8 @@ from typing import Any
 
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.evaluation.evaluator import evaluate
-from fpp_ml_bench.evaluation.result_io import write_result
+from fpp_ml_bench.evaluation.result import write_result
+from fpp_ml_bench.evaluation.score import evaluate
 
 HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 

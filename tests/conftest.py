@@ -25,8 +25,8 @@ TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
 
 def tiny_settings(**changes):
     """Settings of the tiny dataset, with ``changes``."""
-    from fpp_ml_bench.loaders.settings import BuildSettings
-    from fpp_ml_bench.rig import paper_rig
+    from fpp_ml_bench.loaders.render import BuildSettings
+    from fpp_ml_bench.optics import paper_rig
 
     return BuildSettings(**{"rig": paper_rig(TINY_SIZE), "objects": TINY_OBJECTS, **changes})
 
@@ -40,7 +40,7 @@ def file_bytes(folder):
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """Folder of the tiny dataset, all 52 frames. Shared by all tests: copy it before changing it."""
-    from fpp_ml_bench.loaders.build import build
+    from fpp_ml_bench.loaders.render import build
 
     folder = tmp_path_factory.mktemp("tiny") / "dataset"
     build(folder, tiny_settings(), workers=1)
@@ -50,6 +50,6 @@ def tiny(tmp_path_factory):
 @pytest.fixture(scope="session")
 def opened(tiny):
     """The tiny dataset, opened for reading."""
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
     return DatasetFolder(tiny)

@@ -3,10 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.camera import Exposure
-from fpp_ml_bench.loaders.illumination import Lighting, light_surface
-from fpp_ml_bench.loaders.sensor import Noise
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.loaders.render import Exposure, Lighting, Noise, light_surface
+from fpp_ml_bench.optics import Rig
 
 
 def plane_depth_m(rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:

@@ -14,11 +14,8 @@ import numpy as np
 from hub_server import HubServer
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.frames import PAPER_SEQUENCE
-from fpp_ml_bench.loaders.manifest import Manifest, describe_file
-from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWriter, describe_file, plan_shards
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (30, 26)
@@ -62,7 +59,7 @@ _SERVE = """
 import json, sys
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
-from fpp_ml_bench.commands import main
+from fpp_ml_bench.cli import main
 for line in sys.stdin:
     out, err = StringIO(), StringIO()
     with redirect_stdout(out), redirect_stderr(err):

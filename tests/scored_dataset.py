@@ -8,11 +8,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.frames import PAPER_SEQUENCE
-from fpp_ml_bench.loaders.manifest import Manifest
-from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWriter, plan_shards
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
 VIEWS = ("A0", "A60")

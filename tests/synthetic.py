@@ -5,11 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpp_ml_bench.constants import VIEWS
-from fpp_ml_bench.frames import PAPER_SEQUENCE
-from fpp_ml_bench.loaders.assemble import Assembly, assemble
-from fpp_ml_bench.loaders.manifest import Manifest
-from fpp_ml_bench.loaders.shards import Row, ShardWriter, plan_shards
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.storage import Assembly, Manifest, Row, ShardWriter, assemble, plan_shards
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 SIZE = (12, 16)
 SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_drill",)}

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fpp_ml_bench.normalisation import NORMALISATIONS, denormalise, normalise
+from fpp_ml_bench.depth import NORMALISATIONS, denormalise, normalise
 
 
 def depth_map(low=1510.123, high=1987.654, shape=(40, 50)):

@@ -61,7 +61,7 @@ def test_dependencies_flow_one_way():
         position = order.index("core" if top == "fpp_ml_bench" else top)
         for path in (ROOT / top).rglob("*.py"):
             relative = path.relative_to(ROOT).parts
-            if relative[:2] == ("fpp_ml_bench", "commands") or (
+            if relative[:2] == ("fpp_ml_bench", "cli") or (
                 path.name in ("__init__.py", "__main__.py") and position == 0
             ):
                 continue

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from fpp_ml_bench.pixel_sets import (
+from fpp_ml_bench.depth import (
     background_mask,
     depth_edges,
     edge_distance_px,

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.weights_file import ModelConfig
+from fpp_ml_bench.baselines.training import ModelConfig
 
 # Small networks and a size they take, 64 px; TransUNet is built for it: 4x4 map, 2x2 patches.
 SMALL: dict[str, dict[str, int | float]] = {

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics.subject import Subject, checked_output
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject, checked_output
 from fpp_ml_bench.errors import DiagnosisError
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 BATCH = 8
 PIXELS_AT_ONCE = BATCH * 224 * 224

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.evaluation.uncertainty import Interval, object_interval
+from fpp_ml_bench.evaluation.score import Interval, object_interval
 
 EDGES, FRINGES, OWN = "edges", "fringes", "own"
 _LEAST_SPREAD = 1e-12

@@ -13,10 +13,10 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_report import draw, summa
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, SceneSet
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 MOST_VIEWS = 6
 

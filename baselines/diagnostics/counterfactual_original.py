@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, surface_of_sample
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 
 @dataclass(frozen=True)

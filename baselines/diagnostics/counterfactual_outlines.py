@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, OutlineChange
 from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface
-from fpp_ml_bench.loaders.illumination import LitPixels
+from fpp_ml_bench.loaders.render import LitPixels
 
 GROWTH = 0.1
 """How far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area."""

@@ -11,8 +11,8 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfact
 from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Table
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import DepthMethod, SampleReliance, ScenePredictor
 from fpp_ml_bench.baselines.diagnostics.synth import Scene
-from fpp_ml_bench.evaluation.reliance import PART_TITLES, Reliance
-from fpp_ml_bench.evaluation.uncertainty import caution
+from fpp_ml_bench.evaluation.result import PART_TITLES, Reliance
+from fpp_ml_bench.evaluation.score import caution
 
 _WIDE, _GAP = 11.5, 2
 """Width of the figure of scenes in inches, and gap between two scenes in px."""

@@ -16,12 +16,12 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original,
 from fpp_ml_bench.baselines.diagnostics.counterfactual_outlines import outline_changes
 from fpp_ml_bench.baselines.diagnostics.synth import Projected, Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Field, Surface, moved
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU

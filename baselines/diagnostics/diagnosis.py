@@ -21,12 +21,12 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names, probe
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.hardware import describe_hardware
-from fpp_ml_bench.loaders.manifest import write_atomically
+from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.machine import describe_hardware
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.diagnostics.subject import Subject
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 JSON_FILE = "diagnose.json"
 FORMAT_VERSION = 1

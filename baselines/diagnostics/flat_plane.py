@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.counterfactual_original import original
 from fpp_ml_bench.baselines.diagnostics.flat_plane_report import draw, summary, tables
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
-from fpp_ml_bench.baselines.diagnostics.subject import Frames, Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Frames, Subject
 from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, plane
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.depth import object_mask
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)

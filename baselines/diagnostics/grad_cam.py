@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.activations import batch_size, batches
 from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, correlation
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.diagnostics.targets import edge_map, fringe_variation
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
@@ -25,7 +25,7 @@ from fpp_ml_bench.errors import DiagnosisError
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Image = NDArray[np.float32]
 

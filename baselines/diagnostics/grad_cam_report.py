@@ -10,10 +10,10 @@ from fpp_ml_bench.baselines.diagnostics import figures
 from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, Mean, ratio
 from fpp_ml_bench.baselines.diagnostics.grad_cam import PAPER_LAYERS, maps, references
 from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Table
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 PAPER_RATIO = 1.28
 _EXAMPLES = 3

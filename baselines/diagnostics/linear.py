@@ -20,13 +20,13 @@ from fpp_ml_bench.baselines.diagnostics.scores import (
     ratio_of_means,
     score,
 )
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.pixel_sets import object_mask
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 """Training samples of the probes, and training samples and epochs of a quick run."""

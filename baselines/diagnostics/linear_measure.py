@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from fpp_ml_bench.baselines.diagnostics import convolution_probe as convolution
 from fpp_ml_bench.baselines.diagnostics.activations import INPUT, at_pixels, at_size, batches, run, tapped
 from fpp_ml_bench.baselines.diagnostics.ridge import NormalEquations, apply
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.diagnostics.targets import Truth, edge_map, truth
-from fpp_ml_bench.normalisation import normalise
+from fpp_ml_bench.depth import normalise
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 POSITION = "position"
 """The pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Finding, Table
-from fpp_ml_bench.evaluation.report_html import data_uri, escaped, page
+from fpp_ml_bench.evaluation.report import data_uri, escaped, page
 
 REPORT_FILE = "index.html"
 _TEXT = 4000

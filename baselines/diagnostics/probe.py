@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from fpp_ml_bench.errors import DiagnosisError
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.diagnostics.subject import Subject
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Cell = str | int | float | None
 
@@ -125,7 +125,7 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
 
     Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
     """
-    from fpp_ml_bench.loaders.manifest import write_atomically
+    from fpp_ml_bench.loaders.storage import write_atomically
 
     content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)

@@ -21,10 +21,10 @@ from fpp_ml_bench.baselines.diagnostics.reliance import (
 from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.reliance import RELIANCE_VERSION, Reliance, RelianceParts
-from fpp_ml_bench.evaluation.uncertainty import object_interval
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.evaluation.result import RELIANCE_VERSION, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction
 
 Map = NDArray[np.floating[Any]]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.evaluation.uncertainty import Interval, object_interval
+from fpp_ml_bench.evaluation.score import Interval, object_interval
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.camera import Exposure
-from fpp_ml_bench.loaders.illumination import Lighting, LitPixels, background_plane, light_surface
-from fpp_ml_bench.loaders.sensor import Noise
-from fpp_ml_bench.loaders.settings import BuildSettings
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.loaders.render import (
+    BuildSettings,
+    Exposure,
+    Lighting,
+    LitPixels,
+    Noise,
+    background_plane,
+    light_surface,
+)
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction, Rig
 
 Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
 PITCH_FACTOR = 4 / 3

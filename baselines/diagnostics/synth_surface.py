@@ -6,18 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.build import MESH_FOLDER
-from fpp_ml_bench.loaders.meshes import load_user_mesh
-from fpp_ml_bench.loaders.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.scene import turned
-from fpp_ml_bench.loaders.schema import DEPTH, DEPTH_EXACT
-from fpp_ml_bench.loaders.settings import UserMesh
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import object_mask
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.loaders.render import MESH_FOLDER, PixelRays, TracedObject, UserMesh, load_user_mesh, turned
+from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction, Rig
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""

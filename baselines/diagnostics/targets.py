@@ -6,12 +6,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route import TAU
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.normalisation import normalise
-from fpp_ml_bench.pixel_sets import object_mask
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.depth import normalise, object_mask
+from fpp_ml_bench.optics import Direction, Rig
 
 Image = NDArray[np.float32]
 

@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress
-from fpp_ml_bench.baselines.diagnostics.subject import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, moved
 from fpp_ml_bench.baselines.diagnostics.theory_report import draw, summary, tables
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Direction, Rig
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 DISTANCES_M = (0.3, 10.0)
 POINTS = 400

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from fpp_ml_bench.baselines.diagnostics.subject import (
+from fpp_ml_bench.baselines.diagnostics.subjects import (
     FACTORY_MARK,
     NORMALISATION_OF,
     Frames,
@@ -22,13 +22,13 @@ from fpp_ml_bench.baselines.diagnostics.subject import (
     direction_of,
     select_layers,
 )
-from fpp_ml_bench.baselines.inference import fringe_batch
+from fpp_ml_bench.baselines.networks.inference import fringe_batch
+from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import DiagnosisError, FppBenchError
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.normalisation import denormalise
+from fpp_ml_bench.files import printable
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.store import DatasetFolder
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 _LONGEST_MESSAGE = 400
 

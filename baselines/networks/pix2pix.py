@@ -4,7 +4,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_normal, whole
-from fpp_ml_bench.baselines.networks.instance_norm import InstanceNorm
+from fpp_ml_bench.baselines.networks.blocks import InstanceNorm
 
 DOWNSAMPLINGS = 4
 RESIDUAL_BLOCKS = 9

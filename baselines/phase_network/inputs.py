@@ -15,11 +15,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
-from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation
-from fpp_ml_bench.baselines.phase_route.orders import LEAST_BRIGHTNESS
-from fpp_ml_bench.baselines.phase_route.shading import irradiance, wrapped
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.baselines.phase_route import (
+    LEAST_BRIGHTNESS,
+    TAU,
+    CalibrationLayer,
+    Crop,
+    Observation,
+    irradiance,
+    wrapped,
+)
+from fpp_ml_bench.optics import Rig
 
 Image = NDArray[np.float32]
 

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
 from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetConfig, NetFile, load_net
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
-from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.phase_route import Measurement, Settings
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Direction, Rig
 
 PERIOD_TOLERANCE = 2.2
 """Factor by which an image's fringe period in px may differ from that of the training images."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from fpp_ml_bench.baselines.phase_network.windows import Variation
 from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.frames import DIRECTIONS, Direction
+from fpp_ml_bench.optics import DIRECTIONS, Direction
 
 
 @dataclass(frozen=True)

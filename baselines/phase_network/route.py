@@ -14,15 +14,18 @@ from fpp_ml_bench.baselines.phase_network.decide import Answers, decided_mask, n
 from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Image, Scene
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, first_order
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
-from fpp_ml_bench.baselines.phase_route.confidence import MARGIN_SCALE
-from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
-from fpp_ml_bench.baselines.phase_route.observation import Observation
-from fpp_ml_bench.baselines.phase_route.orders import spread_over_pixels
-from fpp_ml_bench.baselines.phase_route.settings import Settings
-from fpp_ml_bench.baselines.phase_route.shading import wrapped
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.baselines.phase_route import (
+    LARGE,
+    MARGIN_SCALE,
+    TAU,
+    Measurement,
+    Observation,
+    Settings,
+    least_energy,
+    spread_over_pixels,
+    wrapped,
+)
+from fpp_ml_bench.optics import Rig
 
 LEAST_ODDS = 1e-6
 """Least probability of a wrong order, whatever the network answers."""

@@ -10,15 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.inputs import Image, Rotation, Scene
-from fpp_ml_bench.baselines.phase_route import orders
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
-from fpp_ml_bench.baselines.phase_route.observation import Observation
-from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
-from fpp_ml_bench.baselines.phase_route.settings import Settings
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.store import DatasetFolder
-from fpp_ml_bench.pixel_sets import depth_edges, object_mask
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer, Observation, PhaseRoute, Settings, orders
+from fpp_ml_bench.depth import depth_edges, object_mask
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction, Rig
 
 EDGE_POINTS = 2000
 """Pixels near depth edges that a sample holds, as centres of training windows."""

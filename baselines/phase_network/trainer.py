@@ -19,13 +19,11 @@ from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sampl
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, score, train
 from fpp_ml_bench.baselines.phase_network.unions import unions_of
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
-from fpp_ml_bench.baselines.phase_route.settings import Settings
-from fpp_ml_bench.baselines.training.history import CURVE_FILE, LOG_FILE, write_log
-from fpp_ml_bench.baselines.training_data import training_benchmark
+from fpp_ml_bench.baselines.phase_route import Settings
+from fpp_ml_bench.baselines.training import CURVE_FILE, LOG_FILE, training_benchmark, write_log
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.manifest import write_atomically
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
+from fpp_ml_bench.optics import Direction
 
 WEIGHTS_FILE, RECIPE_FILE = "phase-net.safetensors", "recipe.json"
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))

@@ -19,15 +19,10 @@ from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window, draw
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
-from fpp_ml_bench.baselines.training.checkpoint import (
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    save_checkpoint,
-)  # fmt: skip
+from fpp_ml_bench.baselines.phase_route import TAU
+from fpp_ml_bench.baselines.training import optimizer_tensors, read_checkpoint, restore_optimizer, save_checkpoint
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.optics import Direction
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 SMALL_RAD = 0.05

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sample_of
-from fpp_ml_bench.loaders.store import DatasetFolder
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 SHADOW_GREY = 6.0
 """Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from fpp_ml_bench.baselines.training_data import TrainingBenchmark
-from fpp_ml_bench.baselines.weights_file import SUFFIX, weights_path
+from fpp_ml_bench.baselines.training import SUFFIX, TrainingBenchmark, weights_path
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.loaders.manifest import write_atomically
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.storage import write_atomically
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.network import PhaseNet
@@ -74,7 +73,7 @@ def save_net(path: Path, network: "PhaseNet", config: NetConfig) -> str:
     """
     from safetensors.torch import save
 
-    from fpp_ml_bench.baselines.weights_file import _ordered_header
+    from fpp_ml_bench.baselines.training.weights import _ordered_header
 
     tensors = {}
     for name, tensor in network.state_dict().items():

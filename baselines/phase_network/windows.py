@@ -24,10 +24,9 @@ from fpp_ml_bench.baselines.phase_network.inputs import (
     channels,
 )
 from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
-from fpp_ml_bench.baselines.phase_route.shading import irradiance
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer, irradiance
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.frames import Direction
+from fpp_ml_bench.optics import Direction
 
 IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""

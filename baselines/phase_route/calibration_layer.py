@@ -1,7 +1,7 @@
 """The fixed calibration layer: wrapped phase and fringe order to depth, in closed form, for any rig.
 
 With ``a = R (x, y, 1)`` a camera pixel's ray is seen by the projector at ``(Z a_i + t_i) / (Z a_2 + t_2)`` (see
-`fpp_ml_bench.triangulation`), and far out at ``a_i / a_2``. What is left when the phase of that point at infinity is
+`fpp_ml_bench.decoding`), and far out at ``a_i / a_2``. What is left when the phase of that point at infinity is
 taken off the absolute phase,
 
     psi = Phi - Phi_infinity = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2),
@@ -18,12 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding import FIXED_POINT_STEPS, rotated_ray
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.frames import DIRECTIONS, Direction
-from fpp_ml_bench.lens import Coefficients, distortion_polynomial, is_distorted
-from fpp_ml_bench.pinhole import Maps
-from fpp_ml_bench.rig import Rig
-from fpp_ml_bench.triangulation import FIXED_POINT_STEPS, rotated_ray
+from fpp_ml_bench.optics import DIRECTIONS, Coefficients, Direction, Maps, Rig, distortion_polynomial, is_distorted
 
 TAU = 2 * np.pi
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Lens
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Direction, Rig
 
 
 class TorchCalibrationLayer(nn.Module):

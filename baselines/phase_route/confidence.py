@@ -20,8 +20,8 @@ from fpp_ml_bench.baselines.phase_route.object_mask import disk
 from fpp_ml_bench.baselines.phase_route.observation import Observation
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decode_blocks import MIN_MODULATION
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.decoding import MIN_MODULATION
+from fpp_ml_bench.optics import Rig
 
 Image = NDArray[np.float32]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 TILE_PX_PER_PERIOD = 1.1
 """Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""

@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 from fpp_ml_bench.baselines.phase_route.several_frames import PIXELWISE, steps_of
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 Frames = Sequence[NDArray[np.uint8] | None]
 

@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.phase_route.measurement import Measurement
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 
 class PhaseMethod:

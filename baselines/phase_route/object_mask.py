@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.empty_scene import Background
-from fpp_ml_bench.decode_blocks import MIN_MODULATION
+from fpp_ml_bench.decoding import MIN_MODULATION
 
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""

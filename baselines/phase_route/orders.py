@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.baselines.phase_route.shading import irradiance
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 Image = NDArray[np.float32]
 

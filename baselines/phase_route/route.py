@@ -29,7 +29,7 @@ from fpp_ml_bench.baselines.phase_route.several_frames import (
 from fpp_ml_bench.baselines.phase_route.shading import phase_slopes, wrapped
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 Image = NDArray[np.float32]
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.frames import DIRECTIONS, Direction
-from fpp_ml_bench.loaders.illumination import Lighting
+from fpp_ml_bench.loaders.render import Lighting
+from fpp_ml_bench.optics import DIRECTIONS, Direction
 
 Prior = Literal["none", "standoff"]
 PRIORS: tuple[Prior, ...] = ("none", "standoff")

@@ -1,6 +1,6 @@
 """Phase and object mask from two or more frames of one direction, with no or little averaging over pixels.
 
-From three frames on the phase is the N-step least squares of `fpp_ml_bench.phase`, pixel by pixel and without any
+From three frames on the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel and without any
 window, so nothing mixes two surfaces at a depth edge. Two frames leave one unknown too many, but a projected fringe
 goes down to black: its mean is its modulation plus the calibrated ambient light, and with that constraint two grey
 levels give brightness and phase. The sign stays open: the local fit over a window decides it. The result is poor where
@@ -20,9 +20,8 @@ from fpp_ml_bench.baselines.phase_route.empty_scene import Background, EmptyScen
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, fringe_fit
 from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, disk, without_small
 from fpp_ml_bench.baselines.phase_route.observation import Crop, Stopwatch
-from fpp_ml_bench.decode_blocks import MIN_MODULATION
+from fpp_ml_bench.decoding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.phase import choose_steps, phase_weights, wrapped_phase
 
 Image = NDArray[np.float32]
 

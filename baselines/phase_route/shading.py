@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 Image = NDArray[np.float32]
 Crop = tuple[slice, slice]

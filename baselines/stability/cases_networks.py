@@ -4,7 +4,7 @@ from fpp_ml_bench.baselines.networks import NETWORKS
 from fpp_ml_bench.baselines.stability import losses_checks as losses
 from fpp_ml_bench.baselines.stability import networks_checks as check
 from fpp_ml_bench.baselines.stability.case import Case, family
-from fpp_ml_bench.baselines.training.tables import LOSSES
+from fpp_ml_bench.baselines.training import LOSSES
 
 RICHARDSON = "difference of two extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding"
 

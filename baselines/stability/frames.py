@@ -5,10 +5,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decode_blocks import DirectionPlan, Limits, plan_direction
-from fpp_ml_bench.frames import DIRECTIONS, Direction, Sequence
-from fpp_ml_bench.gray_code import binary_to_gray, bits_needed, cell_of
-from fpp_ml_bench.rig import Pinhole, Rig, paper_rig
+from fpp_ml_bench.decoding import DirectionPlan, Limits, plan_direction
+from fpp_ml_bench.optics import (
+    DIRECTIONS,
+    Direction,
+    Pinhole,
+    Rig,
+    Sequence,
+    binary_to_gray,
+    bits_needed,
+    cell_of,
+    paper_rig,
+)
 
 MEAN = 127.5
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, gamma
-from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
+from fpp_ml_bench.baselines.training import EPSILON, loss_function, sample_losses
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.torch_metric import DepthScores
+from fpp_ml_bench.evaluation.score import DepthScores
 
 _SHAPE = (2, 1, 24, 32)
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.stability.case import Outcome, worst
 from fpp_ml_bench.baselines.stability.roundoff import U64, gamma, high_precision
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.error_stats import BLOCK, EMPTY, ErrorStats, combine, mean_of, stats_of
-from fpp_ml_bench.evaluation.scores import score_sample
+from fpp_ml_bench.evaluation.score import BLOCK, EMPTY, ErrorStats, combine, mean_of, score_sample, stats_of
 
 _STREAM_BLOCK = 1_000_000
 _STREAM_KINDS = 20

@@ -7,20 +7,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fpp_ml_bench.baselines.methods import method
+from fpp_ml_bench.baselines.method import method
 from fpp_ml_bench.baselines.networks import build
 from fpp_ml_bench.baselines.networks.base import in_full_precision
-from fpp_ml_bench.baselines.networks.instance_norm import RECENTRED_FROM, InstanceNorm
-from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
-from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCalibrationLayer
-from fpp_ml_bench.baselines.phase_route.measurement import Reason
-from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.networks.blocks import RECENTRED_FROM, InstanceNorm
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings, TorchCalibrationLayer
 from fpp_ml_bench.baselines.stability.case import Outcome, worst
 from fpp_ml_bench.baselines.stability.losses_checks import directional, one_thread, seeded
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, UB16, gamma
-from fpp_ml_bench.baselines.training.losses import loss_function
+from fpp_ml_bench.baselines.training import loss_function
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.optics import paper_rig
 
 SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},

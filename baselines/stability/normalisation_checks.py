@@ -5,10 +5,9 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64
+from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.evaluation.units import scored_pair
-from fpp_ml_bench.normalisation import Normalisation, denormalise, normalise
-from fpp_ml_bench.pixel_sets import object_mask
+from fpp_ml_bench.evaluation.score import scored_pair
 
 SIDE = 24
 _TINY = 2.0**-149

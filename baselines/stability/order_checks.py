@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from fpp_ml_bench.acceleration import numba_enabled
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.frames import (
     MEAN,
@@ -17,21 +16,22 @@ from fpp_ml_bench.baselines.stability.frames import (
     worst_angle,
 )
 from fpp_ml_bench.baselines.stability.roundoff import U64, difference, high_precision
+from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decode_blocks import Limits, Reason, decode_direction
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding import Limits, Reason, decode_direction, decode_stack, minus_atan2
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.frames import Direction, Sequence
-from fpp_ml_bench.gray_code import (
+from fpp_ml_bench.optics import (
     INCONSISTENT_RAD,
+    Direction,
+    Rig,
+    Sequence,
     absolute_phase,
     binary_to_gray,
     cell_centres_rad,
     cell_count,
     gray_to_binary,
+    paper_rig,
 )
-from fpp_ml_bench.phase import minus_atan2
-from fpp_ml_bench.rig import Rig, paper_rig
 
 _MODULATION = 100.0
 
@@ -99,7 +99,7 @@ def arctangent(scale: float, code: str) -> Outcome:
     cosine = np.concatenate([cosine, scale * np.array([1.0, -1, 0, 0, -1, 1])])
     sine = np.concatenate([sine, scale * np.array([0.0, 0, 1, -1, -1e-17, 1e-300])])
     if code == "compiled" and numba_enabled():
-        from fpp_ml_bench.decode_kernels import _minus_atan2
+        from fpp_ml_bench.decoding.kernels import _minus_atan2
 
         phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:

@@ -20,11 +20,18 @@ from fpp_ml_bench.baselines.stability.frames import (
     worst_angle,
 )
 from fpp_ml_bench.baselines.stability.roundoff import U64, angle_between, difference, high_precision
-from fpp_ml_bench.decode_blocks import MIN_MODULATION, Limits, Reason, decode_direction
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding import (
+    MIN_MODULATION,
+    Limits,
+    Reason,
+    choose_steps,
+    decode_direction,
+    decode_stack,
+    phase_weights,
+    wrapped_phase,
+)
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.phase import choose_steps, phase_weights, wrapped_phase
-from fpp_ml_bench.rig import Rig
+from fpp_ml_bench.optics import Rig
 
 _MARGIN_PX = 2.0
 

@@ -6,7 +6,7 @@ from typing import Any
 from fpp_ml_bench.baselines.stability.case import Verdict, parameter_text
 from fpp_ml_bench.baselines.stability.heat import LEVELS, families, figure, level
 from fpp_ml_bench.baselines.stability.run import Row
-from fpp_ml_bench.evaluation.report_html import escaped, page
+from fpp_ml_bench.evaluation.report import escaped, page
 
 _LONG = 400
 

@@ -13,14 +13,20 @@ from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.frames import plane_stack
 from fpp_ml_bench.baselines.stability.roundoff import U64, difference, floats, high_precision
 from fpp_ml_bench.baselines.stability.triangulation_checks import conditioning, exact_coordinates, rays
-from fpp_ml_bench.decode_blocks import Reason
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding import Reason, decode_stack, depth_from_coordinate
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.lens import distort, fold_radius_squared, undistort
-from fpp_ml_bench.pinhole import Pinhole
-from fpp_ml_bench.rig import Rig, paper_rig
-from fpp_ml_bench.rig_io import load_rig, rig_from_dict, rotation_matrix, save_rig
-from fpp_ml_bench.triangulation import depth_from_coordinate
+from fpp_ml_bench.optics import (
+    Pinhole,
+    Rig,
+    distort,
+    fold_radius_squared,
+    load_rig,
+    paper_rig,
+    rig_from_dict,
+    rotation_matrix,
+    save_rig,
+    undistort,
+)
 
 
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:

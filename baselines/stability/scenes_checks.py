@@ -8,10 +8,17 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.baselines.stability.case import Outcome, refusal, worst
 from fpp_ml_bench.baselines.stability.roundoff import U64
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.illumination import Lighting, light_surface, projector_centre_m
-from fpp_ml_bench.loaders.raycast import Hits, PixelRays, TracedObject
-from fpp_ml_bench.loaders.scene import SolidMesh, place
-from fpp_ml_bench.rig import paper_rig
+from fpp_ml_bench.loaders.render import (
+    Hits,
+    Lighting,
+    PixelRays,
+    SolidMesh,
+    TracedObject,
+    light_surface,
+    place,
+    projector_centre_m,
+)
+from fpp_ml_bench.optics import paper_rig
 
 RIG = paper_rig(176)
 AHEAD_M = np.array([0.0, 0.0, 1.8])

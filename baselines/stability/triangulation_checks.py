@@ -6,18 +6,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability.case import Outcome, worst
 from fpp_ml_bench.baselines.stability.frames import plane_stack
 from fpp_ml_bench.baselines.stability.roundoff import U32, U64, difference, high_precision
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.frames import Direction
-from fpp_ml_bench.loaders.illumination import Lighting, light_surface
-from fpp_ml_bench.pinhole import Maps
-from fpp_ml_bench.rig import Rig, paper_rig
-from fpp_ml_bench.rig_io import rotation_matrix
-from fpp_ml_bench.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
+from fpp_ml_bench.decoding import decode_stack, depth_from_both, depth_from_coordinate, depth_noise_mm
+from fpp_ml_bench.loaders.render import Lighting, light_surface
+from fpp_ml_bench.optics import Direction, Maps, Rig, paper_rig, rotation_matrix
 
 _WEIGHTS = (0.7, 1.3)
 

@@ -20,7 +20,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.training import gan_losses
+from fpp_ml_bench.baselines.training import losses as gan_losses
 from fpp_ml_bench.baselines.training.losses import loss_function, sample_losses
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.loaders.training import FringeDepth

@@ -14,12 +14,12 @@ from pydantic import Field, ValidationError, model_validator
 
 from fpp_ml_bench.baselines.networks import NETWORKS
 from fpp_ml_bench.baselines.training.tables import GAN, PRESETS, ROWS, TABLES, check_loss
+from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError, SubmissionError
 from fpp_ml_bench.evaluation.schema import Positive, StrictModel, Text, problems_of
-from fpp_ml_bench.evaluation.submission_file import read_plain_file
-from fpp_ml_bench.evaluation.text import printable
-from fpp_ml_bench.frames import CONFIGS
-from fpp_ml_bench.normalisation import Normalisation
+from fpp_ml_bench.evaluation.submission import read_plain_file
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.optics import CONFIGS
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _EXTENDS = "extends"
@@ -115,7 +115,7 @@ class Recipe(StrictModel):
 
     @property
     def data_config(self) -> str:
-        """Which frames are training pairs of their own: a name of `fpp_ml_bench.frames.CONFIGS`."""
+        """Which frames are training pairs of their own: a name of `fpp_ml_bench.optics.sequence.CONFIGS`."""
         return self.frames
 
     @property

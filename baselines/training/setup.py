@@ -7,10 +7,10 @@ from torch import nn
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.training.objectives import Adversarial, Objective, Regression
+from fpp_ml_bench.baselines.training.provenance_of_data import training_benchmark
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.baselines.training.tables import GAN
-from fpp_ml_bench.baselines.training_data import training_benchmark
-from fpp_ml_bench.baselines.weights_file import ModelConfig
+from fpp_ml_bench.baselines.training.weights import ModelConfig
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 

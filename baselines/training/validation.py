@@ -15,12 +15,11 @@ from torch import nn
 from fpp_ml_bench.baselines.training.objectives import Objective
 from fpp_ml_bench.baselines.training.pairs import spread
 from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.torch_metric import DepthScores
-from fpp_ml_bench.evaluation.units import scored_pair
+from fpp_ml_bench.evaluation.score import DepthScores, scored_pair
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
-from fpp_ml_bench.normalisation import Normalisation
 
 SCORING: dict[Normalisation, tuple[Units, Mode]] = {
     "raw": ("mm", "standard"), "global": ("m", "standard"), "individual": ("normalised", "paper-individual"),

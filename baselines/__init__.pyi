@@ -1,0 +1,2 @@
+from .networks import build as build
+from .networks.model import load as load

@@ -1,0 +1,12 @@
+from .case import Case as Case
+from .case import Verdict as Verdict
+from .frames import coded_rig as coded_rig
+from .frames import plane_stack as plane_stack
+from .heat import figure as figure
+from .report import document as document
+from .report import summary as summary
+from .report import write_report as write_report
+from .roundoff import U32 as U32
+from .run import Row as Row
+from .run import all_cases as all_cases
+from .run import run_cases as run_cases

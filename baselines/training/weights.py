@@ -1,0 +1,284 @@
+"""Trained weights on disk: one safetensors file with the tensors and the configuration of their network.
+
+The file's metadata is ``format`` (``fpp-ml-bench``), ``version`` and ``config``, a `ModelConfig` as JSON. Tensors whose
+name starts with ``range_head.`` belong to the range heads (`networks.metric_twin`), the others are the
+network's ``state_dict``. Pickles (``.pt``, ``.pth``) are never opened: opening a pickle can run code.
+
+The same tensors and configuration give the same bytes.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from fpp_ml_bench.baselines.training.provenance_of_data import TrainingBenchmark
+from fpp_ml_bench.depth import Normalisation
+from fpp_ml_bench.errors import FppBenchError, WeightsError
+from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.optics import CONFIGS
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+SHIPPED = Path(__file__).resolve().parent.parent / "weights"
+"""Folder of the weights that come with the package, ``{name}.safetensors``."""
+SUFFIX = ".safetensors"
+FORMAT = "fpp-ml-bench"
+VERSION = "1"
+HEAD_PREFIX = "range_head."
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Pixels = Annotated[int, Field(gt=0)]
+
+
+@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+class ModelConfig:
+    """What a trained network is, and what it was trained on.
+
+    ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is the representation it puts out,
+    ``image_size`` (H, W) in px the only size it is meant for (the fringe period in px depends on the size).
+    ``data_config`` names the frames it was trained on, ``background_removed`` says that its input is 0 outside the
+    object. ``dataset_fingerprint`` is that of the training data, ``benchmark`` its name and version
+    (None for a dataset of the user's own, and in older files), ``recipe`` the resolved training recipe, ``epoch`` the
+    epoch of these weights, ``validation`` its scores.
+
+    Raises ``ValueError`` for a value of the wrong type, an unknown normalisation or configuration.
+    """
+
+    name: Text
+    title: Text
+    network: Text
+    options: dict[Text, Any]
+    normalisation: Normalisation
+    image_size: tuple[Pixels, Pixels]
+    dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    benchmark: TrainingBenchmark | None = None
+    data_config: Text = "single_shot"
+    background_removed: bool = False
+    recipe: dict[Text, Any] = field(default_factory=dict)
+    epoch: Count = 0
+    validation: dict[Text, Scalar] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.data_config not in CONFIGS:
+            raise ValueError(f"unknown data_config {self.data_config!r}; there are {', '.join(CONFIGS)}")
+
+
+_CONFIG: TypeAdapter[ModelConfig] = TypeAdapter(ModelConfig)
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """A checked file: ``tensors`` are the network's, ``heads`` the range heads' without their prefix (may be empty)."""
+
+    path: Path
+    config: ModelConfig
+    tensors: "dict[str, Tensor]"
+    heads: "dict[str, Tensor]"
+    sha256: str
+
+
+def save_weights(
+    path: str | Path, network: "nn.Module", config: ModelConfig, heads: "Mapping[str, Tensor] | None" = None
+) -> None:
+    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all.
+
+    Raises `WeightsError` for tensors that are not finite, that do not fit the network that ``config`` builds, and for
+    a path that can't be written.
+    """
+    from safetensors.torch import save
+
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise WeightsError(f"{_shown(path)}: expected a name that ends in {SUFFIX}; weights are saved as nothing else")
+    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in network.state_dict().items()}
+    clash = next((name for name in tensors if name.startswith(HEAD_PREFIX)), None)
+    if clash is not None:
+        raise WeightsError(f"{_shown(path)}: the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
+    _check_tensors(path, config, tensors)
+    head_tensors = {
+        HEAD_PREFIX + name: tensor.detach().cpu().contiguous().clone() for name, tensor in (heads or {}).items()
+    }
+    _check_finite(path, head_tensors)
+    metadata = {"format": FORMAT, "version": VERSION, "config": _CONFIG.dump_json(config).decode("utf-8")}
+    from fpp_ml_bench.loaders.storage import write_atomically
+
+    try:
+        write_atomically(path, _ordered_header(save({**tensors, **head_tensors}, metadata)))
+    except OSError as error:
+        raise WeightsError(f"{_shown(path)} can't be written: {error.strerror}; give a folder that exists") from None
+
+
+def read_weights(path: str | Path) -> "tuple[ModelConfig, dict[str, Tensor]]":
+    """Configuration and network tensors of a file, ready for ``load_state_dict``. Raises `WeightsError`."""
+    weights = open_weights(path)
+    return weights.config, weights.tensors
+
+
+def open_weights(path: str | Path) -> WeightsFile:
+    """Everything in a weights file, checked.
+
+    Raises `WeightsError`, naming file, expectation and finding, for a file that is absent, damaged, a pickle or
+    foreign, of another version, with unknown or missing keys in its configuration, with tensors that are not finite or
+    that do not fit the network that its configuration builds.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    path = Path(path)
+    data = _read(path)
+    metadata = _metadata(path, data)
+    try:
+        tensors = load(data)
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
+    config = _config(path, metadata)
+    head_tensors = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
+    _check_tensors(path, config, tensors)
+    _check_finite(path, head_tensors)
+    heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in head_tensors.items()}
+    return WeightsFile(path, config, tensors, heads, sha256(data).hexdigest())
+
+
+def shipped_names(folder: Path | None = None) -> list[str]:
+    """Names of the weights in ``folder``, by default the networks that come with the package, sorted."""
+    return sorted(path.name.removesuffix(SUFFIX) for path in (folder or SHIPPED).glob(f"*{SUFFIX}"))
+
+
+def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
+    """Path of the file that ``name_or_path`` means: a path if it ends in ``.safetensors`` or exists, else the name of
+    weights in ``folder`` (None: `SHIPPED`). Raises `WeightsError` for an unknown name and lists the known ones."""
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or text.endswith(SUFFIX) or "/" in text or "\\" in text:
+        return Path(name_or_path)
+    if text in (names := shipped_names(folder)):
+        return (folder or SHIPPED) / f"{text}{SUFFIX}"
+    if Path(text).exists():
+        return Path(text)
+    from difflib import get_close_matches
+
+    closest = get_close_matches(text, names, n=1)
+    hint = f"did you mean {closest[0]!r}?" if closest else f"there are {', '.join(names) or 'none'};"
+    raise WeightsError(
+        f"no weights called {printable(text, 100)!r} come with this package; {hint} or give the path of a {SUFFIX} file"
+    )
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        actual = "a folder" if path.is_dir() else "nothing"
+        raise WeightsError(f"{_shown(path)}: expected a weights file (*{SUFFIX}), found {actual} there")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise WeightsError(f"{_shown(path)} can't be read: {error.strerror}") from None
+
+
+def _metadata(path: Path, data: bytes) -> dict[str, Any]:
+    """The header's ``__metadata__``; refuses what is no safetensors file of ours before anything is unpacked."""
+    if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
+        raise WeightsError(
+            f"{_shown(path)}: expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a "
+            "pickle can run code; load it where you trust it and write it with "
+            "fpp_ml_bench.baselines.training.weights.save_weights"
+        )
+    try:
+        length = int.from_bytes(data[:8], "little")
+        if len(data) < 8 or length > len(data) - 8:
+            raise ValueError(f"{len(data)} bytes, cut off or no {SUFFIX} at all")
+        header = json.loads(data[8 : 8 + length].decode("utf-8"))
+        metadata = header.get("__metadata__", {})
+        if not isinstance(metadata, dict):
+            raise ValueError("its metadata is no mapping")
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise WeightsError(
+            f"{_shown(path)}: damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
+        ) from None
+    if metadata.get("format") != FORMAT:
+        raise WeightsError(
+            f"{_shown(path)}: expected weights of {FORMAT}, got format {printable(str(metadata.get('format')), 60)!r}: "
+            "a safetensors file of something else holds no configuration to rebuild the network from"
+        )
+    if metadata.get("version") != VERSION:
+        raise WeightsError(
+            f"{_shown(path)}: expected version {VERSION}, got {printable(str(metadata.get('version')), 60)!r}; read it "
+            "with the version of fpp-ml-bench that wrote it, or train again"
+        )
+    return metadata
+
+
+def _config(path: Path, metadata: dict[str, Any]) -> ModelConfig:
+    try:
+        return _CONFIG.validate_json(metadata.get("config", ""))
+    except ValidationError as error:
+        lines = "\n  ".join(problems_of(error))
+        raise WeightsError(
+            f"{_shown(path)}: its configuration is not valid; train or save it again:\n  {lines}"
+        ) from None
+
+
+def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tensor]") -> None:
+    """Refuse tensors that are not exactly those of the network that ``config`` builds, or that are not finite."""
+    import torch
+
+    from fpp_ml_bench.baselines.networks import build
+
+    try:
+        with torch.device("meta"):
+            network = build(config.network, **config.options)
+        network.check_size(*config.image_size)
+        expected = network.state_dict()
+    except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
+        raise WeightsError(
+            f"{_shown(path)}: its configuration makes no network: {printable(str(error), 300)}"
+        ) from None
+    built = f"{config.network} with {_options(config)}"
+    for name in tensors:
+        if name not in expected:
+            raise WeightsError(f"{_shown(path)}: tensor {printable(name, 100)} is none of {built}")
+    for name in expected:
+        if name not in tensors:
+            raise WeightsError(f"{_shown(path)}: tensor {name} is missing, which {built} has; train or copy it again")
+        expected_form, actual_form = (
+            f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (expected[name], tensors[name])
+        )
+        if expected_form != actual_form:
+            raise WeightsError(
+                f"{_shown(path)}: tensor {name}: expected {expected_form} for {built}, got {actual_form}"
+            )
+    _check_finite(path, tensors)
+
+
+def _check_finite(path: Path, tensors: "Mapping[str, torch.Tensor]") -> None:
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise WeightsError(
+                f"{_shown(path)}: tensor {printable(name, 100)} holds values that are not finite; the training "
+                "diverged or the file is damaged"
+            )
+
+
+def _ordered_header(data: bytes) -> bytes:
+    """The same file with its metadata keys sorted: safetensors writes them in an order that changes from run to run."""
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length].decode("utf-8"))
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
+    text += b" " * (-len(text) % 8)  # tensors start aligned
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+
+def _options(config: ModelConfig) -> str:
+    return printable(", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults", 200)
+
+
+def _shown(path: Path) -> str:
+    return printable(str(path), 500)

@@ -1,0 +1,17 @@
+from .comparison import Comparison as Comparison
+from .comparison import compare as compare
+from .comparison import comparison_table as comparison_table
+from .html import data_uri as data_uri
+from .html import escaped as escaped
+from .html import page as page
+from .html import palette_png as palette_png
+from .numbers import millimetres as millimetres
+from .numbers import percent as percent
+from .numbers import seconds as seconds
+from .report_page import write_report as write_report
+from .score_tables import html_table as html_table
+from .score_tables import interval_text as interval_text
+from .score_tables import sample_table as sample_table
+from .score_tables import score_table as score_table
+from .sheet import write_sheet as write_sheet
+from .terminal import result_table as result_table

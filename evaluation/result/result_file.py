@@ -1,0 +1,101 @@
+"""Result files on disk: written complete or not at all, and read strictly."""
+
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import SchemaVersion
+from fpp_ml_bench.evaluation.result.result_model import Result
+from fpp_ml_bench.evaluation.schema import validate
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.storage import write_atomically
+
+MAX_BYTES = 64 * 1024 * 1024
+
+
+def result_content(result: Result) -> dict[str, Any]:
+    """The file's content as plain values, keys in the model's order, each sample's name first."""
+    content = result.model_dump(mode="json")
+    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]
+    return content
+
+
+def result_json(result: Result) -> bytes:
+    """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
+    text = json.dumps(result_content(result), indent=1, allow_nan=False, ensure_ascii=False)
+    return text.encode("utf-8") + b"\n"
+
+
+def write_result(result: Result, path: Path) -> None:
+    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
+    _write(path, result_json(result))
+
+
+def write_json(content: Any, path: Path) -> None:
+    """Write plain ``content`` as JSON to ``path``, as `write_result` does."""
+    _write(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n")
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        write_atomically(path, data)
+    except OSError as error:
+        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+
+
+def read_result(path: Path) -> Result:
+    """The result in ``path``; SubmissionError names the file and what is wrong with it."""
+    return parse_result(read_json(path), path)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file: of bounded size, no key twice, no NaN. SubmissionError names file and problem."""
+    file = printable(str(path), 500)
+    try:
+        if not path.is_file():
+            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {_kind(path)}")
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
+    try:
+        return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{file}: expected UTF-8 text; write it again with fpp-eval --json") from None
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
+        raise SubmissionError(f"{file} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+
+
+def parse_result(content: Any, path: Path) -> Result:
+    """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
+    file = printable(str(path), 500)
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version not in get_args(SchemaVersion):
+        given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
+        raise SubmissionError(
+            f"{file}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}; "
+            "score the predictions again with this version's fpp-eval"
+        )
+    result: Result = validate(Result, content, path, "result of fpp-eval")
+    return result
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"key {printable(key, 60)!r} is given twice")
+        content[key] = value
+    return content
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number a score can have")
+
+
+def _kind(path: Path) -> str:
+    return "a folder" if path.is_dir() else "no such file"

@@ -1,0 +1,150 @@
+"""``submission.yaml``: the description of a submission, as a strict model."""
+
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import Track, Units
+from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
+from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
+from fpp_ml_bench.files import printable
+
+SUBMISSION_FILE = "submission.yaml"
+REPORTS_FILE = "per_sample.json"
+"""What a method may report of each sample beside its predictions; it is not scored."""
+MAX_BYTES = 65536
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """SafeLoader without aliases, without duplicate keys, and with 1e-3 read as the number it is."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.YAMLError(f"line {mark.line + 1} uses an alias (*); write the value out")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: a key must be plain text")
+            if key.value in seen:
+                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} is given twice")
+            seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def read_plain(folder: Path) -> dict[Any, Any]:
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked.
+
+    SubmissionError names the file, what is wrong with it and what to do.
+    """
+    path = folder / SUBMISSION_FILE
+    if path.is_symlink() or not path.is_file():
+        raise SubmissionError(
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
+            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
+            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
+        )
+    return read_plain_file(path, "'name: My method'")
+
+
+def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
+    """Keys and values of a YAML file, bounded and plain as this module says; ``example`` shows what a line looks like.
+
+    SubmissionError names the file, what is wrong with it and what to do.
+    """
+    file = printable(str(path), 500)
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; shorten names and settings")
+        content = yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
+    except OSError as error:
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{file}: expected UTF-8 text") from None
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
+        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
+    if not isinstance(content, dict):
+        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
+    return content
+
+
+class Submission(StrictModel):
+    """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
+
+    ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
+    ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
+    on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
+    black outside the object); false is never written, so that files without this key stay as they are.
+    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
+    """
+
+    name: Text
+    method: Text
+    units: Units
+    png_mm_per_level: Positive | None = None
+    frames_used: list[Count]
+    uses_ground_truth_range: bool
+    uses_ground_truth_mask: bool = False
+    seconds_per_sample: Positive | None
+    seconds_source: Literal["measured", "self-reported"] | None = None
+    hardware: HardwareInfo | None = None
+    software: dict[Text, Text] = Field(default_factory=dict, max_length=100)
+    settings: dict[Text, Scalar] = Field(default_factory=dict, max_length=200)
+    seeds: dict[Text, Count] = Field(default_factory=dict, max_length=100)
+    timing: Timing | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Submission":
+        if len(set(self.frames_used)) != len(self.frames_used):
+            raise ValueError("frames_used names a frame twice")
+        if self.units == "normalised" and not self.uses_ground_truth_range:
+            raise ValueError(
+                "units: normalised needs uses_ground_truth_range: true, for normalised depth only becomes mm through "
+                "the range of the very samples it is scored on; submit mm for the metric track"
+            )
+        if self.png_mm_per_level is not None and self.units != "mm":
+            raise ValueError("png_mm_per_level gives PNG levels in mm, so units must be mm")
+        if self.seconds_per_sample is not None and (self.seconds_source is None or self.hardware is None):
+            raise ValueError("seconds_per_sample needs seconds_source and hardware beside it, or null when unknown")
+        if self.timing is not None and self.timing.frames != len(self.frames_used):
+            raise ValueError("timing.frames is not the number of frames_used; time this very method")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        if not self.uses_ground_truth_mask:
+            content.pop("uses_ground_truth_mask", None)
+        return content
+
+    @property
+    def track(self) -> Track:
+        """``metric``, or what of the test samples' ground truth the method was given: range, object mask or both."""
+        if self.uses_ground_truth_range:
+            return "oracle range + mask" if self.uses_ground_truth_mask else "oracle range"
+        return "oracle mask" if self.uses_ground_truth_mask else "metric"
+
+
+def read_submission(folder: Path) -> Submission:
+    """The checked ``submission.yaml`` of a predictions folder; SubmissionError names the file and the key."""
+    return check_submission(folder, read_plain(folder))
+
+
+def check_submission(folder: Path, content: dict[Any, Any]) -> Submission:
+    """``content`` of the folder's ``submission.yaml`` as the model; SubmissionError as `read_submission`."""
+    return validate(Submission, content, folder / SUBMISSION_FILE, "submission description")

@@ -1,0 +1,148 @@
+"""Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (floats).
+
+Each row of ``depth`` holds H lists of W values, one list of H W values, or a tensor; float16, float32 or float64. The
+unpacked size is checked before anything is unpacked: compressed Arrow buffers are refused, and the sizes of a Parquet
+file's pages are added up first (`fpp_ml_bench.evaluation.submission.parquet_pages`).
+"""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Lock, local
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.submission.arrow_messages import check_uncompressed
+from fpp_ml_bench.evaluation.submission.parquet_pages import check_pages
+from fpp_ml_bench.files import printable, read_bounded
+
+_ARROW_MAGIC, _PARQUET_MAGIC = b"ARROW1\0\0", b"PAR1"
+_FLOATS = {pa.float16(): np.float16, pa.float32(): np.float32, pa.float64(): np.float64}
+_SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
+_ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
+
+
+class TablePredictions:
+    """A reader (`fpp_ml_bench.evaluation.submission.prediction_files.Reader`) of a single file.
+
+    `__init__` raises PredictionError with the file's name. The whole file is held in memory: at most a float64 map per
+    sample.
+    """
+
+    def __init__(self, path: Path, samples: Sequence[str], size: tuple[int, int]) -> None:
+        self._file, self._size = path.name, size
+        self._lock = Lock()
+        try:
+            self._table, self._digest = _read(path, len(samples), size)
+            self._rows = _rows(self._table, samples)
+        except PredictionError as error:
+            raise PredictionError(f"{printable(str(path), 500)} {error}") from None
+
+    def named(self, sample: str) -> str:
+        return f"{self._file}, sample {printable(sample)}"
+
+    def __call__(self, sample: str, memory: local) -> tuple[NDArray[Any], str]:
+        with self._lock:
+            column = self._table.column("depth").slice(self._rows[sample], 1).combine_chunks()
+        values = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
+        return _depth_map(values, self._size), self._digest
+
+
+def _read(path: Path, samples: int, size: tuple[int, int]) -> tuple[pa.Table, str]:
+    largest = samples * (size[0] * size[1] * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
+    content = read_bounded(path, largest)
+    digest = hashlib.sha256(content).hexdigest()
+    try:
+        if content.startswith(_PARQUET_MAGIC):
+            table = _parquet(content, largest, samples, size)
+        else:
+            body = pa.py_buffer(content)
+            # An IPC file is an IPC stream between a mark and a footer.
+            body = body.slice(len(_ARROW_MAGIC)) if content.startswith(_ARROW_MAGIC) else body
+            check_uncompressed(body)
+            table = pa.ipc.open_stream(body).read_all()
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, EOFError, IndexError, KeyError) as error:
+        if isinstance(error, PredictionError):
+            raise
+        reason = printable(str(error).split("\n")[0], 120)
+        raise PredictionError(f"can't be read as Arrow or Parquet ({reason}); {_ADVICE}") from None
+    return table, digest
+
+
+def _parquet(content: bytes, largest: int, samples: int, size: tuple[int, int]) -> pa.Table:
+    import pyarrow.parquet as pq
+
+    limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
+    file = pq.ParquetFile(pa.py_buffer(content), **limits)
+    # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
+    check_pages(file.metadata, content, 2 * largest, 2 * samples * (size[0] * size[1] + 1))
+    _check_columns(file.schema_arrow)
+    return file.read(use_threads=False)
+
+
+def _check_columns(schema: pa.Schema) -> None:
+    if sorted(schema.names) != ["depth", "sample"]:
+        raise PredictionError(
+            f"holds the columns {printable(', '.join(schema.names), 120)}; expected sample and depth: {_ADVICE}"
+        )
+    if schema.field("sample").type not in (pa.string(), pa.large_string()):
+        raise PredictionError(f"column sample: expected text, got {schema.field('sample').type}; {_ADVICE}")
+    value = schema.field("depth").type
+    while (inner := _item_type(value)) is not None:
+        value = inner
+    if value not in _FLOATS or value == schema.field("depth").type:
+        depth_type = printable(str(schema.field("depth").type), 80)
+        raise PredictionError(
+            f"column depth: expected lists of float16, float32 or float64, got {depth_type}; whole numbers wrap "
+            f"around, other types are not depth: {_ADVICE}"
+        )
+
+
+def _item_type(value: pa.DataType) -> pa.DataType | None:
+    if isinstance(value, pa.BaseExtensionType):
+        return value.storage_type
+    if pa.types.is_list(value) or pa.types.is_large_list(value) or pa.types.is_fixed_size_list(value):
+        return value.value_type
+    return None
+
+
+def _rows(table: pa.Table, samples: Sequence[str]) -> dict[str, int]:
+    _check_columns(table.schema)
+    names = table.column("sample").to_pylist()
+    rows = {name: row for row, name in enumerate(names)}
+    problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
+    problems += [
+        f"holds {printable(name)}, which is no sample of this split" for name in rows if name not in set(samples)
+    ]
+    problems += [f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1]
+    if problems:
+        raise PredictionError(f"{'; '.join(problems[:20])}; write one row for each sample")
+    return rows
+
+
+def _depth_map(column: pa.Array, size: tuple[int, int]) -> NDArray[Any]:
+    """The (H, W) map in a column of one row."""
+    shape: list[int] = []
+    values = column
+    while _item_type(values.type) is not None:
+        if isinstance(values, pa.ExtensionArray):
+            values = values.storage
+            continue
+        if values.null_count:
+            raise PredictionError("holds missing values (null); write 0 where nothing was measured")
+        lengths = values.value_lengths().unique().to_pylist()
+        if len(lengths) != 1:
+            raise PredictionError(f"expected rows of one length, got {len(lengths)} different ones; write H x W values")
+        shape.append(lengths[0])
+        values = values.flatten()
+    if values.null_count:
+        raise PredictionError("holds missing values (null); write 0 where nothing was measured")
+    if tuple(shape) not in (tuple(size), (size[0] * size[1],)):
+        raise PredictionError(f"expected shape {size} (H, W), got {tuple(shape)}; predict at that size")
+    dtype = np.dtype(_FLOATS[values.type])
+    return np.frombuffer(values.buffers()[1], dtype, len(values), values.offset * dtype.itemsize).reshape(size)

@@ -1,0 +1,123 @@
+"""The commands ``fpp-bench`` and ``fpp-eval``.
+
+Each command is a module of this package with ``SUMMARY``, ``EXAMPLES``, ``add_arguments(parser)`` and ``run(args)``.
+Only the module of the command that runs is imported, and such a module imports numpy and the rest inside ``run``, so
+``--help`` answers at once. This package may import every subpackage; none of them imports it.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from types import ModuleType
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.errors import FppBenchError
+
+OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "build": ("build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
+    "import": ("import_tree", "read a published tree (PNG + .mat) into the same dataset format"),
+    "info": ("info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
+    "verify": ("verify", "check a dataset: checksums, missing and foreign files, split leaks"),
+    "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),
+    "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
+    "train": ("train", "train a recipe, shipped or yours, into a weights file"),
+    "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
+    "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
+    "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
+    "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),
+    "reliance": ("reliance", "measure phase reliance: does a prediction follow the fringes or the outline"),
+    "diagnose": ("diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
+    "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
+    "stability": ("stability", "stiff and extreme cases against higher precision and theory"),
+    "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
+}
+
+_EPILOG = """\
+examples:
+  fpp-bench build data/mini --preset mini
+  fpp-bench predict classical data/mini --split test --out predictions
+  fpp-eval predictions --dataset data/mini --split test --json result.json
+  fpp-bench leaderboard result.json
+
+fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped.
+"""
+
+
+def _formatter(prog: str) -> argparse.HelpFormatter:
+    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=30, width=110)
+
+
+def parser_for(command: ModuleType, prog: str) -> argparse.ArgumentParser:
+    """Argument parser of one command module."""
+    parser = argparse.ArgumentParser(
+        prog=prog,
+        description=command.SUMMARY,
+        epilog="examples:\n" + "\n".join(f"  {line}" for line in command.EXAMPLES),
+        formatter_class=_formatter,
+        allow_abbrev=False,
+    )
+    command.add_arguments(parser)
+    return parser
+
+
+def run_command(command: ModuleType, prog: str, argv: Sequence[str]) -> int:
+    """Parse ``argv`` and run the command; expected errors become a message and an exit status."""
+    args = parser_for(command, prog).parse_args(argv)
+    return guarded(lambda: command.run(args), prog)
+
+
+def guarded(run: Callable[[], int], prog: str) -> int:
+    """Exit status of ``run``; an error of this package, an unreadable file or Ctrl-C becomes a message."""
+    try:
+        return run()
+    except FppBenchError as error:
+        print(f"{prog}: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:
+        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
+        sys.stdout = None  # type: ignore[assignment]
+        return BAD_INPUT
+    except OSError as error:
+        print(f"{prog}: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{prog}: stopped", file=sys.stderr)
+        return INTERRUPTED
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``fpp-bench``."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments and arguments[0] in COMMANDS:
+        module = import_module(f"fpp_ml_bench.cli.{COMMANDS[arguments[0]][0]}")
+        return run_command(module, f"fpp-bench {arguments[0]}", arguments[1:])
+    width = max(map(len, COMMANDS))
+    listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
+    parser = argparse.ArgumentParser(
+        prog="fpp-bench",
+        usage="fpp-bench [--help] [--version] COMMAND ...",
+        description="FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry.",
+        epilog=f"commands:\n{listing}\n\n{_EPILOG}",
+        formatter_class=_formatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"fpp-ml-bench {__version__}")
+    parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown and unknown[0] == arguments[0]:
+        print(
+            f"fpp-bench: error: unknown option {arguments[0]!r} before a command; see fpp-bench --help", file=sys.stderr
+        )
+        return BAD_INPUT
+    if args.command is not None:
+        from difflib import get_close_matches
+
+        matches = get_close_matches(args.command, COMMANDS, n=1)
+        hint = f"; did you mean {matches[0]!r}?" if matches else f"; there are {', '.join(COMMANDS)}"
+        print(f"fpp-bench: error: unknown command {args.command!r}{hint}", file=sys.stderr)
+        return BAD_INPUT
+    parser.print_help(sys.stderr if not arguments else sys.stdout)
+    return BAD_INPUT

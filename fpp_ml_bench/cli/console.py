@@ -1,0 +1,78 @@
+"""Console output: a progress bar on standard error, and numbers with units for tables."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console, RenderableType
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.loaders.storage import Manifest
+
+
+@contextmanager
+def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterator[Callable[[int], None]]:
+    """A rich progress bar over ``total`` steps; yields the function that advances it.
+
+    Shows the rate of ``unit``, of which a step counts ``per_step`` (52 images a sample), and the time left.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task: object) -> Text:
+            speed = getattr(task, "speed", None) or getattr(task, "finished_speed", None)
+            return Text(f"{speed * per_step:,.0f} {unit}/s" if speed else "", style="cyan")
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"), Rate(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda steps: progress.advance(task, steps)
+
+
+def gigabytes(count: float) -> str:
+    """A number of bytes as text with a decimal unit, B to GB."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def millimetres(value: float | None) -> str:
+    """A length in mm as text for a table; a dash for None."""
+    return "-" if value is None else f"{value:.3f}"
+
+
+def say_benchmark(manifest: "Manifest") -> None:
+    """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
+    from fpp_ml_bench.loaders.storage import benchmark_sentence
+
+    as_expected, sentence = benchmark_sentence(manifest)
+    print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
+
+
+WIDTH_IN_PIPES = 140
+
+
+def output_width() -> int:
+    """Columns of text there are: the terminal's, those COLUMNS says, or a fixed number into pipes and files."""
+    if sys.stdout.isatty() or "COLUMNS" in os.environ:
+        return Console().width
+    return WIDTH_IN_PIPES
+
+
+def show(*parts: RenderableType) -> None:
+    """Print to stdout: plain text of a fixed width into pipes and files, colours only on a terminal."""
+    # A name may hold characters that the terminal's encoding lacks; a table with a mark in it beats a traceback.
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="replace")
+    console = Console(width=output_width(), highlight=False, markup=False, emoji=False)
+    for part in parts:
+        console.print(part)

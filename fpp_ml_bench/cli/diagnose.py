@@ -1,0 +1,137 @@
+"""``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.baselines.diagnostics import PROBES
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fpp_ml_bench.baselines.diagnostics import Diagnosis, Probe, Progress
+
+SUMMARY = (
+    "Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file."
+)
+EXAMPLES = (
+    "fpp-bench diagnose unet-individual-rmse data/cpu224 --out report",
+    "fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   adds to the report",
+    "fpp-bench diagnose phase data/cpu224 --out report-phase",
+    "fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1 bottleneck dec1 --quick --out look",
+    "fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder decoder.2 --out report-mine",
+)
+UNITS = ("mm", "m", "normalised")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument(
+        "model", metavar="MODEL",
+        help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own "
+        "torch module as file.py:factory; that file is executed",
+    )  # fmt: skip
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the model's image size")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
+    parser.add_argument(
+        "--probe", action="append", default=[], metavar="NAME",
+        help=f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--samples", type=_count, metavar="N", help="most samples of a split, taken evenly (default: the probe's)"
+    )
+    parser.add_argument(
+        "--seeds", type=_count, metavar="N", help="repeats of what depends on random numbers (default: 2)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a short run for a first look; its numbers are not reliable"
+    )
+    parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
+    parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
+    parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
+    parser.add_argument(
+        "--units", choices=UNITS,
+        help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
+    )  # fmt: skip
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
+    return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the probes, write the report, print the summaries. Raises FppBenchError for what can't be diagnosed."""
+    from fpp_ml_bench.machine import limit_threads, usable_cores
+
+    threads = args.threads or usable_cores()
+    limit_threads(threads)
+    from fpp_ml_bench.baselines.diagnostics import ProbeSettings, checked_names, diagnose, subject
+    from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+    probe_names = checked_names(args.probe)
+    dataset = DatasetFolder(args.dataset)
+    model = subject(args.model, dataset, args.layers, args.units, args.frame, threads)
+    settings = ProbeSettings(args.samples, args.seeds, args.quick)
+    with _bars() as progress:
+        diagnosis = diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+    show(_table(model.title, diagnosis))
+    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
+    return 0
+
+
+@contextmanager
+def _bars() -> "Iterator[Callable[[Probe], Progress]]":
+    """A bar for each probe, on standard error."""
+    from rich import progress as bar
+    from rich.console import Console
+
+    columns = (
+        bar.TextColumn("{task.description}"), bar.BarColumn(), bar.TaskProgressColumn(), bar.TimeElapsedColumn(),
+        bar.TimeRemainingColumn(),
+    )  # fmt: skip
+    with bar.Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def started(probe: "Probe") -> "Progress":
+            task = bars.add_task(probe.title, total=None)
+
+            def show_progress(done: int, total: int, activity: str = "") -> None:
+                description = f"{probe.title}: {activity}" if activity else probe.title
+                bars.update(task, completed=done, total=total, description=description)
+
+            return show_progress
+
+        yield started
+
+
+def _table(title: str, diagnosis: "Diagnosis") -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left")
+    table.add_column("Probe")
+    table.add_column("Summary", overflow="fold")
+    table.add_column("Seconds", justify="right")
+    for result in diagnosis.results:
+        text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
+        table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
+    return table
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that makes the same report, without the machine's settings."""
+    import shlex
+
+    words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
+    for name in args.probe:
+        words += ["--probe", name]
+    for option in ("samples", "seeds", "frame", "units"):
+        value = getattr(args, option)
+        words += [] if value is None else [f"--{option}", str(value)]
+    words += ["--quick"] if args.quick else []
+    words += ["--layers", *args.layers] if args.layers else []
+    return shlex.join(words)

@@ -1,0 +1,131 @@
+"""``fpp-bench leaderboard``: rank result files, and show the paper's rows apart."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import METRICS
+
+SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
+EXAMPLES = (
+    "fpp-bench leaderboard result.json second.json",
+    "fpp-bench leaderboard results/ --sort object_rmse_mm --markdown table.md",
+    "fpp-bench leaderboard --paper loss",
+    "fpp-bench leaderboard --page page",
+    "fpp-bench leaderboard --readme README.md --check",
+    "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json --provenance verified",
+)
+_PROVENANCES = ("measured here", "verified", "self-reported")
+_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "all", "none")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument(
+        "results", nargs="*", type=Path, metavar="RESULT.json",
+        help="result files, or folders of them (default: the rows shipped with the package, ./result*.json and "
+        "./results/*.json)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
+        help=f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
+    )  # fmt: skip
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables as Markdown")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the ranking as JSON")
+    parser.add_argument(
+        "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
+        help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="DIR",
+        help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
+    )
+    parser.add_argument(
+        "--tradeoff", type=Path, metavar="FILE",
+        help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--readme", type=Path, metavar="FILE",
+        help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="with --readme: write nothing; exit status 1 when the block is not up to date",
+    )
+    parser.add_argument(
+        "--row", type=Path, metavar="FILE", help="write the given result as a row file for the leaderboard"
+    )
+    parser.add_argument(
+        "--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
+        help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
+    from fpp_ml_bench.cli.console import output_width, show
+    from fpp_ml_bench.leaderboard.export import markdown, table_json
+    from fpp_ml_bench.leaderboard.page import write_page
+    from fpp_ml_bench.leaderboard.paper import chosen_tables
+    from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, discover, expand, rank, read_entries, shipped_rows
+    from fpp_ml_bench.leaderboard.rows import read_entry, write_row
+    from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
+    from fpp_ml_bench.loaders.storage import write_atomically
+
+    if args.check and args.readme is None:
+        raise SubmissionError("--check checks a README; give it with --readme FILE")
+    if args.tradeoff is not None and args.page is None:
+        raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
+    if args.readme is not None:
+        return _readme(args)
+    if args.row is not None:
+        if len(args.results) != 1:
+            raise SubmissionError(f"--row makes a row of one result, {len(args.results)} were given")
+        write_row(read_entry(args.results[0]), args.provenance, args.row)
+        print(f"{args.row}: {args.provenance}")
+        return 0
+    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
+    unnamed = shipped_rows() if args.page is not None else discover(Path.cwd())
+    files = expand(args.results) if args.results else unnamed
+    entries = read_entries(files)
+    groups = rank(entries, args.sort)
+    papers = chosen_tables(args.paper)
+    for path, text in ((args.markdown, markdown), (args.json, table_json)):
+        if path is None:
+            continue
+        try:
+            write_atomically(path, text(groups, papers, args.sort).encode("utf-8"))
+        except OSError as error:
+            raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
+    if args.page is not None:
+        from fpp_ml_bench.leaderboard.tradeoff import read_tradeoff, shipped_tradeoff
+
+        shipped = None if args.results else shipped_tradeoff()
+        settings = shipped if args.tradeoff is None else read_tradeoff(args.tradeoff)
+        written = write_page(rank(entries, DEFAULT_SORT), papers, args.page, settings)
+        print(f"{args.page}: {len(written)} files; open {written[0]}")
+        return 0
+    show(*group_tables(groups, args.sort, output_width()), *paper_rich_tables(papers))
+    return 0
+
+
+def _readme(args: argparse.Namespace) -> int:
+    """Write or check README's block from the shipped rows or the named files, never from the current folder."""
+    from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+    from fpp_ml_bench.leaderboard.readme_block import update_readme
+
+    entries = read_entries(expand(args.results) if args.results else shipped_rows())
+    same = update_readme(args.readme, rank(entries), args.check)
+    if args.check and not same:
+        print(
+            f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
+            f"fpp-bench leaderboard --readme {args.readme}",
+            file=sys.stderr,
+        )
+        return 1
+    print(f"{args.readme}: {'the ranking is up to date with the rows' if same else 'written'}")
+    return 0

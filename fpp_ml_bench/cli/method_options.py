@@ -1,0 +1,240 @@
+"""Which method, and its settings: the same for ``predict`` and ``time``."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fpp_ml_bench.baselines.training import PRESETS, TABLES
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.method import Method
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+METHOD_HELP = (
+    "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
+    "(single-shot phase; order, mask and correction learned), the name of weights that "
+    "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
+)
+_RECIPE_SUFFIXES = (".yaml", ".yml")
+
+
+def add_method_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--threads`` and the options of each kind of method."""
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
+    classical = parser.add_argument_group("classical")
+    classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    classical.add_argument(
+        "--direction",
+        choices=("horizontal", "vertical", "both"),
+        help="fringes to use: one direction is enough for a depth (default: both)",
+    )
+    classical.add_argument(
+        "--fewest",
+        action="store_const",
+        const=True,
+        help="capture only the Gray frames that the rig's range needs: with both directions usually none",
+    )
+    classical.add_argument(
+        "--depth-noise",
+        type=float,
+        metavar="MM",
+        help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
+    )
+    phase = parser.add_argument_group("phase and phase-net")
+    phase.add_argument(
+        "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
+    )
+    phase.add_argument(
+        "--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)"
+    )
+    phase.add_argument(
+        "--error-mm",
+        type=float,
+        metavar="MM",
+        help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
+        "with a single fringe; may need the Gray code",
+    )
+    phase.add_argument(
+        "--prior",
+        choices=("none", "standoff"),
+        help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
+    )
+    phase.add_argument(
+        "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
+    )
+    phase.add_argument(
+        "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
+    )
+    phase.add_argument(
+        "--weights",
+        metavar="FILE",
+        help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
+        "phase-net-fresh, trained on additional objects)",
+    )
+    network = parser.add_argument_group("trained networks")
+    network.add_argument(
+        "--range",
+        dest="depth_range",
+        choices=("oracle", "predicted", "mean"),
+        help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
+        "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
+    )
+    network.add_argument("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
+    network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
+
+
+def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+    """The method that ``args`` name, for the rig of ``opened``.
+
+    Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
+    FppBenchError for an unknown method, and for an option that belongs to another one.
+    """
+    method = _method(args, opened)
+    config = getattr(method, "weights_config", None)
+    if config is not None:
+        from fpp_ml_bench.baselines.training import training_data_warning
+
+        warning = training_data_warning(config, opened.manifest)
+        if warning is not None:
+            print(f"warning: {config.name} was {warning}", file=sys.stderr)
+    return method
+
+
+def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+    from fpp_ml_bench.baselines.method import METHODS, method
+    from fpp_ml_bench.errors import PredictionError
+
+    if args.threads < 1:
+        raise PredictionError(f"--threads {args.threads}: expected 1 or more")
+    kind = args.method if args.method in METHODS else "network"
+    weights = _weights(args.method, opened.size[1]) if kind == "network" else None
+    for owner, options in _OPTIONS.items():
+        foreign = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
+        if foreign:
+            raise PredictionError(
+                f"{_flag(foreign[0])} is an option of {_KINDS[owner]}, not of {args.method}; leave it out"
+            )
+    if weights is not None:
+        return _network(weights, args, opened)
+    return method(kind, opened.rig, **_MAKERS[kind](args, opened))
+
+
+def weights_of_recipe(recipe: str, size: int) -> Path:
+    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
+    wide. Raises FppBenchError where there are none."""
+    from fpp_ml_bench.baselines.training import load_recipe
+    from fpp_ml_bench.errors import RecipeError
+    from fpp_ml_bench.leaderboard.reproduce import RUNS, Folders, current_weights
+
+    resolved = [load_recipe(recipe, preset) for preset in PRESETS]
+    searched = []
+    for candidate in resolved:
+        below = RUNS / candidate.preset
+        weights = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
+        if weights is not None and candidate.size == size:
+            return weights
+        searched.append(f"{below / candidate.name} ({candidate.size} px)")
+    raise RecipeError(
+        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(searched)}; train it "
+        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
+    )
+
+
+def _weights(name: str, size: int) -> Path:
+    """The weights file that METHOD means, where it is no method of its own."""
+    from fpp_ml_bench.baselines.method import METHODS
+    from fpp_ml_bench.baselines.training import SUFFIX, shipped_names, weights_path
+    from fpp_ml_bench.errors import PredictionError, WeightsError
+
+    row_of_a_table = name.split("/")[0] in TABLES and not name.endswith(SUFFIX)
+    if name.endswith(_RECIPE_SUFFIXES) or row_of_a_table:
+        return weights_of_recipe(name, size)
+    try:
+        return weights_path(name)
+    except WeightsError:
+        methods = ", ".join((*METHODS, *shipped_names()))
+        raise PredictionError(
+            f"unknown method {name!r}; there are {methods}, and every .safetensors file of trained weights"
+        ) from None
+
+
+def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+    from fpp_ml_bench.baselines.networks.model import load
+    from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+    from fpp_ml_bench.errors import WeightsError
+
+    model = load(path, args.device)
+    if model.config.image_size != opened.size:
+        raise WeightsError(
+            f"{path}: was trained at {_size(model.config.image_size)} px (H x W), {opened.path} has images of "
+            f"{_size(opened.size)} px: the fringe period in px depends on the size, so a network works at one size "
+            "only; use weights trained at that size, or a dataset built at the weights' size"
+        )
+    return NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
+
+
+def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    steps = opened.sequence.steps if args.steps is None else args.steps
+    if args.depth_noise is not None:
+        steps = _steps_for(args, opened)
+    options = {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
+    return {**options, **({"fewest": True} if args.fewest else {})}
+
+
+def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
+    """Steps for ``--depth-noise``, by the noise that the dataset was built with."""
+    from fpp_ml_bench.decoding import fewest_steps
+    from fpp_ml_bench.errors import PredictionError
+    from fpp_ml_bench.loaders.render import modulation_at
+
+    depth_noise_mm = args.depth_noise
+    noise_grey = opened.manifest.settings.get("noise_sigma_grey")
+    if args.steps is not None or not (depth_noise_mm > 0 and depth_noise_mm < float("inf")):
+        raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
+    if noise_grey is None:
+        raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
+    modulation = modulation_at(opened.rig, opened.rig.working_range_mm[1])
+    steps = fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
+    if steps is None:
+        raise PredictionError(
+            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {opened.sequence.steps} steps that "
+            "were captured; allow more noise, or use both directions"
+        )
+    return steps
+
+
+def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    from fpp_ml_bench.errors import PredictionError
+
+    if args.frames is not None and args.error_mm is not None:
+        raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
+    options: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
+    options |= {"frames": args.frames, "error_mm": args.error_mm}
+    options["shading"] = None if args.no_shading is None else False
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _phase_net(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+    options = {"direction": args.fringe, "min_confidence": args.min_confidence, "weights": args.weights}
+    options["shading"] = None if args.no_shading is None else False
+    return {"threads": args.threads} | {name: value for name, value in options.items() if value is not None}
+
+
+_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net}
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "classical": ("steps", "direction", "fewest", "depth_noise"),
+    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
+    "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
+    "network": ("depth_range", "frame", "device"),
+}
+"""Options that belong to one kind of method only, by their name in the parsed arguments."""
+_KINDS = {"classical": "classical", "phase": "phase", "phase-net": "phase-net", "network": "trained networks"}
+
+
+def _flag(option: str) -> str:
+    return {"depth_range": "--range"}.get(option, f"--{option.replace('_', '-')}")
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

@@ -1,0 +1,72 @@
+"""``fpp-bench predict``: run a method over a split."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
+from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.method import Method
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
+EXAMPLES = (
+    "fpp-bench predict classical data/mini --split test --out predictions",
+    "fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4",
+    "fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle",
+    "fpp-bench predict phase data/mini --frames 3 --out predictions-3",
+    "fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene",
+    "fpp-eval predictions --dataset data/mini --split test --target depth_exact --json result.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left"
+    )
+    add_method_options(parser)
+    add_explain_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.machine import limit_threads
+
+    limit_threads(args.threads)
+    with as_asked(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.baselines.run import predict_split
+    from fpp_ml_bench.cli.console import progress_bar
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+    opened = DatasetFolder(args.dataset)
+    method = chosen_method(args, opened)
+    samples = len(opened.samples(args.split))
+    with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
+        finished = predict_split(opened, method, args.split, args.out, advance)
+    print(
+        f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{finished.seconds_per_sample:.3f} s a sample (median)"
+    )
+    how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
+    print(f"next: fpp-eval {args.out} {how} --json result.json")
+    from fpp_ml_bench.baselines.run import explain_predict
+
+    explain(args, lambda: explain_predict(opened, method, args.split))
+    return 0
+
+
+def _scoring(method: "Method", opened: "DatasetFolder") -> str:
+    """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
+    from, but against that depth the process that made it would score 0."""
+    mode, target = getattr(method, "mode", "standard"), getattr(method, "target", "depth_exact")
+    if target == "depth_exact" and not opened.has_exact:
+        target = "depth"
+    return (f" --mode {mode}" if mode != "standard" else "") + (f" --target {target}" if target != "depth" else "")

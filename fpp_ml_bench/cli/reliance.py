@@ -1,0 +1,98 @@
+"""``fpp-bench reliance``: how far a method's predictions follow the fringe's phase, as a score from 0 to 1."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fpp_ml_bench.evaluation.result import Reliance
+
+SUMMARY = "Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?"
+EXAMPLES = (
+    "fpp-bench reliance classical data/cpu224",
+    "fpp-bench reliance phase data/cpu224 --fringe vertical",
+    "fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
+    parser.add_argument(
+        "dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects"
+    )
+    parser.add_argument(
+        "--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)"
+    )
+    parser.add_argument(
+        "--into", type=Path, metavar="FILE",
+        help="write the score into this result or leaderboard row of the same method (.json)",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
+    add_method_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, write, print. A file that can't take the score raises FppBenchError before measuring."""
+    from fpp_ml_bench.machine import limit_threads
+
+    limit_threads(args.threads)
+    from fpp_ml_bench.baselines.diagnostics import SceneSet, measure
+    from fpp_ml_bench.cli.console import progress_bar, show
+    from fpp_ml_bench.errors import PredictionError
+    from fpp_ml_bench.evaluation.result import write_json
+    from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
+    from fpp_ml_bench.leaderboard.rows import read_entry
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+    if not 1 <= args.views <= 6:
+        raise PredictionError(f"--views {args.views}: expected 1 to 6, an object has six views")
+    dataset = DatasetFolder(args.dataset)
+    method = chosen_method(args, dataset)
+    entry = None if args.into is None else read_entry(args.into)
+    if entry is not None:
+        check_same_method(entry, method)
+    scene_set = SceneSet(dataset, args.views)
+    advanced = 0
+    with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
+
+        def progress(done: int, total: int, activity: str = "") -> None:
+            nonlocal advanced
+            advance(done - advanced)
+            advanced = done
+
+        sha256 = method.settings.get("weights_sha256")
+        reliance, _ = measure(method, scene_set, sha256 if isinstance(sha256, str) else None, progress)
+    if args.json is not None:
+        write_json(reliance.model_dump(mode="json"), args.json)
+    if entry is not None:
+        write_reliance(entry, reliance)
+    show(_table(method.title, reliance))
+    return 0
+
+
+def _table(title: str, reliance: "Reliance") -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    from fpp_ml_bench.evaluation.result import PART_TITLES
+
+    table = Table(
+        title=Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects"), title_justify="left"
+    )
+    table.add_column("")
+    table.add_column("value", justify="right")
+    low, high = reliance.interval
+    interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+    table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
+    if reliance.order_free_score is not None:
+        table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
+    for key, words in PART_TITLES.items():
+        value = getattr(reliance.parts, key)
+        if value is not None:
+            table.add_row(words, f"{value:.3f}")
+    return table

@@ -1,0 +1,147 @@
+"""``fpp-bench reproduce``: the paper's tables, trained and scored here."""
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpp_ml_bench.baselines.training import PRESETS
+from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.leaderboard.reproduce import Folders
+
+SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
+EXAMPLES = (
+    "fpp-bench reproduce --list",
+    "fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop",
+    "fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept",
+    "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
+)
+ALL = "all"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's arguments."""
+    parser.add_argument(
+        "table", nargs="?", choices=(*PAPER_TABLES, ALL), metavar="TABLE", help=f"{', '.join(PAPER_TABLES)} or {ALL}"
+    )
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="cpu",
+        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs"), metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
+    )  # fmt: skip
+    parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
+    parser.add_argument(
+        "--only-missing", action="store_true",
+        help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
+        "again. Finished trainings are always kept",
+    )  # fmt: skip
+    parser.add_argument(
+        "--minutes", type=_minutes, metavar="M",
+        help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
+        "continues",
+    )  # fmt: skip
+    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
+    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
+
+
+def _minutes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected minutes above 0, got {text!r}")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
+    from fpp_ml_bench.cli import CHECK_FAILED
+    from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.errors import RecipeError, TrainingError
+    from fpp_ml_bench.leaderboard.reproduce import Folders
+
+    below = args.runs / args.preset
+    folders = Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
+    tables = PAPER_TABLES if args.table in (None, ALL) else (args.table,)
+    if args.list:
+        return _list(tables, folders)
+    if args.table is None:
+        raise RecipeError(f"expected a table: {', '.join(PAPER_TABLES)} or {ALL}; --list shows their rows")
+    from fpp_ml_bench.leaderboard.reproduce import (
+        ReproduceSettings,
+        orderings,
+        orderings_sentence,
+        reproduce,
+        table_lines,
+        table_rich,
+    )
+
+    command = _command(args)
+    outcome = reproduce(
+        ReproduceSettings(
+            tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, report=_report
+        )
+    )
+    for table, path in zip(tables, outcome.tables, strict=True):
+        lines = table_lines(table, outcome.jobs, folders, outcome.opened)
+        show(table_rich(table, lines, args.preset), orderings_sentence(orderings(lines)))
+        print(f"Written: {path}")
+    if outcome.failed:
+        each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
+        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
+    if outcome.stopped is not None:
+        print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Continue with: {command}")
+        return CHECK_FAILED
+    return 0
+
+
+def _report(line: str) -> None:
+    """Print a line with the time on stderr, where the engine's progress is too."""
+    import sys
+    from datetime import datetime
+
+    print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that continues where this run stops, keeping its results."""
+    words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
+    for option, value in (("--data", args.data), ("--rows", args.rows)):
+        words += [] if value is None else [option, str(value)]
+    words += [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
+    words += ["--only-missing"]
+    words += [] if args.minutes is None else ["--minutes", f"{args.minutes:g}"]
+    words += ["--anyway"] if args.anyway else []
+    return shlex.join(words)
+
+
+def _list(tables: "tuple[str, ...]", folders: "Folders") -> int:
+    from rich.table import Table
+
+    from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.leaderboard.reproduce import planned, state_of, variants
+
+    jobs = planned(tables, folders.preset)
+    table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    for title in ("Row", "Training", "State", "Rows written"):
+        table.add_column(title, overflow="fold")
+    for job in jobs:
+        row_files = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
+        table.add_row(
+            "\n".join(place.recipe_name for place in job.places),
+            job.recipe.name,
+            state_of(folders.training(job.recipe)),
+            f"{sum(path.is_file() for path in row_files)} of {len(row_files)}",
+        )
+    show(table)
+    print(f"{len(jobs)} trainings fill {sum(len(job.places) for job in jobs)} rows.")
+    return 0

@@ -1,0 +1,106 @@
+"""``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical bounds."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fpp_ml_bench.baselines.stability import Case, Row
+
+SUMMARY = "Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds."
+EXAMPLES = (
+    "fpp-bench stability",
+    "fpp-bench stability --out stability --quick",
+    "fpp-bench stability --group phase --group metrics --json",
+    "fpp-bench stability --list",
+)
+_GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--group", action="append", choices=_GROUPS, metavar="GROUP",
+        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write index.html, stability.json and stability.png here"
+    )
+    parser.add_argument("--json", action="store_true", help="print the run as JSON instead of a table")
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out the case that needs gigabytes (10 million triangles)"
+    )
+    parser.add_argument("--list", action="store_true", help="list the cases and their bounds, and run none")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the cases; 1 if any FAILs."""
+    import json
+
+    from fpp_ml_bench.baselines.stability import Verdict, all_cases, run_cases
+    from fpp_ml_bench.cli import CHECK_FAILED, OK
+    from fpp_ml_bench.cli.console import progress_bar, show
+    from fpp_ml_bench.errors import StabilityError
+
+    groups = [group for group in _GROUPS if group in (args.group or _GROUPS)]
+    if args.out is not None and args.out.exists() and not args.out.is_dir():
+        raise StabilityError(f"--out {args.out}: expected a folder or a new path, got a file")
+    cases = all_cases(groups, quick=args.quick)
+    if args.list:
+        return _list(cases)
+    with progress_bar("stability", len(cases), "cases") as advance:
+        rows = run_cases(cases, lambda _: advance(1))
+    written = []
+    if args.out is not None:
+        from fpp_ml_bench.baselines.stability import write_report
+
+        written = write_report(rows, args.out)
+    if args.json:
+        from fpp_ml_bench.baselines.stability import document
+
+        print(json.dumps(document(rows), indent=1, allow_nan=False))
+    else:
+        _show(rows)
+        for path in written:
+            show(f"Written: {path}")
+    return CHECK_FAILED if any(row.verdict is Verdict.FAIL for row in rows) else OK
+
+
+def _show(rows: "Sequence[Row]") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from fpp_ml_bench.baselines.stability import Verdict, figure, summary
+    from fpp_ml_bench.cli.console import show
+
+    table = Table()
+    for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
+        table.add_column(title, justify="left" if title == "group" else "right")
+    for group, counts in summary(rows).items():
+        ratio = counts["largest_ratio"]
+        table.add_row(
+            group, str(counts["cases"]), str(counts["within"]), str(counts["flagged"]), str(counts["FAIL"]),
+            ratio if isinstance(ratio, str) else figure(ratio), f"{counts['cpu_seconds']:.1f}",
+        )  # fmt: skip
+    show(table)
+    for row in rows:
+        if row.verdict is Verdict.FAIL:
+            show(Text(f"FAIL {row.case.group}: {row.case.name}: {row.against}"))
+
+
+def _list(cases: "Sequence[Case]") -> int:
+    from rich.text import Text
+
+    from fpp_ml_bench.cli import OK
+    from fpp_ml_bench.cli.console import show
+
+    listed = set()
+    for case in cases:
+        if (case.group, case.family) not in listed:
+            listed.add((case.group, case.family))
+            members = sum((member.group, member.family) == (case.group, case.family) for member in cases)
+            show(Text(f"{case.group}: {case.family} ({members}): {case.computes}; against {case.reference}"))
+            show(Text(f"    bound: {case.predicts}"))
+    show(Text(f"{len(cases)} cases"))
+    return OK

@@ -1,0 +1,103 @@
+"""``fpp-bench tradeoff``: error against run time and captured frames, and what each stage costs as its input grows."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.leaderboard.tradeoff import Plan, TradeoffSettings
+
+SUMMARY = "Error against run time and frames for every method and setting on this machine, and how each cost grows."
+EXAMPLES = (
+    "fpp-bench tradeoff data/full",
+    "fpp-bench tradeoff data/cpu224 --runs runs --out tradeoff-224",
+    "fpp-bench tradeoff data/mini --quick --only classical --only phase",
+    "fpp-bench tradeoff data/full --list",
+    "fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json",
+)
+_GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
+    parser.add_argument(
+        "--out", type=Path, default=Path("tradeoff"), metavar="DIR",
+        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--only", action="append", choices=_GROUPS, default=[], metavar="GROUP",
+        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
+    )  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="fewer settings, views, runs and sizes")
+    parser.add_argument("--list", action="store_true", help="show what would be measured, and stop")
+    parser.add_argument("--threads", type=_count, default=1, metavar="N", help="threads a method may use (default: 1)")
+    parser.add_argument(
+        "--clock", choices=("wall", "processor"), default="wall",
+        help="processor: processor time of this process, for a shared machine (default: wall)",
+    )  # fmt: skip
+    parser.add_argument("--views", type=_count, metavar="N", help="views of each test object (default: 2, quick: 1)")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
+    parser.add_argument(
+        "--widths", type=_count, nargs="*", metavar="W",
+        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)",
+    )  # fmt: skip
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 1000:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 1000, got {text!r}")
+    return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure what is missing, write all files, print fronts, growths and remarks."""
+    from fpp_ml_bench.machine import limit_threads
+
+    limit_threads(args.threads)
+    from fpp_ml_bench.cli.console import progress_bar, show
+    from fpp_ml_bench.leaderboard.tradeoff import (
+        TradeoffSettings,
+        front_table,
+        growth_table,
+        planned,
+        remarks,
+        tradeoff,
+        write_report,
+    )
+
+    settings = TradeoffSettings(
+        args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock, args.views, args.runs,
+        args.widths,
+    )  # fmt: skip
+    plan = planned(settings)
+    if args.list:
+        return _list(settings, plan)
+    with progress_bar("measuring", len(plan), "settings") as advance:
+        measurements = tradeoff(settings, plan, lambda key: advance(1))
+    written = write_report(measurements, args.out)
+    if measurements.points:
+        show(front_table(measurements))
+    if measurements.growth:
+        show(growth_table(measurements.growth))
+    for line in remarks(measurements):
+        print(line)
+    for path in written:
+        print(f"Written: {path}")
+    return 0
+
+
+def _list(settings: "TradeoffSettings", plan: "Plan") -> int:
+    from rich.table import Table
+
+    from fpp_ml_bench.cli.console import show
+
+    table = Table(title=f"{settings.dataset}: {len(plan.views.names)} views", title_justify="left")
+    for title in ("Group", "Setting", "Note"):
+        table.add_column(title, overflow="fold")
+    for setting in plan.settings:
+        table.add_row(setting.group, setting.title, setting.note or "")
+    for ladder in plan.ladders:
+        table.add_row("costs", ladder.key, f"{len(ladder.steps)} steps from {ladder.steps[0]} to {ladder.steps[-1]}")
+    show(table)
+    print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
+    return 0

@@ -1,0 +1,106 @@
+"""``fpp-bench train``: one recipe, one weights file."""
+
+import argparse
+from pathlib import Path
+
+from fpp_ml_bench.baselines.training import PRESETS
+
+SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
+EXAMPLES = (
+    "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
+    "fpp-bench train phase-net data/full --out runs/phase-net      the network of the phase route",
+    "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
+    "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
+    "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
+)
+MODEL = "model.safetensors"
+PHASE_NET = "phase-net"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net"
+    )
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume"
+    )
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="stop before an epoch that would not finish in time, everything saved",
+    )
+    parser.add_argument(
+        "--extra",
+        type=Path,
+        metavar="DATASET",
+        help="phase-net: another dataset whose training split is added",
+    )
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)"
+    )
+    parser.add_argument(
+        "--unions",
+        type=int,
+        metavar="N",
+        help="phase-net: images that join several objects, made from each sample (default: as the shipped weights)",
+    )
+    parser.add_argument(
+        "--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)"
+    )
+    parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
+    from accelerate import PartialState
+
+    from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+    from fpp_ml_bench.baselines.training import load_recipe, train
+    from fpp_ml_bench.cli import CHECK_FAILED
+    from fpp_ml_bench.errors import RecipeError
+
+    if args.minutes is not None and not 0 < args.minutes < 1e6:
+        raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
+    if args.recipe == PHASE_NET:
+        return _phase_net(args)
+    for option in ("extra", "start", "steps", "unions", "rate"):
+        if getattr(args, option) is not None:
+            raise RecipeError(f"--{option} is an option of phase-net; leave it out")
+    recipe = load_recipe(args.recipe, args.preset)
+    trained = train(recipe, args.dataset, args.out, minutes=args.minutes)
+    if not PartialState().is_main_process:
+        return 0 if trained.finished else CHECK_FAILED
+    if not trained.finished:
+        print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
+        return CHECK_FAILED
+    weights = trained.weights
+    if recipe.normalisation == "individual" and not recipe.background_removed:
+        weights = args.out / MODEL
+        save_with_heads(trained.weights, args.dataset, weights)
+    print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
+    print(f"curve: {trained.curve}")
+    print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
+    return 0
+
+
+def _phase_net(args: argparse.Namespace) -> int:
+    from fpp_ml_bench.baselines.phase_network import Recipe, train_phase_net
+    from fpp_ml_bench.cli import CHECK_FAILED
+    from fpp_ml_bench.cli.console import progress_bar
+
+    options = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
+    recipe = Recipe(**options)
+    trained = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
+    if trained.weights is None:
+        steps = f"{trained.steps} of {recipe.steps} steps"
+        print(f"{args.out}: stopped after {steps}, all saved; run the same command to resume")
+        return CHECK_FAILED
+    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
+    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
+    print(f"next: fpp-bench predict phase-net {args.dataset} --weights {trained.weights} --out predictions")
+    return 0

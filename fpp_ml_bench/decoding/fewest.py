@@ -1,0 +1,262 @@
+"""The fewest frames that a rig's working range needs: phase steps for a noise, Gray bits for the orders that can occur.
+
+A pixel's ray crosses only a few fringe periods within the working range (2.4 and 1.9 with the paper's rig), while the
+Gray code tells all periods of the pattern apart. There are two ways to capture fewer Gray frames:
+
+- A bit that is the same on every cell the camera can see, at any depth between the near end of the range and the
+  background, carries no information (`gray_bits_in_view`). A single direction needs every bit that changes somewhere in
+  view: without it, the codes on either side of the change are mirror images, and a phase at a cell's edge fits two
+  cells.
+- With both directions, no bit may be needed (`orders_from_phases`): the two fringes' periods along the ray differ, and
+  together they are unambiguous over their beat, as in two-frequency unwrapping. The (u, v) of the right pair of orders
+  lies on the pixel's epipolar line; that of a wrong pair is several px away.
+
+Own derivation.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.compiled import numba_enabled
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.decoding.blocks import (
+    MAX_DISAGREEMENT_PX,
+    Coordinates,
+    DirectionPlan,
+    Limits,
+    Reason,
+    decode_direction,
+)
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
+
+_GRID = 33
+"""Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""
+CODE_MARGIN_CELLS = 1
+AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
+"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
+LEAST_TOLERANCE_PX = 1.0
+"""Distance in projector px that noise may move a pixel off its epipolar line. The decoder's worst case (3 steps, least
+modulation) has a sigma of 0.5 px, usual pixels have 0.02 px."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane."""
+
+    near_px: dict[Direction, np.ndarray]
+    far_px: dict[Direction, np.ndarray]
+    background_px: dict[Direction, np.ndarray]
+
+
+def reach_of(rig: Rig) -> Reach:
+    """Projector coordinates of the camera's rays at the ends of the working range and on the background plane; NaN
+    outside the projector's view."""
+    rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
+    columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
+    x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
+
+    def projected(depth_m: float) -> dict[Direction, np.ndarray]:
+        u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
+        return {"vertical": u, "horizontal": v}
+
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    return Reach(projected(near_m), projected(far_m), projected(rig.background_m))
+
+
+@lru_cache(maxsize=16)
+def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
+    """Gray bits of a direction (0 = most significant frame) that change within the camera's view. All other bits are
+    the same on every cell in view, in the working range and on the background."""
+    reach, bits = reach_of(rig), rig.sequence.bits(direction)
+    in_view = np.concatenate([ends[direction] for ends in (reach.near_px, reach.far_px, reach.background_px)])
+    in_view = in_view[np.isfinite(in_view)]
+    last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
+    if not in_view.size:
+        return tuple(range(bits))
+    low, high = (int(cell_of(edge, rig.pitch(direction))) for edge in (in_view.min(), in_view.max()))
+    cells = np.arange(max(low - CODE_MARGIN_CELLS, 0), min(high + CODE_MARGIN_CELLS, last) + 1)
+    code = binary_to_gray(cells if cells.size else np.arange(last + 1))
+    return tuple(bit for bit in range(bits) if np.ptp(code >> (bits - 1 - bit) & 1))
+
+
+@dataclass(frozen=True)
+class JointCode:
+    """How well both directions' phases together fix the orders, in projector px across the epipolar line.
+
+    ``least_gap_px``: smallest distance of a wrong pair of orders from the right pair within the range;
+    ``background_gap_px``: smallest distance at which the background plane could pass for a point within the range.
+    ``driver``: the direction of which a ray crosses more periods within the range; ``most_periods``: at most so many.
+    """
+
+    least_gap_px: float
+    background_gap_px: float
+    driver: Direction = "vertical"
+    most_periods: float = 0.0
+
+    @property
+    def tolerance_px(self) -> float:
+        """Largest accepted distance from the epipolar line: half the gap, and never more than the decoder allows."""
+        return min(MAX_DISAGREEMENT_PX, self.least_gap_px / 2)
+
+    @property
+    def unambiguous(self) -> bool:
+        """Whether the phases alone suffice: `LEAST_TOLERANCE_PX` left for noise, and clear of the background."""
+        return self.tolerance_px >= LEAST_TOLERANCE_PX and self.background_gap_px > self.tolerance_px
+
+
+@lru_cache(maxsize=8)
+def orders_from_phases(rig: Rig) -> JointCode:
+    """How well two wrapped phases alone give the orders of both directions within the working range.
+
+    A wrong pair is i periods off in u and j in v, with (i, j) not (0, 0); both stay within the segment that the range
+    covers on the epipolar line, extended by the decoder's tolerance at either end. Its distance from the line is
+    ``|i P_u e_v - j P_v e_u|``, e the line's unit direction. This holds only for projectors without distortion, whose
+    epipolar lines are straight; for all others both gaps are 0.
+    """
+    if rig.projector.is_distorted:
+        return JointCode(0.0, 0.0)
+    reach = reach_of(rig)
+    near, far, background = (
+        np.stack([ends["vertical"], ends["horizontal"]]) for ends in (reach.near_px, reach.far_px, reach.background_px)
+    )
+    line = far - near
+    usable = np.isfinite(line).all(axis=0) & np.isfinite(background).all(axis=0) & (np.hypot(*line) > 0)
+    if not usable.any():
+        return JointCode(0.0, 0.0)
+    near, far, background, line = near[:, usable], far[:, usable], background[:, usable], line[:, usable]
+    e = line / np.hypot(*line)
+    pitch = np.array([[rig.pitch("vertical")], [rig.pitch("horizontal")]])
+    span = (np.abs(line) + 2 * MAX_DISAGREEMENT_PX) / pitch
+    low = (np.minimum(near, far) - MAX_DISAGREEMENT_PX - background) / pitch
+    high = (np.maximum(near, far) + MAX_DISAGREEMENT_PX - background) / pitch
+    most_orders = int(np.ceil(max(span.max(), np.abs(low).max(), np.abs(high).max())))
+    gaps = {"range": math.inf, "background": math.inf}
+    for i in range(-most_orders, most_orders + 1):
+        for j in range(-most_orders, most_orders + 1):
+            distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
+            inside = (abs(i) <= span[0]) & (abs(j) <= span[1]) & ((i, j) != (0, 0))
+            on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
+            for name, possible in (("range", inside), ("background", on_background)):
+                if possible.any():
+                    gaps[name] = min(gaps[name], float(distance_px[possible].min()))
+    periods = (np.abs(line) / pitch).max(axis=1)
+    driver = AXES[int(periods[1] > periods[0])]
+    return JointCode(gaps["range"], gaps["background"], driver, float(periods.max()))
+
+
+def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
+    """Gray bits that must be captured for ``direction`` "vertical", "horizontal" or "both", per direction."""
+    if direction == "both":
+        if orders_from_phases(rig).unambiguous:
+            return {"horizontal": (), "vertical": ()}
+        return {name: gray_bits_in_view(rig, name) for name in DIRECTIONS}
+    name: Direction = "vertical" if direction == "vertical" else "horizontal"
+    return {name: gray_bits_in_view(rig, name)}
+
+
+def fewest_steps(
+    rig: Rig, direction: Direction | str, depth_mm_sigma: float, modulation: float, noise_grey: float
+) -> int | None:
+    """Fewest phase steps with which noise moves depth by at most ``depth_mm_sigma`` (standard deviation, mm) at the far
+    end of the range on the optical axis; None where all steps of the sequence are too few.
+
+    ``modulation`` at that depth and ``noise_grey`` in grey levels; see `triangulation.depth_noise_mm`.
+    """
+    far_mm = rig.working_range_mm[1]
+    for steps in range(3, rig.sequence.steps + 1):
+        if float(depth_noise_mm(rig, far_mm, direction, steps, modulation, noise_grey)) <= depth_mm_sigma:
+            return steps
+    return None
+
+
+def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPlan], JointCode | None]:
+    """The plans with only the Gray frames that the working range needs, and the joint code if it replaces them all."""
+    joint = orders_from_phases(rig) if len(plans) == 2 else None
+    if joint is not None and joint.unambiguous:
+        return [replace(plan, gray=()) for plan in plans], joint
+    return [replace(plan, constant_levels=_constant_levels(rig, plan)) for plan in plans], None
+
+
+def _constant_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
+    """Grey level of each Gray frame that is the same on every cell in view, by frame index."""
+    needed = gray_bits_in_view(rig, plan.direction)
+    reach = reach_of(rig).near_px[plan.direction]
+    in_view = reach[np.isfinite(reach)]
+    if not in_view.size:
+        return {}
+    last = plan.length_px - 1
+    code = int(binary_to_gray(cell_of(np.clip(in_view[0], 0, last), plan.pitch_px)))
+    bits = len(plan.gray)
+    return {
+        frame: (code >> (bits - 1 - bit) & 1) * GREY_LEVELS for bit, frame in enumerate(plan.gray) if bit not in needed
+    }
+
+
+def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
+    """Phase and modulation of a block without Gray frames; reasons that depend on a fringe order are cleared."""
+    coordinates = decode_direction(grey, plan, limits)
+    order_faults = (coordinates.reason == Reason.INCONSISTENT_ORDER) | (coordinates.reason == Reason.OUTSIDE_PATTERN)
+    coordinates.reason[order_faults] = 0
+    return coordinates
+
+
+def nearest_pair(
+    coordinates: dict[Direction, Coordinates], rays: Maps, rig: Rig, tolerance_px: float
+) -> tuple[dict[Direction, NDArray[np.float64]], NDArray[np.float64]]:
+    """The pair of fringe orders that lies nearest to the epipolar line, for every pixel.
+
+    Returns the orders of each direction, whole numbers as float64 (n,), and the pair's distance from the line in
+    projector px, inf where no order lies in the range.
+    """
+    joint = orders_from_phases(rig)
+    a, b = (0, 1) if joint.driver == "vertical" else (1, 0)
+    first, second = coordinates[AXES[a]].phase, coordinates[AXES[b]].phase
+    pitches = rig.pitch(AXES[a]), rig.pitch(AXES[b])
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    tries = math.ceil(joint.most_periods + 2 * tolerance_px / pitches[0]) + 1
+    order_a, order_b = np.zeros(first.shape), np.zeros(first.shape)
+    nearest = np.full(first.shape, np.inf)
+    if numba_enabled():
+        from fpp_ml_bench.decoding.kernels import joint_orders
+
+        device = rig.projector
+        joint_orders(
+            *rays, first, second, rig.R, rig.t, a, (device.fx, device.fy), (device.cx, device.cy), (near_m, far_m),
+            pitches, tolerance_px, tries, order_a, order_b, nearest,
+        )  # fmt: skip
+        return {AXES[a]: order_a, AXES[b]: order_b}, nearest
+    x, y = rays
+    near, far = (rig.project(np.stack([x * z, y * z, np.full_like(x, z)], axis=-1)) for z in (near_m, far_m))
+    with np.errstate(all="ignore"):
+        line = far[0] - near[0], far[1] - near[1]
+        slope, share = line[b] / line[a], np.abs(line[a]) / np.hypot(*line)
+        low, high = np.minimum(near[a], far[a]) - tolerance_px, np.maximum(near[a], far[a]) + tolerance_px
+        start = np.ceil(low / pitches[0] - first / (2 * np.pi))
+        for step in range(tries):
+            first_order = start + step
+            position_px = (first + 2 * np.pi * first_order) * (pitches[0] / (2 * np.pi))
+            predicted = near[b] + (position_px - near[a]) * slope
+            second_order = np.floor(predicted / pitches[1] - second / (2 * np.pi) + 0.5)
+            distance_px = np.abs((second + 2 * np.pi * second_order) * (pitches[1] / (2 * np.pi)) - predicted) * share
+            better = (distance_px < nearest) & (position_px <= high)
+            nearest[better], order_a[better], order_b[better] = (
+                distance_px[better],
+                first_order[better],
+                second_order[better],
+            )
+    return {AXES[a]: order_a, AXES[b]: order_b}, nearest
+
+
+def with_order(coordinates: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
+    """Coordinates of a direction from its wrapped phase and its fringe orders (n,), as with Gray code."""
+    absolute = coordinates.phase + 2 * np.pi * order
+    coordinate = absolute * (rig.pitch(direction) / (2 * np.pi))
+    reason = coordinates.reason.copy()
+    outside = (coordinate < -0.5) | (coordinate > rig.pattern_length(direction) - 0.5)
+    reason[(reason == 0) & outside] = Reason.OUTSIDE_PATTERN
+    return Coordinates(coordinate, coordinates.modulation, coordinates.phase, reason)

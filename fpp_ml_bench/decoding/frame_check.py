@@ -1,0 +1,93 @@
+"""Detects a sinusoid frame whose capture failed (dead, dimmed or flashed), from the frames' mean grey levels.
+
+Every pixel follows ``A + C cos delta_n + S sin delta_n``, and so does the mean over any set of pixels. With seven or
+more steps, a mean that contradicts the other means is therefore detected in any scene; the three or more redundant
+equations tell a wrong frame from a scene that violates the model (gamma on a few pixels). With four to six steps only a
+black frame can be detected, by comparison with the frame half a period later. Three steps have no redundancy. Without
+this check a wrong frame would go unnoticed and cause a phase error of up to (2/N) (A + B) / B.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.decoding.blocks import DirectionPlan
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.optics import Sequence
+
+SAMPLED_PX = 4096
+LEAST_PX = 64
+"""With fewer pixels the mean depends more on the scene than on the frame."""
+LEAST_OFF_GREY = 16.0
+LEAST_OFF_SHARE = 0.3
+"""A frame is wrong when its mean deviates by more than both limits: no lamp flickers by 30%."""
+AGREEMENT_GREY = 3.0
+"""Largest residual of the other frames' means. Quantisation, noise and clipping leave less; above it,
+the scene does not follow the model (a strong gamma on a few pixels), and then no frame is reported."""
+LEAST_STEPS_FOR_MEANS = 7
+OPPOSITE_SPAN_GREY = 40
+"""A correct frame is black only where all phases are within 0.2 rad of its minimum. The frame half a period later (36
+degrees off that for five steps) then spans at most a fifth of the modulation."""
+
+
+def check_frames(
+    flat: Mapping[int, NDArray[np.uint8]],
+    plan: DirectionPlan,
+    mask_indices: NDArray[np.intp] | None,
+    sequence: Sequence,
+) -> None:
+    """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others.
+
+    ``flat`` frames by index, uint8 (pixels,); ``mask_indices`` flat indices of the pixels to decode (None: all). Tests
+    at most `SAMPLED_PX` of them, evenly spread.
+    """
+    first = flat[plan.sinusoids[0]]
+    pixel_count = len(first) if mask_indices is None else len(mask_indices)
+    if pixel_count < LEAST_PX or len(plan.sinusoids) < 4:
+        return
+    step = -(-pixel_count // SAMPLED_PX)
+    sampled = slice(None, None, step) if mask_indices is None else mask_indices[::step]
+    levels = [flat[index][sampled] for index in plan.sinusoids]
+    if len(levels) >= LEAST_STEPS_FOR_MEANS:
+        shifts = 2 * np.pi * np.array([sequence.frames[index].step for index in plan.sinusoids]) / sequence.steps
+        model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
+        wrong = _contradicting_mean(np.array([level.mean() for level in levels]), model, plan.weights)
+    else:
+        wrong = _black_frame(levels)
+    if wrong is not None:
+        position, fault = wrong
+        raise DecodeError(
+            f"frame {sequence.frames[plan.sinusoids[position]].title}: {fault}: its capture failed (dead, dimmed or "
+            "flashed frame); take it again, or decode with steps that leave it out"
+        )
+
+
+def _contradicting_mean(
+    means: NDArray[np.float64], model: NDArray[np.float64], weights: NDArray[np.float64]
+) -> tuple[int, str] | None:
+    """Index of the frame whose mean contradicts the others, and what is wrong with it; None where no frame does."""
+    fitted = model @ (weights @ means)
+    influence = np.einsum("ij,ji->i", model, weights)
+    deviations = np.abs(means - fitted) / (1 - influence)  # from the prediction of the other frames alone
+    for position in np.flatnonzero(deviations > LEAST_OFF_GREY):
+        others = np.arange(len(means)) != position
+        fit = np.linalg.lstsq(model[others], means[others], rcond=None)[0]
+        expected = float(model[position] @ fit)
+        agree = np.abs(model[others] @ fit - means[others]).max() <= AGREEMENT_GREY
+        if agree and deviations[position] > LEAST_OFF_SHARE * max(expected, 0.0):
+            fault = f"its mean grey level is {means[position]:.0f}, and by the other steps it should be {expected:.0f}"
+            return int(position), fault
+    return None
+
+
+def _black_frame(levels: list[NDArray[np.uint8]]) -> tuple[int, str] | None:
+    """Index of the frame that is black at every pixel while the frame half a period later varies, and the fault.
+
+    Where a correct frame is black everywhere, both are at an extreme of the fringe, and the later frame can't vary.
+    """
+    for position, level in enumerate(levels):
+        opposite = levels[(position + len(levels) // 2) % len(levels)]
+        if not level.any() and int(opposite.max()) - int(opposite.min()) >= OPPOSITE_SPAN_GREY:
+            return position, "it is black all over while the other steps vary"
+    return None

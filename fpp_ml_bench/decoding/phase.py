@@ -1,0 +1,133 @@
+"""Wrapped phase, modulation and mean from N phase-shifted frames (paper Eqs. 1 and 2).
+
+The model is ``I_n = A + B cos(phi + delta_n)`` with ``delta_n = 2 pi n / N``. Written as ``A + C cos delta_n + S sin
+delta_n`` with ``C = B cos phi`` and ``S = -B sin phi`` it is linear, and least squares over any three or more
+different shifts is one weighted sum of the frames for each of A, C and S. For equal steps the weights are 1/N, (2/N)
+cos delta_n and (2/N) sin delta_n, and ``phi = -atan2(S, C)`` is the paper's Eq. 2.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from fpp_ml_bench.compiled import numba_enabled
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
+
+
+class Phase(NamedTuple):
+    """``phase`` in rad, [-pi, pi); ``modulation`` B and ``mean`` A in grey levels; all (H, W)."""
+
+    phase: NDArray[np.floating]
+    modulation: NDArray[np.floating]
+    mean: NDArray[np.floating]
+
+
+def choose_steps(steps: int, count: int) -> tuple[int, ...]:
+    """``count`` of ``steps`` frames, spread over the circle as evenly as they go: floor(i steps / count + 1/2).
+
+    Exactly equal where ``count`` divides ``steps``. Raises `DecodeError` for fewer than 3 or more than ``steps``.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 3 <= count <= steps:
+        raise DecodeError(f"steps: expected a whole number from 3 to the {steps} that were projected, got {count!r}")
+    return tuple((2 * i * steps + count) // (2 * count) for i in range(count))
+
+
+def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
+    """Weights of the frames in A, C and S: float64 (3, N) for N phase shifts in rad.
+
+    Closed form for equal steps, else the least-squares pseudo-inverse. Raises `DecodeError` where the shifts don't
+    determine a phase (fewer than three different ones).
+    """
+    shifts = np.asarray(shifts_rad, dtype=np.float64)
+    if shifts.ndim != 1 or len(shifts) < 3 or not np.all(np.isfinite(shifts)):
+        raise DecodeError(f"shifts_rad: expected at least 3 finite phase shifts in rad, got {shifts_rad!r}")
+    count = len(shifts)
+    turns = shifts / (2 * np.pi)
+    model = np.stack([np.ones(count), cosine_of_turns(turns), sine_of_turns(turns)], axis=1)
+    weights = model.T * np.array([[1.0], [2.0], [2.0]]) / count
+    if np.abs(weights @ model - np.eye(3)).max() < 1e-12:
+        return np.ascontiguousarray(weights)
+    if np.linalg.cond(model) > 1e6:
+        raise DecodeError(
+            f"shifts_rad: the shifts {shifts.tolist()} don't determine a phase; 3 different ones are needed"
+        )
+    return np.ascontiguousarray(np.linalg.pinv(model))
+
+
+def _checked(frames: Iterable[ArrayLike]) -> list[NDArray]:
+    images = [np.asarray(frame) for frame in frames]
+    if len(images) < 3:
+        raise DecodeError(f"a phase needs at least 3 frames, got {len(images)}")
+    for i, image in enumerate(images):
+        if image.ndim != 2 or image.shape != images[0].shape:
+            raise DecodeError(f"frame {i}: expected shape (H, W) = {images[0].shape} like frame 0, got {image.shape}")
+        if image.dtype.kind not in "uif":
+            raise DecodeError(f"frame {i}: expected integer or real grey levels, got dtype {image.dtype}")
+    return images
+
+
+def wrapped_phase(
+    frames: Iterable[ArrayLike], shifts_rad: ArrayLike | None = None, dtype: DTypeLike = np.float64
+) -> Phase:
+    """Wrapped phase, modulation and mean of N >= 3 frames (N, H, W), or N images (H, W), in grey levels.
+
+    ``shifts_rad`` (N,) defaults to equal steps, 2 pi n / N. Sums are float64 whatever ``dtype`` (float32 or float64)
+    the results have. A phase of exactly +pi comes out as -pi. Where nothing is modulated the phase means nothing: look
+    at the modulation. Raises `DecodeError` for too few frames, unequal shapes, or dtypes that hold no grey levels.
+    """
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
+        raise DecodeError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
+    images = _checked(frames)
+    if shifts_rad is None:
+        shifts_rad = 2 * np.pi * np.arange(len(images)) / len(images)
+    weights = phase_weights(shifts_rad)
+    if weights.shape[1] != len(images):
+        raise DecodeError(f"shifts_rad: expected one for each of the {len(images)} frames, got {weights.shape[1]}")
+    mean, cosine, sine = weighted_sums(images, weights)
+    phase = minus_atan2(sine, cosine).astype(dtype)
+    phase[phase >= np.asarray(np.pi, dtype=dtype)] = -np.pi  # float32 rounds the last values below pi up to it
+    return Phase(
+        phase, np.sqrt(cosine * cosine + sine * sine).astype(dtype, copy=False), mean.astype(dtype, copy=False)
+    )
+
+
+def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """One weighted sum of the images for each row of ``weights``, added in frame order in float64."""
+    sums: list[NDArray[np.float64]] = []
+    for image, column in zip(images, weights.T, strict=True):
+        grey = image.astype(np.float64)
+        if not sums:
+            sums = [weight * grey for weight in column]
+        else:
+            for total, weight in zip(sums, column, strict=True):
+                total += weight * grey
+    return sums
+
+
+def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor.
+
+    +pi is mapped to -pi.
+    """
+    if numba_enabled():
+        from fpp_ml_bench.decoding.kernels import minus_atan2_kernel
+
+        phase = np.empty(np.shape(sine))
+        minus_atan2_kernel(np.ravel(sine), np.ravel(cosine), phase.ravel())
+        return phase
+    phase = -arctangent2(sine, cosine)
+    phase[phase >= np.pi] = -np.pi
+    return phase
+
+
+def clipped_steps(frames: Iterable[ArrayLike], level: int = GREY_LEVELS) -> NDArray[np.uint16]:
+    """In how many of the frames each pixel stands exactly at ``level`` (255: saturated, 0: black), uint16 (H, W)."""
+    images = _checked(frames)
+    count = np.zeros(images[0].shape, dtype=np.uint16)
+    for image in images:
+        count += image == level
+    return count

@@ -1,0 +1,184 @@
+"""The three pixel sets on which every score is reported, and the depth edges that split the object set.
+
+Ground-truth statistics, training masks and the evaluator share the rule (paper Section 5.3.2): a pixel belongs to the
+object where the target depth is above 0 mm, else to the background.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M
+from fpp_ml_bench.skipping import skipping_enabled
+
+DEPTH_EDGE_JUMP_MM = 10.0
+"""A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
+At 1.8 m a pixel covers 0.79 mm, so 10 mm per pixel is a surface tilted by 85 degrees from the image plane."""
+
+
+def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels of the object: target depth above 0. ``depth_mm`` (H, W) in mm, 0 = background; bool (H, W)."""
+    return depth_mm > 0
+
+
+def background_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels of the background: all pixels outside the object, so that the two sets always make up the image."""
+    return ~object_mask(depth_mm)
+
+
+def edge_jump_mm(size_px: int) -> float:
+    """Depth step in mm that counts as an edge in an image ``size_px`` wide."""
+    return DEPTH_EDGE_JUMP_MM * FULL_SIZE / size_px
+
+
+def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.bool_]:
+    """Pixels beside a depth edge, bool (H, W).
+
+    An edge runs between an object pixel and a background pixel beside it (4-neighbours), or between two object pixels
+    whose depths differ by more than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels are marked.
+    """
+    jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
+    inside = object_mask(depth_mm)
+    edge = np.zeros(depth_mm.shape, dtype=bool)
+    for axis in (0, 1):
+        before = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        after = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        step = np.abs(depth_mm[after] - depth_mm[before]) > jump
+        step = (step & inside[before] & inside[after]) | (inside[before] != inside[after])
+        edge[before] |= step
+        edge[after] |= step
+    return edge
+
+
+def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
+    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px.
+
+    Both pixels beside an edge have distance 0, their neighbours 1, and so on; an image without edges has distance inf
+    everywhere.
+    """
+    import cv2
+
+    edge = depth_edges(depth_mm, jump_mm)
+    if not edge.any():
+        return np.full(depth_mm.shape, np.inf, dtype=np.float32)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance, dtype=np.float32)
+
+
+def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:
+    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W), computed by dilating the edges.
+
+    For the few pixels of a score's edge band this is several times faster than a distance transform, and needs no
+    OpenCV (whose import alone takes longer than scoring ten samples).
+    """
+    return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
+
+
+def object_near_edges(
+    depth_mm: NDArray[np.floating], bands_px: Sequence[int], jump_mm: float | None = None
+) -> list[NDArray[np.bool_]]:
+    """`object_near_edge` for several bands; the edges are computed once."""
+    near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
+    inside = object_mask(depth_mm)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    if not rows.size:
+        return near_edge
+    # Every edge touches the object, so the object's box and one pixel around it hold all of them.
+    box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
+    if not skipping_enabled():
+        box = (slice(None), slice(None))
+    edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
+    for band, band_px in zip(near_edge, bands_px, strict=True):
+        if band_px > 0:
+            _dilate(edge, band_px, band[box])
+            band[box] &= inside[box]
+    return near_edge
+
+
+def _dilate(edge: NDArray[np.bool_], band_px: int, band: NDArray[np.bool_]) -> None:
+    """Mark in ``band`` the pixels nearer than ``band_px`` to a pixel of ``edge``; both (h, w)."""
+    height, width = edge.shape
+    run, half = edge.copy(), 0  # edge, dilated sideways by half
+    reach = min(band_px - 1, height - 1)
+    for dy in range(band_px - 1, -1, -1):
+        # Widest sideways offset still inside the open disk dx^2 + dy^2 < band^2; it grows as dy shrinks.
+        limit = math.isqrt(band_px * band_px - 1 - dy * dy)
+        while half < min(limit, width - 1):
+            half += 1
+            run[:, half:] |= edge[:, :-half]
+            run[:, :-half] |= edge[:, half:]
+        if dy <= reach:
+            band[: height - dy] |= run[dy:]
+            band[dy:] |= run[: height - dy]
+
+
+Normalisation = Literal["raw", "global", "individual"]
+NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
+
+_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
+
+def _check(name: str) -> None:
+    if name not in NORMALISATIONS:
+        raise ValueError(f"unknown normalisation {name!r}; there are {', '.join(NORMALISATIONS)}")
+
+
+def normalise(
+    depth_mm: NDArray[np.floating], name: Normalisation, depth_min_mm: float, depth_max_mm: float,
+    out: NDArray[np.floating] | None = None,
+) -> NDArray:  # fmt: skip
+    """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
+
+    Single precision loses nothing where depth and range are float32: the difference of two such depths within a factor
+    of two of each other is exact (Sterbenz), and the division rounds once. Any other range, or depths of higher
+    precision, would lose digits by being rounded first: these are computed in float64 and rounded at the end.
+    Raises ``ValueError`` for an unknown name or a range that is not finite and ordered.
+    """
+    _check(name)
+    result = np.empty(depth_mm.shape, dtype=np.float32) if out is None else out
+    if name == "raw":
+        result[...] = depth_mm
+    elif name == "global":
+        np.divide(depth_mm, np.float32(MM_PER_M), out=result, casting="same_kind")
+    else:
+        span = _span(depth_min_mm, depth_max_mm)
+        if span == 0:
+            result[...] = 0
+        elif depth_mm.dtype.itemsize <= 4 and _is_single(depth_min_mm) and _SMALLEST <= span <= _LARGEST:
+            np.subtract(depth_mm, np.float32(depth_min_mm), out=result, casting="same_kind")
+            result /= np.float32(span)
+            result *= object_mask(depth_mm)
+        else:
+            share = (depth_mm.astype(np.float64) - float(depth_min_mm)) / span
+            result[...] = np.where(object_mask(depth_mm), share, 0.0)
+    return result
+
+
+def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth_max_mm: float) -> NDArray[np.float64]:
+    """A network's output in the representation ``name`` back to mm; float64 of the same shape.
+
+    Under ``individual`` every pixel goes through the same affine map, so a predicted 0 becomes D_min (paper Section
+    5.3.2). Raises ``ValueError`` as `normalise`.
+    """
+    _check(name)
+    depth = values.astype(np.float64)
+    if name == "raw":
+        return depth
+    if name == "global":
+        return depth * MM_PER_M
+    return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
+
+
+def _is_single(value: float) -> bool:
+    """Whether float32 holds ``value`` exactly."""
+    return abs(value) <= _LARGEST and float(np.float32(value)) == float(value)
+
+
+def _span(depth_min_mm: float, depth_max_mm: float) -> float:
+    low, high = float(depth_min_mm), float(depth_max_mm)
+    if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+        raise ValueError(f"expected a finite depth range with depth_min <= depth_max, got {low} to {high} mm")
+    return high - low

@@ -1,0 +1,81 @@
+"""The projected patterns: N-step sinusoids and a phase-aligned Gray code, as 8-bit images.
+
+Step n of the fringes of period P is ``127.5 + 127.5 cos(2 pi w / P + 2 pi n / N)`` along the varying coordinate w
+(paper Eq. 1). The Gray code counts HALF periods: cell j holds the pixels with floor(w / (P / 2)) = j, coded by the
+reflected binary code, most significant bit first, 0 or 255. A cell edge therefore never falls together with both ends
+of the phase: see `fpp_ml_bench.optics.gray_code` for why that cures the half-period slip.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import FppBenchError, RigError
+from fpp_ml_bench.optics.gray_code import binary_to_gray, cell_of
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Frame
+from fpp_ml_bench.portable import cosine_of_turns
+
+
+def _frame(rig: Rig, index: int) -> Frame:
+    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
+        raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
+    return rig.sequence.frames[index]
+
+
+def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
+    """Frame ``index`` along the coordinate it varies with: uint8 (L,), L = projector height or width.
+
+    Horizontal fringes and code vary along the rows (L = height), vertical ones along the columns (L = width); black and
+    white are constant, (1,). Raises `RigError` for an index outside the sequence.
+    """
+    frame = _frame(rig, index)
+    if frame.direction is None:
+        return np.array([0 if frame.kind == "black" else GREY_LEVELS], dtype=np.uint8)
+    position = np.arange(rig.pattern_length(frame.direction))
+    pitch = rig.pitch(frame.direction)
+    if frame.kind == "sinusoid":
+        steps, half = rig.sequence.steps, GREY_LEVELS / 2
+        turns = (position * steps + frame.step * pitch) / (pitch * steps)
+        return np.rint(half + half * cosine_of_turns(turns)).astype(np.uint8)
+    code = binary_to_gray(cell_of(position, pitch))
+    bit = code >> (rig.sequence.bits(frame.direction) - 1 - frame.step) & 1
+    return (bit * GREY_LEVELS).astype(np.uint8)
+
+
+def pattern_profiles(rig: Rig) -> NDArray[np.uint8]:
+    """All F profiles in one table, uint8 (F, max(W, H)): row i is `pattern_profile` i, its last value repeated."""
+    length = max(rig.projector.width, rig.projector.height)
+    profiles = (pattern_profile(rig, i) for i in range(len(rig.sequence)))
+    return np.stack([np.pad(p, (0, length - len(p)), mode="edge") for p in profiles])
+
+
+def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
+    """Frame ``index`` as the projector shows it, uint8 (h_p, w_p); a read-only view of its profile."""
+    profile = pattern_profile(rig, index)
+    column = rig.sequence.frames[index].direction == "horizontal"
+    return np.broadcast_to(profile[:, None] if column else profile, (rig.projector.height, rig.projector.width))
+
+
+def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:
+    """Write every pattern as ``A_{i}.png`` (8-bit grey, lossless) into ``folder`` and return the paths in frame order.
+
+    Raises `FppBenchError` when the folder can't be made or a file can't be written.
+    """
+    import cv2
+
+    target = Path(folder)
+    paths = []
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        for index in range(len(rig.sequence)):
+            done, png = cv2.imencode(".png", np.ascontiguousarray(pattern_image(rig, index)))
+            if not done:
+                raise FppBenchError(f"pattern {index}: OpenCV could not encode a PNG")
+            paths.append(target / f"A_{index}.png")
+            paths[-1].write_bytes(png.tobytes())
+    except OSError as error:
+        raise FppBenchError(f"{target}: patterns can't be written: {error.strerror or error}") from error
+    return paths

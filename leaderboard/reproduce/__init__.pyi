@@ -1,0 +1,12 @@
+from .lines import table_lines as table_lines
+from .paper_order import orderings as orderings
+from .plan import RUNS as RUNS
+from .plan import Folders as Folders
+from .plan import planned as planned
+from .plan import variants as variants
+from .run_tables import ReproduceSettings as ReproduceSettings
+from .run_tables import reproduce as reproduce
+from .table import orderings_sentence as orderings_sentence
+from .table import table_rich as table_rich
+from .train_row import current_weights as current_weights
+from .train_row import state_of as state_of

@@ -1,0 +1,142 @@
+"""Scores on every (view, frame) pair of a condition's test set, as in the paper's multi-frame table (Section 5.4).
+
+The paper averages over all pairs. Here each sample's score is the mean over its frames, and the headline the mean over
+samples: the same number, for every sample has the same frames, and the interval can then be taken over objects. The
+rules are the evaluator's own (`scored_pair`, `score_sample`).
+"""
+
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.errors import PredictionError, SubmissionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.result import Headline, Intervals, Sha256, read_json, write_json
+from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
+from fpp_ml_bench.evaluation.score import intervals_over_objects, score_sample, scored_pair
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+Scores = dict[str, float | None]
+
+
+class FrameMean(StrictModel):
+    """Mean over samples for one frame of the sequence."""
+
+    frame: Count
+    metrics: Headline
+
+
+class SampleMean(StrictModel):
+    """Mean over frames for one sample."""
+
+    sample: Text
+    object: Text
+    metrics: Headline
+
+
+class AllFrames(StrictModel):
+    """The six errors over all pairs of ``frames`` and test samples, with what they were computed from."""
+
+    schema_version: Literal["1.0.0"]
+    protocol_version: Text
+    recipe: Text
+    fingerprint: Sha256
+    weights_sha256: Sha256
+    mode: Mode
+    frames: list[Count]
+    pairs: Annotated[int, Field(gt=0)]
+    metrics: Headline
+    intervals: Intervals
+    per_frame: list[FrameMean]
+    per_sample: list[SampleMean]
+
+
+def score_all_frames(
+    opened: DatasetFolder,
+    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
+    frames: Sequence[int],
+    units: Units,
+    mode: Mode,
+    recipe: str,
+    weights_sha256: str,
+    split: str = "test",
+) -> AllFrames:
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) in ``units`` out) on every sample of ``split`` and frame.
+
+    Raises PredictionError for a prediction that is not finite, and what `scored_pair` raises.
+    """
+    samples = opened.samples(split)
+    scores: dict[tuple[str, int], Scores] = {}
+    for sample in samples:
+        target_mm = opened.target_mm(sample)
+        for frame in frames:
+            values = predict(opened.frame(sample, frame))
+            if not np.isfinite(values).all():
+                raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
+            pair = scored_pair(values, target_mm, units, mode, sample)
+            metrics = score_sample(*pair).metrics()
+            scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
+    rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
+    objects = [split_sample_name(sample)[0] for sample in samples]
+    ends: dict[str, list[float | None]] = {
+        key: [None, None] if interval is None else list(interval) for key, interval in _intervals(rows, objects).items()
+    }
+    return AllFrames(
+        schema_version="1.0.0",
+        protocol_version=PROTOCOL_VERSION,
+        recipe=recipe,
+        fingerprint=opened.fingerprint,
+        weights_sha256=weights_sha256,
+        mode=mode,
+        frames=list(frames),
+        pairs=len(scores),
+        metrics=Headline(**_mean(rows)),
+        intervals=Intervals(**ends),
+        per_frame=[
+            FrameMean(frame=frame, metrics=Headline(**_mean([scores[sample, frame] for sample in samples])))
+            for frame in frames
+        ],
+        per_sample=[
+            SampleMean(sample=sample, object=name, metrics=Headline(**row))
+            for sample, name, row in zip(samples, objects, rows, strict=True)
+        ],
+    )
+
+
+def write_all_frames(scores: AllFrames, path: Path) -> None:
+    """Write as JSON, complete or not at all. SubmissionError where the file can't be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(scores.model_dump(mode="json"), path)
+
+
+def read_all_frames(path: Path) -> AllFrames:
+    """Read strictly; SubmissionError names the file and what is wrong with it."""
+    return validate(AllFrames, read_json(path), path, "file of scores on all frames")
+
+
+def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> AllFrames | None:
+    """The scores in ``path`` if valid and of this dataset, these weights and the current protocol; else None."""
+    if not path.is_file():
+        return None
+    try:
+        scores = read_all_frames(path)
+    except SubmissionError:
+        return None
+    key = (fingerprint, weights_sha256, PROTOCOL_VERSION)
+    return scores if (scores.fingerprint, scores.weights_sha256, scores.protocol_version) == key else None
+
+
+def _mean(rows: Sequence[Scores]) -> Scores:
+    """Plain mean of each headline score over the rows that have it."""
+    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
+    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
+
+
+def _intervals(rows: Sequence[Scores], objects: Sequence[str]) -> dict[str, tuple[float, float] | None]:
+    return intervals_over_objects(rows, objects, HEADLINE)

@@ -1,0 +1,13 @@
+from .measure_all import Plan as Plan
+from .measure_all import TradeoffSettings as TradeoffSettings
+from .measure_all import planned as planned
+from .measure_all import tradeoff as tradeoff
+from .points import Cost as Cost
+from .points import Point as Point
+from .points import Tradeoff as Tradeoff
+from .points import read_tradeoff as read_tradeoff
+from .points import shipped_tradeoff as shipped_tradeoff
+from .report import front_table as front_table
+from .report import growth_table as growth_table
+from .report import remarks as remarks
+from .report import write_report as write_report

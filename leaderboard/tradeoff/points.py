@@ -1,0 +1,145 @@
+"""What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts.
+
+There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its whole
+depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field
+
+from fpp_ml_bench.evaluation.result import HardwareInfo, read_json
+from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
+from fpp_ml_bench.leaderboard.pareto import pareto_front
+
+Group = Literal["classical", "phase", "networks", "precision", "sizes"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+COSTS = "costs"
+"""The group of `Growth`, which compares no methods."""
+Cost = Literal["seconds", "frames"]
+ErrorKey = Literal["object_mae_mm", "measured_mae_mm"]
+SLOWED = 1.25
+"""A setting is marked when the machine ran slower by this factor beside it than in the run's median."""
+MOST_LEFT_OUT = 0.05
+"""Share of the object's pixels without a depth up to which an error over the others is compared."""
+TRADEOFF_FILE = "tradeoff.json"
+TRADEOFF_SCHEMA: Literal["1.0.0"] = "1.0.0"
+
+
+class Point(StrictModel):
+    """A setting: ``seconds`` per view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
+
+    ``interval_mm`` is the 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method
+    was told about the views that it is scored on. ``note``: further remarks. ``failed``: why there is no measurement;
+    there are no numbers then. ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's
+    one-minute load average at that time, None where the system does not provide it.
+    """
+
+    key: Text
+    group: Group
+    title: Text
+    frames: Count = 0
+    image_px: Count = 0
+    runs: Count = 0
+    seconds: Positive | None = None
+    seconds_p5: Positive | None = None
+    seconds_p95: Positive | None = None
+    object_mae_mm: NonNegative | None = None
+    interval_mm: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    measured_mae_mm: NonNegative | None = None
+    missing_share: Share | None = None
+    parameters: Count = 0
+    given: Text | None = None
+    note: Text | None = None
+    failed: Text | None = None
+    pace_ms: Positive | None = None
+    load: NonNegative | None = None
+
+
+class Growth(StrictModel):
+    """Seconds of one stage (the least of several runs) at ``amounts`` of pixels, frames, objects or rows, and the
+    fitted power: see `fpp_ml_bench.leaderboard.tradeoff.growth`."""
+
+    stage: Text
+    over: Text
+    amounts: list[Positive]
+    seconds: list[Positive]
+    exponent: float
+    low: float
+    high: float
+    tail: float
+    flag: Text | None = None
+
+
+class Tradeoff(StrictModel):
+    """A whole run: the data, the rules, the machine, and the results.
+
+    ``sittings``: how often the run was started or continued; times of different sittings may differ by more than the
+    pace shows. ``settings``: the rules and options of the run.
+    """
+
+    tradeoff_schema_version: Literal["1.0.0"] = TRADEOFF_SCHEMA
+    created: Text
+    dataset: Text
+    fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    image_size: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    target: Text
+    views: list[Text]
+    settings: dict[Text, Scalar]
+    hardware: HardwareInfo
+    software: dict[Text, Text]
+    sittings: Count
+    points: list[Point]
+    growth: list[Growth]
+
+    @property
+    def pace_ms(self) -> list[float]:
+        """The pace beside each point, ascending."""
+        return sorted(point.pace_ms for point in self.points if point.pace_ms is not None)
+
+    @property
+    def loads(self) -> list[float]:
+        """The system's load beside each point, ascending."""
+        return sorted(point.load for point in self.points if point.load is not None)
+
+    def slowed(self, point: Point) -> bool:
+        """Whether the machine was slower beside ``point`` by the factor `SLOWED` than in the run's median."""
+        paces = self.pace_ms
+        return point.pace_ms is not None and point.pace_ms > SLOWED * paces[len(paces) // 2]
+
+    def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
+        """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
+
+        The precisions are left out: they repeat the classical method's arithmetic in plain NumPy. For the error over
+        measured pixels, points that leave out more than `MOST_LEFT_OUT` of the object's pixels are left out too:
+        a method must not gain by leaving out difficult pixels.
+        """
+        points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
+        if error == "measured_mae_mm":
+            points = [point for point in points if (point.missing_share or 0) <= MOST_LEFT_OUT]
+        return [point for point in points if point.seconds and getattr(point, error)]
+
+    def front(self, cost: Cost = "seconds", error: ErrorKey = "object_mae_mm") -> list[Point]:
+        """The comparable points that no other beats in both cost and error, the cheapest first."""
+        points = self.comparable(error)
+        points.sort(key=lambda point: point.key)
+        indices = pareto_front([(float(getattr(point, cost)), getattr(point, error)) for point in points])
+        return [points[index] for index in indices]
+
+
+def read_tradeoff(path: Path) -> Tradeoff:
+    """A ``tradeoff.json``, read strictly. SubmissionError names the file and what is wrong with it."""
+    return validate(Tradeoff, read_json(path), path, "tradeoff file")
+
+
+def shipped_tradeoff() -> Tradeoff | None:
+    """The trade-off that ships with the package and is shown on the leaderboard's page; None without the file."""
+    path = Path(__file__).resolve().parent / TRADEOFF_FILE
+    return read_tradeoff(path) if path.is_file() else None
+
+
+def failures(points: Sequence[Point]) -> list[Point]:
+    """Settings that could not be measured."""
+    return [point for point in points if point.failed]

@@ -1,0 +1,172 @@
+"""Meshes by name: the 50 procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
+
+import io
+import logging
+import math
+import struct
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fpp_ml_bench.constants import OBJECTS, SPLITS
+from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.loaders.render.settings import UserMesh
+from fpp_ml_bench.loaders.storage import file_hash
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+
+if TYPE_CHECKING:
+    import trimesh
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
+
+
+def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
+    """Mesh ``name`` ready for the scene: metres, z up, about its turning axis."""
+    user = {mesh.name: mesh for mesh in user_meshes}
+    if name in user:
+        return load_user_mesh(user[name])
+    from fpp_ml_bench.loaders.render.objects import object_mesh
+
+    return _solid(name, object_mesh(name))
+
+
+def _solid(name: str, mesh: "trimesh.Trimesh") -> SolidMesh:
+    return SolidMesh(name, np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
+
+
+def load_user_mesh(description: UserMesh) -> SolidMesh:
+    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted.
+
+    Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or
+    triangles between vertices that are not there.
+    """
+    mesh = _read_mesh(Path(description.path))
+    vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
+    for axis, degrees in enumerate(description.rotation_deg):
+        cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        a, b = vertices_m[:, first].copy(), vertices_m[:, second].copy()
+        vertices_m[:, first], vertices_m[:, second] = cosine * a - sine * b, sine * a + cosine * b
+    if description.centre:
+        vertices_m = vertices_m - (vertices_m.min(axis=0) + vertices_m.max(axis=0)) / 2
+    return SolidMesh(
+        description.name, vertices_m + np.asarray(description.offset_m), np.asarray(mesh.faces, dtype=np.int32)
+    )
+
+
+# What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8
+# sends it looking for a package that guesses encodings).
+_READER_ERRORS = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, NameError, OSError,
+    RuntimeError, TypeError, ValueError, struct.error,
+)  # fmt: skip
+
+
+def _read_mesh(path: Path) -> "trimesh.Trimesh":
+    import trimesh
+
+    # Its log would put a traceback of its own on the screen; what matters of it is in our message.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        content = path.read_bytes()
+        if kind == "obj":  # its comments may be in any encoding, and its numbers are ASCII
+            content = content.decode("utf-8", errors="replace").encode()
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh", process=False)
+    except _READER_ERRORS as error:
+        reason = "damaged, or of another format" if isinstance(error, ImportError | NameError) else error
+        raise MeshError(f"{path}: can't be read as a mesh ({reason}); expected {', '.join(MESH_SUFFIXES)}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or np.shape(mesh.vertices)[1:] != (3,):
+        raise MeshError(f"{path}: holds no triangles; export it as a triangle mesh")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError(f"{path}: has vertices that are not finite numbers; repair the mesh")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise MeshError(f"{path}: has triangles between vertices that are not there; it is damaged, export it again")
+    return mesh
+
+
+def write_ply(mesh: SolidMesh, path: Path) -> None:
+    """Write a mesh as binary PLY in metres, object coordinates."""
+    import trimesh
+
+    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_bytes(trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
+    temporary.replace(path)
+
+
+def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
+    """Users' meshes from a YAML list; raises `MeshError` naming the entry and the key.
+
+    ::
+
+        - {name: my_part, path: part.stl, scale: 0.001, rotation_deg: [90, 0, 0], split: test}
+
+    ``path`` is relative to the list's own folder; ``scale`` takes the file's unit to metres.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MeshError(f"{path}: can't be read as YAML ({error})") from error
+    if not isinstance(content, list) or not content:
+        raise MeshError(f"{path}: expected a list of meshes, each with name and path, got {type(content).__name__}")
+    meshes = tuple(_entry(entry, f"{path}, entry {i + 1}", path.parent) for i, entry in enumerate(content))
+    names = [mesh.name for mesh in meshes]
+    for name in names:
+        if names.count(name) > 1:
+            raise MeshError(f"{path}: the name {name!r} is given twice")
+    return meshes
+
+
+def single_mesh(path: Path) -> UserMesh:
+    """A user's mesh given by its file alone: named after the file, in metres, in split test."""
+    stem = "".join(c if c in _NAME_CHARACTERS else "_" for c in path.stem.lower())
+    return _entry({"name": stem, "path": path.name}, str(path), path.parent)
+
+
+def _entry(entry: object, where: str, folder: Path) -> UserMesh:
+    keys = {item.name for item in fields(UserMesh)} - {"content"}
+    if not isinstance(entry, dict) or not {"name", "path"} <= set(entry):
+        raise MeshError(f"{where}: expected a mapping with name and path, got {entry!r}")
+    unknown = set(map(str, entry)) - keys
+    if unknown:
+        raise MeshError(f"{where}: unknown key {sorted(unknown)[0]!r}; there are {', '.join(sorted(keys))}")
+    name = entry["name"]
+    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
+        raise MeshError(f"{where}: name must be of a-z, 0-9 and _, got {name!r}")
+    if name in OBJECTS:
+        raise MeshError(f"{where}: {name!r} is one of the benchmark's own objects; choose another name")
+    file = folder / str(entry["path"])
+    if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file():
+        raise MeshError(f"{where}: {file} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
+    split = entry.get("split", "test")
+    if split not in SPLITS:
+        raise MeshError(f"{where}: split {split!r}, expected {', '.join(SPLITS)}")
+    scale = _finite(entry.get("scale", 1.0), f"{where}: scale")
+    if scale <= 0:
+        raise MeshError(f"{where}: scale must be above 0, got {scale:g}")
+    base = UserMesh(name=name, path=str(file), scale=scale, split=split, content=file_hash(file))
+    triples: dict[str, Any] = {}
+    for key in ("rotation_deg", "offset_m"):
+        if key in entry:
+            values = entry[key]
+            if not isinstance(values, list) or len(values) != 3:
+                raise MeshError(f"{where}: {key} must be three numbers, got {values!r}")
+            triples[key] = tuple(_finite(value, f"{where}: {key}") for value in values)
+    centre = entry.get("centre", True)
+    if not isinstance(centre, bool):
+        raise MeshError(f"{where}: centre must be true or false, got {centre!r}")
+    return replace(base, centre=centre, **triples)
+
+
+def _finite(value: object, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise MeshError(f"{where} must be a number, got {value!r}")
+    return float(value)

@@ -1,0 +1,245 @@
+"""Bottles and sprayers: lofted or turned bodies with closures. Drawn upright in millimetres at their real size."""
+
+import numpy as np
+
+from fpp_ml_bench.loaders.render.objects.solids import (
+    SEGMENTS,
+    Point2,
+    Solid,
+    block,
+    cut,
+    disc,
+    embossed,
+    facing,
+    lathe,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    softened,
+    text_section,
+    union,
+    wrapped,
+)
+from fpp_ml_bench.loaders.render.objects.sweeps import curve, loft, tube
+
+
+def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
+    """Screw cap standing on z = 0 with vertical grips."""
+    angle = 2 * np.pi * np.arange(ribs) / ribs
+    grips = [
+        rod((radius * c, radius * s, 1.5), (radius * c, radius * s, height - 2.5), 0.07 * radius)
+        for c, s in zip(np.cos(angle).tolist(), np.sin(angle).tolist(), strict=True)
+    ]
+    return union(lathe([(radius, 0), (radius, height - 2), (radius - 2, height)]), *grips)
+
+
+def mustard_bottle() -> Solid:
+    """Oval squeeze bottle, 96 x 58 x 190 mm, with a pointed nozzle."""
+    body = loft(
+        [(0, 84, 46, 2.6), (3, 92, 55, 2.6), (10, 95, 58, 2.6), (60, 95, 58, 2.6), (112, 94, 57, 2.5),
+         (132, 84, 53, 2.4), (146, 62, 46, 2.2), (153, 46, 42, 2.0), (155, 42, 41, 2.0)], smooth=8,
+    )  # fmt: skip
+    closure = lathe(
+        np.concatenate(
+            [[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]
+        ),
+    )
+    grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
+    panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
+    words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
+    return place(union(body, closure, panel, embossed(body, words, 2.2), *grips), turn=(0, 0, 30))
+
+
+def bleach_cleanser() -> Solid:
+    """Cleanser bottle, 98 x 66 x 250 mm: square shoulders, a waist to hold it by and a ribbed cap."""
+    body = loft(
+        [(0, 88, 54, 4), (3, 96, 64, 4), (10, 98, 66, 4), (90, 98, 66, 4), (112, 93, 60, 3.6), (135, 86, 54, 3.2),
+         (158, 86, 54, 3.0), (178, 84, 52, 2.8), (194, 70, 46, 2.4), (206, 46, 38, 2.0), (212, 36, 35, 2)], smooth=8,
+    )  # fmt: skip
+    neck = rod((0, 0, 205), (0, 0, 222), 16)
+    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
+    words = text_section("BLEACH", 74).translate((0, 70))
+    for width, height in ((76, 50), (60, 40), (66, 30)):
+        words = words + rectangle(width, 2.6, 0, (0, height))
+    return place(union(body, neck, cap, embossed(body, words, 1.5)), turn=(0, 0, 30))
+
+
+def container_bottle() -> Solid:
+    """Canister with a handle through its shoulder, 170 x 105 x 280 mm, and a wide screw cap."""
+    body = loft(
+        [(0, 152, 90, 3.4), (4, 164, 101, 3.4), (12, 168, 105, 3.4), (120, 168, 105, 3.4), (165, 166, 102, 3.2),
+         (205, 152, 92, 2.8), (232, 118, 78, 2.4), (248, 76, 62, 2.1), (254, 58, 56, 2), (262, 56, 56, 2)], smooth=8,
+    )  # fmt: skip
+    hole = place(tube(curve([(-90, 46, 205), (0, 46, 205), (90, 46, 205)], 2), 15.0, 2.1), (0, 0, -18))
+    thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
+    cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
+    panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
+    marks = (
+        text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70)) + rectangle(60, 7, 3, (-19, 48))
+    )
+    for step in range(7):
+        marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
+    drained = cut(union(body, panel, embossed(body, marks, 2.4)), hole, *thinner)
+    return place(union(drained, cap), turn=(0, -3, -6))
+
+
+def spray_bottle() -> Solid:
+    """Trigger sprayer, 78 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
+    body = lathe(
+        np.concatenate([
+            [(31, 0), (37, 1)],
+            curve([(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
+            [(14.5, 205)],
+        ])
+    )  # fmt: skip
+    collar = ribbed_cap(19, 20, 30).translate((0, 0, 196))
+    head = polygon(
+        [
+            (-18, 214),
+            (18, 214),
+            (20, 226),
+            (34, 236),
+            (36, 262),
+            (20, 275),
+            (-34, 275),
+            (-62, 266),
+            (-64, 248),
+            (-20, 244),
+        ],
+        3,
+    )
+    trigger = plate(
+        polygon(np.concatenate([
+            curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
+            curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
+        ])), 13, 0)  # fmt: skip
+    nozzle = facing(
+        union(
+            rod((-60, 257, 0), (-72, 257, 0), 11),
+            block(8, 24, 24, 1, (-74, 257, 0)),
+            rod((-76, 257, 0), (-80, 257, 0), 5),
+        )
+    )
+    grip = [ring(39.2, 0.9, z) for z in (16, 22, 28)]
+    words = wrapped(text_section("SPRAY", 56), 38.8, 74, 1.3)
+    return place(union(body, collar, facing(plate(head, 19)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
+
+
+def vial() -> Solid:
+    """Medicine vial, 24 x 58 mm: round shoulder, crimped cap over a rubber stopper, a label."""
+    glass = lathe([(10.5, 0), (12, 1.5), (12, 36), (11.3, 39), (9, 42), (7, 44), (6.6, 46), (6.6, 51)], 0.8)
+    crimp = lathe([(8.5, 49), (9.4, 50), (9.4, 57), (8.6, 58.2)])
+    stopper = union(lathe([(6, 57), (6, 59.4), (5, 60.2)]), ring(7.4, 0.5, 58.2))
+    label = wrapped(rectangle(62, 22), 12, 20, 0.25)
+    words = wrapped(text_section("VIAL", 16), 12.2, 25, 0.35)
+    lines = [wrapped(rectangle(15, 1.1), 12.2, z, 0.3) for z in (18.5, 15.5, 12.5)]
+    return union(glass, crimp, stopper, label, words, *lines)
+
+
+def cork() -> Solid:
+    """Tapered stopper, 34 mm wide, with lenticels and pits."""
+    body = lathe([(11.5, 0), (12.6, 1.2), (16.2, 40.6), (15.2, 42)], segments=SEGMENTS)
+    pits = []
+    for k in range(90):
+        angle, z = 2.39996 * k, 2.5 + 36.5 * ((k * 0.4142136) % 1.0)
+        radius = 12.7 + 0.09 * z
+        long = 0.6 + 1.9 * ((k * 0.7320508) % 1.0)
+        start = (radius * float(np.cos(angle)), radius * float(np.sin(angle)), z)
+        side = angle + 0.09 * long
+        end = (radius * float(np.cos(side)), radius * float(np.sin(side)), z + 0.4)
+        pits.append(rod(start, end, 0.4, 0.75, rounded=True))
+    holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
+    split = block(10, 0.8, 14, 0, (-14, 4, 36))
+    return place(cut(body, *pits, *holes, split), turn=(0, -2, 0))
+
+
+def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid:
+    """Can body with a seamed rim at both ends, a sunk lid and raised ribs at the heights given."""
+    rim = radius + 1.4
+    wall: list[Point2] = [(rim - 1, 0), (rim, 0.8), (rim, 2.6), (radius, 3.6)]
+    for z in ribs:
+        wall += [(radius, z - 1.8), (radius + 0.9, z - 0.6), (radius + 0.9, z + 0.6), (radius, z + 1.8)]
+    wall += [(radius, height - 3.6), (rim, height - 2.6), (rim, height - 0.8), (rim - 1, height)]
+    sunk_lid = rod((0, 0, height - 3), (0, 0, height + 1), radius - 1.2)
+    return cut(lathe(wall), sunk_lid)
+
+
+def _pull_tab(scale: float = 1.0) -> Solid:
+    """Ring-pull lying on z = 0, its rivet at the origin and its ring towards -x."""
+    tab = (rectangle(22, 15, 7.4, (-9, 0)) - softened(rectangle(10, 9, 4.4, (-13, 0)), 1)).scale((scale, scale))
+    return union(plate(tab, 1.6).translate((0, 0, 1.2)), rod((0, 0, -1), (0, 0, 2.6), 3.0 * scale))
+
+
+def _around(count: int) -> list[Point2]:
+    """Unit vectors at ``count`` equal steps round the axis."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return [(float(c), float(s)) for c, s in zip(np.cos(angle), np.sin(angle), strict=True)]
+
+
+def master_chef_can() -> Solid:
+    """Coffee can, 102 x 139 mm, with an overhanging plastic lid and its name on a label that does not quite close."""
+    body = _rimmed(50, 132)
+    lid = cut(
+        lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]),
+        rod((0, 0, 137), (0, 0, 141), 46),
+    )
+    label = wrapped(rectangle(292, 112), 50, 65, 0.6)
+    name = union(
+        wrapped(text_section("MASTER", 76), 50.6, 92, 1.0),
+        wrapped(text_section("CHEF", 58), 50.6, 70, 1.0),
+        wrapped(disc(17), 50.6, 36, 1.0),
+    )
+    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in _around(60)]
+    return union(body, lid, label, name, *grips)
+
+
+def tomato_soup_can() -> Solid:
+    """Soup can, 66 x 101 mm, with ring-pull, two ribs and a label."""
+    body = _rimmed(32.5, 101, ribs=(10, 91))
+    label = wrapped(rectangle(188, 68), 32.5, 50.5, 0.5)
+    name = union(
+        wrapped(text_section("TOMATO", 62), 33, 66, 0.9),
+        wrapped(text_section("SOUP", 50), 33, 48, 0.9),
+        wrapped(disc(8), 33, 29, 1.0),
+    )
+    return union(body, label, name, _pull_tab().translate((-8, 0, 98)))
+
+
+def tuna_fish_can() -> Solid:
+    """Flat can, 85 x 33 mm, tipped to show its lid with the ring-pull and steps."""
+    body = _rimmed(42, 33, ribs=(9, 24))
+    steps = union(ring(36, 1.3, 30), ring(30, 1.0, 30))
+    name = wrapped(text_section("TUNA", 40), 42, 16.5, 1.0)
+    fish_body = plate(disc(10).scale((1.5, 0.75)) + rectangle(9, 9).rotate(45).translate((17, 0)), 2)
+    fish = place(fish_body, (12, 0, 30), (0, 0, 90))
+    return place(union(body, steps, name, fish, _pull_tab(1.2).translate((-14, 0, 30))), turn=(0, -48, 0))
+
+
+def potted_meat_can() -> Solid:
+    """Rectangular meat tin with round corners, 97 x 50 x 82 mm, a sunk lid with ring-pull."""
+    outline = 5.0
+    rows = [
+        (0, 95, 48, outline), (1, 97.5, 50.5, outline), (3, 97.5, 50.5, outline), (4, 95, 48, outline),
+        (78, 95, 48, outline), (79, 97.5, 50.5, outline), (81, 97.5, 50.5, outline), (82, 95, 48, outline),
+    ]  # fmt: skip
+    lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
+    body = loft(rows)
+    label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
+    words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
+    tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
+    return place(union(cut(body, lid), label, embossed(body, words, 1.8), tab), turn=(0, 0, 2))
+
+
+def container_tin() -> Solid:
+    """Kitchen canister, 110 x 158 mm: rolled seams, an overlapping domed lid with a knob, a label plate."""
+    body = lathe([(53, 0), (54.4, 0.8), (54.4, 2.6), (53, 3.6), (53, 112)])
+    dome = curve([(54.6, 122), (52, 127), (40, 132), (22, 135), (7, 136)])
+    lid = lathe(np.concatenate([[(54.0, 104.0), (55.4, 104.6), (55.4, 106.4), (54.6, 107.4)], dome, [(5.0, 140.0)]]))
+    knob = lathe(curve([(5, 138), (7, 143), (11, 147), (12.5, 152), (9, 157), (1, 158.6)]))
+    beads = [ring(53, 1.2, z) for z in (14, 96)]
+    plaque = wrapped(rectangle(74, 44, 8), 53, 56, 1.0)
+    name = wrapped(text_section("TEA", 52), 54, 56, 1.3)
+    return union(body, lid, knob, plaque, name, *beads)

@@ -1,0 +1,175 @@
+"""Hollow ware and round household things: bowl, mug, pitcher, bucket, candles, tape, banana. Millimetres, real size."""
+
+import numpy as np
+
+from fpp_ml_bench.loaders.render.objects.solids import (
+    SMALL_SEGMENTS,
+    Solid,
+    ball,
+    block,
+    cut,
+    lathe,
+    place,
+    rectangle,
+    ring,
+    rod,
+    stroke,
+    text_section,
+    union,
+    vessel,
+    wrapped,
+)
+from fpp_ml_bench.loaders.render.objects.sweeps import curve, skin, tube
+
+
+def bowl() -> Solid:
+    """Bowl, 160 x 60 mm, with foot, rolled rim and two turned lines inside, tipped so that its hollow is seen."""
+    outside = curve([(30, 5), (50, 11), (66, 24), (76, 42), (80, 60)])
+    profile = np.concatenate([[(27.0, 0.0), (30.0, 0.0)], outside])
+    body = vessel(profile, 3.2, 0.6)
+    lines = [ring(r, 0.7, z) for r, z in ((73.6, 44), (70.4, 37.5))]
+    return place(union(body, ring(79.2, 2.4, 59.5), *lines), turn=(0, -50, 0))
+
+
+def mug() -> Solid:
+    """Mug, 82 x 92 mm and its handle, tipped a little to show the hollow."""
+    body = vessel([(35, 0), (38, 1.5), (40.5, 10), (41, 40), (41, 92)], 3.6, 1.2)
+    ear = curve([(0, -38, 76), (0, -52, 79), (0, -66, 68), (0, -69, 50), (0, -62, 32), (0, -50, 22), (0, -37, 19)])
+    handle = tube(ear, 5.2, flatten=1.35, up=(1, 0, 0))
+    badge = wrapped(stroke([(-16, 8), (-8, 18), (0, 10), (8, 18), (16, 8), (0, -14), (-16, 8)], 3.4), 41, 46, 1.2)
+    solid = cut(union(body, handle), rod((0, 0, 4.5), (0, 0, 88), 37.3))
+    return place(union(solid, badge, ring(39.5, 1.7, 91.5)), turn=(0, -30, 0))
+
+
+def pitcher() -> Solid:
+    """Pitcher, 130 x 240 mm: tapered, with a pulled spout, a big handle and ridges round its foot."""
+    profile = np.concatenate([[(44.0, 0.0)], curve([(48, 2), (52, 60), (57, 130), (60, 190), (62, 238)])])
+    wall = 3.4
+    body = vessel(profile, wall, 1.0)
+    lip, throat = _spout(0.0), _spout(wall)
+    bore = lathe([(44, 6), (48.4, 60), (53.4, 130), (56.4, 190), (58.5, 250)])
+    ear = curve(
+        [(0, -56, 214), (0, -78, 222), (0, -104, 206), (0, -110, 160), (0, -98, 104), (0, -74, 66), (0, -50, 56)]
+    )
+    handle = tube(ear, 8.0, flatten=1.4, up=(1, 0, 0))
+    ridges = [ring(r, 1.3, z) for r, z in ((48.6, 10), (49.2, 17), (49.8, 24), (61.4, 222))]
+    marks = [
+        wrapped(rectangle(14 if k % 2 else 26, 2.4), 48.6 + 0.062 * z, z, 1.4, 24)
+        for k, z in enumerate(range(50, 200, 20))
+    ]
+    shell = cut(union(body, lip, handle, *ridges, *marks), throat, bore)
+    return place(shell, turn=(0, -10, 0))
+
+
+def _spout(inset: float) -> Solid:
+    """Beak of the pitcher towards +y; drawn ``inset`` mm smaller on every side it is its channel."""
+    rim = 238.0 + (12 if inset else 0)
+    outline = [
+        (0, 90 - 2 * inset, rim),
+        (-30 + inset, 44, rim),
+        (30 - inset, 44, rim),
+        (0, 55 - inset, 176 + 2 * inset),
+        (-18, 30, rim),
+        (18, 30, rim),
+    ]
+    return Solid.batch_hull([ball(2.5, point) for point in outline]).trim_by_plane((0, 0, -1), -rim)
+
+
+def cleaning_bucket() -> Solid:
+    """Pail, 280 x 250 mm, with bands, ears, and a bail handle with its grip, tipped to show the inside."""
+    body = vessel([(98, 0), (102, 2), (138, 250)], 3.5, 1.2)
+    bands = [ring(137.5, 4, 248), ring(135.2, 2.5, 232), ring(104, 2.5, 18), ring(105.5, 2.0, 28)]
+    ears = [rod((0, s * 130, 236), (0, s * 146, 236), 13, 10) for s in (-1, 1)]
+    angle = np.linspace(0, np.pi, 41)
+    bow = np.stack([-118 * np.sin(angle), 146 * np.cos(angle), 236 + 78 * np.sin(angle)], axis=1)
+    bail = tube(bow, 3.6, up=(1, 0, 1))
+    grip = rod((-118, -46, 312), (-118, 46, 312), 11)
+    words = wrapped(text_section("CLEAN", 150), 120, 130, 2.0)
+    rivets = [ball(4.5, (0, s * 147, 236)) for s in (-1, 1)]
+    solid = cut(union(body, *bands, *ears), rod((0, 0, 8), (0, 0, 252), 97.5, 134.2))
+    return place(union(solid, bail, grip, words, *rivets), turn=(0, -20, 0))
+
+
+def lighting_candles() -> Solid:
+    """Five burning candles of different height and girth, in cups on a narrow holder 250 mm long."""
+    holder = union(block(34, 250, 12, 3, (0, 0, 6)), *(block(44, 14, 8, 2, (0, s * 84, 4)) for s in (-1, 1)))
+    stands = ((-98, 20, 118), (-53, 22, 182), (0, 26, 226), (52, 23, 160), (98, 19, 92))
+    cups = [lathe([(16, 8), (radius + 2, 12), (radius + 3, 26)]).translate((0, y, 0)) for y, radius, _ in stands]
+    return union(holder, *cups, *(_candle(radius, height).translate((0, y, 10)) for y, radius, height in stands))
+
+
+def _candle(radius: float, height: float) -> Solid:
+    """Candle with a molten pool, runs of wax, a wick and a flame."""
+    body = cut(
+        lathe([(radius, 0), (radius, height - 1), (radius - 1, height)], segments=96),
+        lathe([(radius - 7, height - 7), (radius - 3, height - 2), (radius - 3, height + 4)], segments=96),
+    )
+    runs = []
+    for k in range(5):
+        angle = 1.11 + 1.31 * k + 0.03 * height
+        x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
+        runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
+    wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
+    flame_side = curve(
+        [(0.6, height + 4), (4.5, height + 8), (6.6, height + 15), (4.6, height + 25), (0.6, height + 38)], 6
+    )
+    return union(body, *runs, wick, lathe(flame_side, segments=SMALL_SEGMENTS))
+
+
+def duct_tape() -> Solid:
+    """Roll of tape, 128 x 50 mm, on a cardboard core, its end lifted; stood on edge with the hole to the viewer."""
+    turns = lathe([(64, 0), (64, 50)], 0.6)
+    core = cut(rod((0, 0, -0.6), (0, 0, 50.6), 41), rod((0, 0, -2), (0, 0, 53), 38))
+    windings = [
+        cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r))
+        for r in range(45, 63, 4)
+        for z in (-0.7, 49.1)
+    ]
+    bent = np.linspace(-1.4, 0.15, 24)
+    lifted = np.stack(
+        [
+            (64.0 + 30 * np.clip(bent - -0.5, 0, 1) ** 2) * np.cos(bent),
+            (64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2) * np.sin(bent),
+        ],
+        axis=1,
+    )
+    end = stroke(lifted, 1.4).extrude(50)
+    roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
+    return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 16)).rotate((0, -5, 0))
+
+
+def banana() -> Solid:
+    """Banana, about 190 mm along its bend: five blunt edges, a stalk and a dark tip."""
+    bend = np.linspace(np.radians(-38), np.radians(46), 61)
+    radius = 112.0
+    path = np.stack([np.zeros_like(bend), radius * np.sin(bend), -radius * np.cos(bend)], axis=1)
+    along = np.linspace(0, 1, len(bend))
+    knots = curve(
+        [
+            (0, 4.2),
+            (0.03, 6.0),
+            (0.09, 11.5),
+            (0.22, 16.4),
+            (0.45, 18.4),
+            (0.66, 16.6),
+            (0.8, 11.5),
+            (0.88, 6.2),
+            (0.95, 4.4),
+            (1.0, 5.4),
+        ]
+    )
+    girth = np.interp(along, knots[:, 0], knots[:, 1])
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    across = np.broadcast_to(np.array([1.0, 0.0, 0.0]), path.shape)
+    above = np.cross(tangent, across)
+    angle = 2 * np.pi * np.arange(80) / 80
+    edges = 1 + 0.055 * np.cos(5 * angle + 0.6)
+    reach = girth[:, None] * edges[None, :]
+    rings = (
+        path[:, None, :]
+        + (reach * np.cos(angle))[:, :, None] * across[:, None, :]
+        + (reach * np.sin(angle))[:, :, None] * above[:, None, :]
+    )
+    tip = rod(tuple(path[0]), tuple(path[0] + 0.6 * (path[0] - path[2])), 3.4, 2.8)
+    return place(union(skin(rings), tip), turn=(32, 0, 0)).rotate((0, 4, 4))

@@ -1,0 +1,156 @@
+"""Which pixel sees which triangle of an object, the exact depth and normal there, and what lies in shadow.
+
+The camera's rays go through a depth buffer over the pixels' own rays, lens distortion included; any other ray through a
+box tree. All of it is float64 (`fpp_ml_bench.loaders.render.raycast_kernels`).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.optics import Pinhole
+
+SLACK = 1e-9
+"""Boxes are widened by this, in m or normalised units: far above float64's rounding, far below a pixel."""
+_SHADOW_OFFSET_M = 1e-4
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Pixels that see the object: flat ``pixels`` int64 (n,) ascending, ``depth_m`` float64 (n,), ``normals`` float64
+    (n, 3), unit vectors turned toward the camera, so that a mesh with flipped triangles shades like one without."""
+
+    pixels: NDArray[np.int64]
+    depth_m: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+
+class PixelRays:
+    """The rays of an image: ``x`` and ``y`` float64 (H, W), undistorted normalised coordinates; NaN where there is no
+    ray.
+
+    ``columns`` float64 (2, W) bounds them: the greatest x up to each column, and the least x from it on. ``rows``
+    (2, H) does the same for y.
+    """
+
+    def __init__(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        self.x, self.y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+        self.columns, self.rows = _bounds(self.x, 0), _bounds(self.y, 1)
+
+    @classmethod
+    def of(cls, camera: Pinhole) -> "PixelRays":
+        """The rays of a camera; those of the two latest cameras are kept."""
+        return _camera_rays(camera)
+
+
+@lru_cache(maxsize=2)
+def _camera_rays(camera: Pinhole) -> PixelRays:
+    return PixelRays(*camera.rays())
+
+
+def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    greatest = np.where(np.isnan(rays), -np.inf, rays).max(axis=axis)
+    least = np.where(np.isnan(rays), np.inf, rays).min(axis=axis)
+    return np.stack([np.maximum.accumulate(greatest), np.minimum.accumulate(least[::-1])[::-1]])
+
+
+class TracedObject:
+    """One placed object, ready for rays: ``vertices_m`` (V, 3) in camera coordinates."""
+
+    def __init__(self, mesh: SolidMesh, vertices_m: NDArray[np.float64]) -> None:
+        corners = vertices_m[mesh.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.sqrt(normals[:, 0] ** 2 + normals[:, 1] ** 2 + normals[:, 2] ** 2)
+        solid = lengths > 0
+        if not solid.any():
+            raise MeshError(f"object {mesh.name!r} has no triangle with an area")
+        self._corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
+        self._normals = normals[solid] / lengths[solid, None]
+        self._offsets = _dot(self._normals, self._corners[:, 0])
+        self._vertices_m = vertices_m
+
+    def primary(self, rays: PixelRays) -> Hits:
+        """What the camera's rays meet first."""
+        from fpp_ml_bench.loaders.render.raycast_kernels import rasterise
+
+        window = self._window(rays)
+        (top, bottom), (left, right) = window
+        shape = (max(bottom - top, 0), max(right - left, 0))
+        depth_m, triangle = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int32)
+        if triangle.size:
+            rasterise(
+                self._corners, self._normals, self._offsets, rays.x, rays.y, rays.columns, rays.rows, left, top,
+                depth_m, triangle,
+            )  # fmt: skip
+        row, column = np.nonzero(triangle >= 0)
+        seen = triangle[row, column]
+        row, column = row + top, column + left
+        normals = self._normals[seen]
+        facing = normals[:, 0] * rays.x[row, column] + normals[:, 1] * rays.y[row, column] + normals[:, 2]
+        return Hits(
+            pixels=row * rays.x.shape[1] + column,
+            depth_m=depth_m[row - top, column - left],
+            normals=np.where((facing > 0)[:, None], -normals, normals),
+        )
+
+    def _window(self, rays: PixelRays) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First row and column, and those behind the last, of the box that the object can cover in the image."""
+        z = self._corners[..., 2]
+        if z.min() <= 0:
+            return (0, rays.x.shape[0]), (0, rays.x.shape[1])
+        spans = []
+        for bounds, across in ((rays.rows, self._corners[..., 1] / z), (rays.columns, self._corners[..., 0] / z)):
+            first = np.searchsorted(bounds[0], across.min() - SLACK, "left")
+            behind = np.searchsorted(bounds[1], across.max() + SLACK, "right")
+            spans.append((int(first), int(behind)))
+        return spans[0], spans[1]
+
+    def may_shadow(self, from_light_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points the object can hide from the light at ``light_m`` (3,); bool (n,).
+
+        ``from_light_m`` float64 (3, n): from the light to each point, along the camera's axes. Points outside the
+        object's bounding box as the light sees it lie on lines that miss the object.
+        """
+        x, y, z = from_light_m
+        around = self._vertices_m - light_m
+        if around[:, 2].min() <= 0:
+            return np.ones(z.size, dtype=bool)
+        possible = z > 0
+        for along, across in ((x, around[:, 0] / around[:, 2]), (y, around[:, 1] / around[:, 2])):
+            possible &= (along >= (across.min() - SLACK) * z) & (along <= (across.max() + SLACK) * z)
+        return possible
+
+    def shadowed(self, points_m: NDArray[np.float64], light_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which surface points (n, 3) the object itself hides from the light at ``light_m`` (3,); bool (n,)."""
+        toward = light_m - points_m
+        lengths = np.sqrt(toward[:, 0] ** 2 + toward[:, 1] ** 2 + toward[:, 2] ** 2)
+        origins = points_m + toward * (_SHADOW_OFFSET_M / lengths)[:, None]
+        return self.blocked(origins, np.broadcast_to(light_m, points_m.shape))
+
+    def blocked(self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether the object lies between each origin and its target, both (n, 3) in camera coordinates; bool (n,)."""
+        from fpp_ml_bench.loaders.render.raycast_kernels import any_hit
+
+        blocked = np.zeros(len(origins_m), dtype=bool)
+        any_hit(*self._tree, origins_m, targets_m, blocked)
+        return blocked
+
+    @cached_property
+    def _tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Triangles in the order of a box tree, where its leaves start, and its boxes."""
+        from fpp_ml_bench.loaders.render.raycast_kernels import LEAF, build_tree
+
+        count = len(self._corners)
+        leaves = 1 << (-(-count // LEAF) - 1).bit_length()
+        order, starts, boxes = np.empty(count, np.int64), np.empty(leaves + 1, np.int64), np.empty((2 * leaves, 6))
+        build_tree(self._corners, order, starts, boxes)
+        return self._corners[order], starts, boxes
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Dot products of rows (n, 3), added in order: `einsum` may fuse multiplications and additions."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]

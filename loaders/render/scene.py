@@ -1,0 +1,108 @@
+"""Where things stand: an object on its turning axis in front of the camera, at a fixed or a drawn distance.
+
+Object coordinates are metres with z up and the turning axis as z. Camera coordinates are the rig's: x right, y down,
+z forward. At angle 0 the object's +x axis points away from the camera (paper Section 3.1: R_z(60 degrees x i)).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.sensor import uniform
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+
+PlacementRule = Literal["fixed", "varied"]
+PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
+
+_MARGIN_PX = 2.0
+
+
+@dataclass(frozen=True)
+class SolidMesh:
+    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3)."""
+
+    name: str
+    vertices_m: NDArray[np.float64]
+    faces: NDArray[np.int32]
+
+
+def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """Vertices after R_z(degrees), along the camera's axes but still about the turning axis; (V, 3) metres."""
+    cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
+    x = cosine * vertices_m[:, 0] - sine * vertices_m[:, 1]
+    y = sine * vertices_m[:, 0] + cosine * vertices_m[:, 1]
+    return np.column_stack([-y, -vertices_m[:, 2], x])
+
+
+def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[float, float]:
+    """Nearest and farthest distance of the turning axis that keeps a turned object in range and inside the image.
+
+    ``about_axis_m`` (V, 3) from `turned`. The bounds may be crossed (near > far): then the object fits nowhere.
+    """
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    camera = rig.camera
+    left = (camera.cx - _MARGIN_PX) / camera.fx
+    right = (camera.width - 1 - camera.cx - _MARGIN_PX) / camera.fx
+    top = (camera.cy - _MARGIN_PX) / camera.fy
+    bottom = (camera.height - 1 - camera.cy - _MARGIN_PX) / camera.fy
+    x, y, z = about_axis_m.T
+    needs = [near_m - z.min()]
+    for offset, low, high in ((x, left, right), (y, top, bottom)):
+        needs += [float(np.max(offset / high - z)), float(np.max(-offset / low - z))]
+    return float(max(needs)), float(far_m - z.max())
+
+
+def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) -> tuple[NDArray[np.float64], float]:
+    """Vertices in camera coordinates (V, 3) in metres, and the distance of the turning axis in metres.
+
+    ``fixed`` puts the axis at the rig's standoff; ``varied`` draws the distance, seeded by (seed, object, view), over
+    all that keeps the object within the working range and the image. Raises `MeshError` for an object that does not
+    fit, with the scale at which it would in every view.
+    """
+    about_axis_m = turned(mesh.vertices_m, VIEW_DEGREES[VIEWS.index(view)])
+    nearest_m, farthest_m = distance_bounds_m(about_axis_m, rig)
+    tolerance_m = 1e-9
+    if rule == "fixed":
+        distance_m = rig.standoff_m
+        fits = nearest_m - tolerance_m <= distance_m <= farthest_m + tolerance_m
+    else:
+        distance_m = nearest_m + (farthest_m - nearest_m) * uniform(seed, mesh.name, view, "distance")
+        fits = nearest_m <= farthest_m
+    if not fits:
+        raise MeshError(_misfit(mesh, view, rig, rule))
+    return about_axis_m + np.array([0.0, 0.0, distance_m]), distance_m
+
+
+def _misfit(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule) -> str:
+    size = " x ".join(f"{extent:.3f}" for extent in np.ptp(mesh.vertices_m, axis=0))
+    near_mm, far_mm = rig.working_range_mm
+    where = f"with its turning axis {rig.standoff_m} m from the camera" if rule == "fixed" else "at any distance"
+    scale = _largest_scale(mesh, rig, rule)
+    advice = f"scale it, offset included, by {scale:g} or less" if scale > 0 else "no scale makes it fit: move it"
+    return (
+        f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in "
+        f"view {view} {where}; {advice}, or give a rig with a wider range"
+    )
+
+
+def _largest_scale(mesh: SolidMesh, rig: Rig, rule: PlacementRule) -> float:
+    """Factor up to 1 at which the mesh fits in every view, rounded down to three digits; 0 if none does."""
+    views = [turned(mesh.vertices_m, degrees) for degrees in VIEW_DEGREES]
+
+    def fits(scale: float) -> bool:
+        bounds = (distance_bounds_m(about_axis_m * scale, rig) for about_axis_m in views)
+        return all(near <= (rig.standoff_m if rule == "fixed" else far) <= far for near, far in bounds)
+
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    if low < 1e-6:  # not even a point fits there
+        return 0.0
+    digit = 10.0 ** (np.floor(np.log10(low)) - 2)
+    return float(np.floor(low / digit) * digit)

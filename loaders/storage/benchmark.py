@@ -1,0 +1,73 @@
+"""The benchmarks that this package names: which bytes a preset must have, and whether a dataset folder has them.
+
+A result is only comparable with results on the same bytes. A benchmark therefore has a name, a version and a
+fingerprint (`Manifest.fingerprint`), the same on every processor. A change of the bytes is a new version.
+"""
+
+from dataclasses import dataclass
+
+from fpp_ml_bench.constants import FULL_SIZE, MINI_SIZE
+from fpp_ml_bench.loaders.render import preset_settings
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A named dataset: ``name``, ``version``, the SHA-256 ``fingerprint`` of its content (64 hex digits), and the
+    ``preset`` and image ``size`` in px that build it."""
+
+    name: str
+    version: int
+    preset: str
+    size: int
+    fingerprint: str
+
+    @property
+    def title(self) -> str:
+        """As it is printed: ``fpp-bench-full version 0``."""
+        return f"{self.name} version {self.version}"
+
+
+BENCHMARKS = (
+    Benchmark(
+        "fpp-bench-full", 0, "full", FULL_SIZE, "d46eed4271d91e8887863420ca08dff148db61abc135a24233d7757135d5683f"
+    ),
+    Benchmark("fpp-bench-full-224", 0, "full", 224, "052761fe170e60c8893e47b480265dd5727a4045bfb076077bc7eb8a0a1657a9"),
+    Benchmark(
+        "fpp-bench-mini", 0, "mini", MINI_SIZE, "0ba15100b657c8b0edfde78d1833ecefc0ebc42d219a96727f83fe604ba55440"
+    ),
+)
+"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
+
+
+def benchmark_of(fingerprint: str) -> Benchmark | None:
+    """The benchmark with this fingerprint; None for any other dataset."""
+    return next((benchmark for benchmark in BENCHMARKS if benchmark.fingerprint == fingerprint), None)
+
+
+def intended_benchmark(manifest: Manifest) -> Benchmark | None:
+    """The benchmark whose settings a dataset was built with, whatever its bytes are; None for settings of its own."""
+    if manifest.origin != GENERATED:
+        return None
+    content = (manifest.settings, manifest.rig, manifest.stored)
+    for benchmark in BENCHMARKS:
+        settings = preset_settings(benchmark.preset, benchmark.size)
+        if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
+            return benchmark
+    return None
+
+
+def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
+    """A sentence about what a dataset is; False beside it for a benchmark's settings with other bytes."""
+    fingerprint = manifest.fingerprint
+    benchmark = benchmark_of(fingerprint)
+    if benchmark is not None:
+        return True, f"this is {benchmark.title}"
+    intended = intended_benchmark(manifest)
+    if intended is None:
+        return True, "a dataset of its own, none of the named benchmarks: its scores compare only with scores on itself"
+    return False, (
+        f"built with the settings of {intended.title}, but not its bytes (fingerprint {fingerprint[:8]}, expected "
+        f"{intended.fingerprint[:8]}): its scores do not compare with that benchmark's. Build it again with this "
+        "version of the package; if it still differs, please report the processor and the package versions"
+    )

@@ -1,0 +1,279 @@
+"""Reading a dataset folder by memory map: views of single images without a copy; needs only NumPy and pyarrow.
+
+The evaluator, the classical method, the torch dataset and the pictures read datasets through this module.
+`fpp_ml_bench.load_dataset` opens the same files as a ``datasets.Dataset``.
+"""
+
+import ctypes
+import mmap
+import sys
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import SPLITS
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, available_configs, stored_groups
+from fpp_ml_bench.loaders.storage.manifest import Manifest, ShardFile, read_manifest
+from fpp_ml_bench.optics import Sequence
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from fpp_ml_bench.optics import Rig
+
+
+ALL_SPLITS = "all"
+
+
+class DatasetFolder:
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
+
+    Images are read-only memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker
+    processes map the files themselves.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._attach(Path(path), read_manifest(Path(path)))
+        for shard in self.manifest.shards:
+            file = self.path / shard.path
+            size = file.stat().st_size if file.is_file() else None
+            if size != shard.bytes:
+                found_size = "it is missing" if size is None else f"it has {size}"
+                raise DatasetError(
+                    f"{file}: expected {shard.bytes} bytes, {found_size}; build or copy the dataset again"
+                )
+
+    def _attach(self, path: Path, manifest: Manifest) -> None:
+        self.path = path
+        self.manifest = manifest
+        self._batches: dict[str, list[pa.RecordBatch]] = {}
+        self._images: dict[tuple[str, str], list[NDArray]] = {}
+        self._maps: dict[str, pa.Buffer] = {}
+
+    @classmethod
+    def unchecked(cls, path: Path, manifest: Manifest) -> "DatasetFolder":
+        """Open the folder even if some of its files are missing; for `fpp_ml_bench.loaders.storage.verification`."""
+        dataset = cls.__new__(cls)
+        dataset._attach(path, manifest)
+        return dataset
+
+    def forget(self, shard: ShardFile) -> None:
+        """Close the memory maps of a file."""
+        self._batches.pop(shard.path, None)
+        self._maps.pop(shard.path, None)
+        for key in [key for key in self._images if key[0] == shard.path]:
+            del self._images[key]
+
+    def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
+        return DatasetFolder, (self.path,)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the data's content, 64 hex digits."""
+        return self.manifest.fingerprint
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image height and width in px."""
+        return self.manifest.size
+
+    @cached_property
+    def rig(self) -> "Rig":
+        """The rig whose camera took the images."""
+        from fpp_ml_bench.optics import rig_from_dict
+
+        return rig_from_dict(self.manifest.rig)
+
+    @cached_property
+    def sequence(self) -> Sequence:
+        return Sequence(**self.manifest.rig["sequence"])
+
+    @property
+    def configs(self) -> tuple[str, ...]:
+        """Configurations whose frames are stored here."""
+        return available_configs(self.sequence, self.manifest.stored)
+
+    @property
+    def has_exact(self) -> bool:
+        """Whether the dataset has ``depth_exact`` (generated data; published data has decoded depth only)."""
+        return self.manifest.exact
+
+    @cached_property
+    def splits(self) -> dict[str, list[str]]:
+        """Sample names of each split in row order."""
+        return self.manifest.splits
+
+    @cached_property
+    def _position(self) -> dict[str, tuple[str, int]]:
+        return {sample: (split, row) for split, names in self.splits.items() for row, sample in enumerate(names)}
+
+    def samples(self, split: str) -> list[str]:
+        """Sample names of ``split``, or of every split in turn for ``all``. Raises `DatasetError` for other names."""
+        if split == ALL_SPLITS:
+            return [name for part in SPLITS for name in self.splits.get(part, [])]
+        if split not in self.splits:
+            raise DatasetError(f"{self.path}: no split {split!r}; there are {', '.join(self.splits)} and {ALL_SPLITS}")
+        return list(self.splits[split])
+
+    def split_of_sample(self, sample: str) -> str:
+        """Split that holds ``sample``. Raises `DatasetError` for an unknown sample."""
+        return self._find(sample)[0]
+
+    def measured(self, sample: str) -> dict:
+        """The builder's measurements of a sample: labels, cover, distance, and the ground-truth error if available."""
+        split, row = self._find(sample)
+        return self.manifest.samples[split][row]
+
+    def _find(self, sample: str) -> tuple[str, int]:
+        if sample not in self._position:
+            from difflib import get_close_matches
+
+            matches = get_close_matches(sample, self._position, n=3)
+            hint = f"; similar names: {', '.join(matches)}" if matches else ""
+            raise DatasetError(f"{self.path}: no sample {sample!r}{hint}")
+        return self._position[sample]
+
+    def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
+        """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` if stored."""
+        if column not in (DEPTH, DEPTH_EXACT):
+            raise DatasetError(f"unknown depth column {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
+        if column == DEPTH_EXACT and not self.has_exact:
+            raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
+        return self._image(sample, DATA_GROUP, column)
+
+    def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
+
+        The object is the same set of pixels for either column, the pixels with a decoded ``depth``: a surface that the
+        projector does not reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same
+        pixels.
+        """
+        depth_mm = self.depth_mm(sample)
+        if column == DEPTH:
+            return depth_mm
+        return np.where(object_mask(depth_mm), self.depth_mm(sample, column), np.float32(0))
+
+    def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
+        """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""
+        for group, frames in stored_groups(self.sequence, self.manifest.stored).items():
+            if index in frames:
+                return self._image(sample, group, self.sequence.frames[index].column)
+        raise DatasetError(
+            f"{self.path}: frame {index} is not stored here (configurations: {', '.join(self.configs)}); build with "
+            "--frames all"
+        )
+
+    def frames(self, sample: str, indices: "tuple[int, ...] | range | list[int]") -> list[NDArray[np.uint8]]:
+        """Several frames of a sample, each uint8 (H, W), in the order of ``indices``."""
+        return [self.frame(sample, index) for index in indices]
+
+    def release(self, sample: str) -> None:
+        """Release the memory of a sample's images that were read. Views of them stay valid.
+
+        Called after each sample of a split, it keeps the memory from growing with the number of samples.
+        """
+
+        split, row = self._find(sample)
+        for shard in self.manifest.shards:
+            mapped_file = self._maps.get(shard.path)
+            if mapped_file is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
+                continue
+            for column in self.record_batches(shard)[0].schema.names:
+                if (shard.path, column) in self._images:
+                    release_pages(self._row_of(shard, column, row), mapped_file.address, mapped_file.size)
+            if row - shard.first_row == shard.rows - 1:
+                self.forget(shard)  # pages between its images stay mapped as long as the file is
+
+    def _image(self, sample: str, group: str, column: str) -> NDArray:
+        split, row = self._find(sample)
+        return self._row_of(self._shard(split, group, row), column, row)
+
+    def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
+        """Image of row ``row`` of the split, from the file that holds it."""
+        row -= shard.first_row
+        for images in self.column_images(shard, column):
+            if row < len(images):
+                return images[row]
+            row -= len(images)
+        raise DatasetError(f"{self.path / shard.path}: fewer rows than its manifest says; run: fpp-bench verify")
+
+    def _shard(self, split: str, group: str, row: int) -> ShardFile:
+        for shard in self.manifest.shards:
+            if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
+                return shard
+        raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
+
+    def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
+        """Record batches of a file, memory-mapped."""
+        if shard.path not in self._batches:
+            import pyarrow as pa
+
+            path = self.path / shard.path
+            try:
+                memory_map = pa.memory_map(str(path), "r")
+                mapped_file = memory_map.read_buffer()
+                self._batches[shard.path] = list(pa.ipc.open_stream(mapped_file))
+                self._maps[shard.path] = mapped_file
+            except (pa.ArrowException, OSError) as error:
+                raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
+        return self._batches[shard.path]
+
+    def column_images(self, shard: ShardFile, column: str) -> list[NDArray]:
+        """A column of a file as images: a read-only view (rows, H, W) per record batch."""
+        key = shard.path, column
+        if key not in self._images:
+            try:
+                self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
+            except (ValueError, KeyError, AttributeError) as error:
+                height, width = self.size
+                raise DatasetError(
+                    f"{self.path / shard.path}: column {column} does not hold images of {height} x {width} px "
+                    f"({error}); run: fpp-bench verify"
+                ) from error
+        return self._images[key]
+
+    def _views(self, column: "pa.Array") -> NDArray:
+        storage = getattr(column, "storage", column)  # an Array2D extension where `datasets` has been imported
+        flat = storage.values.values
+        dtype = np.dtype(np.uint8 if flat.type.bit_width == 8 else np.float32)
+        # Not flat.to_numpy(): that imports pandas where it is installed, which takes longer than scoring a test split.
+        pixels = np.frombuffer(flat.buffers()[1], dtype, len(flat), flat.offset * dtype.itemsize)
+        return pixels.reshape(len(storage), *self.size)
+
+
+_MADV_DONTNEED = 4
+FAULT_AROUND_BYTES = 1 << 16
+"""A page fault on a file also maps the neighbouring pages, in aligned windows of this size (Linux's default)."""
+
+
+@cache
+def _madvise() -> Any:
+    if not sys.platform.startswith("linux"):
+        return None
+    function = getattr(ctypes.CDLL(None), "madvise", None)
+    if function is not None:
+        function.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+    return function
+
+
+def release_pages(view: NDArray[Any], address: int, size: int) -> None:
+    """Release the pages that contain ``view``, a contiguous array, and the pages mapped together with them.
+
+    ``address`` and ``size`` (bytes) are those of the whole READ-ONLY FILE map that contains ``view``. No page outside
+    is touched: on memory that is not backed by a file, the same call would erase the data. On systems other than Linux,
+    or for a view outside the map, this does nothing.
+    """
+    madvise = _madvise()
+    start = view.ctypes.data
+    stop = start + view.nbytes
+    if madvise is None or not view.nbytes or start < address or stop > address + size:
+        return
+    page = mmap.PAGESIZE
+    begin = max(start // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES, address // page * page)
+    end = min(-(-stop // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES, -(-(address + size) // page) * page)
+    madvise(begin, end - begin, _MADV_DONTNEED)

@@ -1,0 +1,192 @@
+"""Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or sample."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    LABELS,
+    RANGE,
+    arrow_schema,
+    group_columns,
+    stored_groups,
+)
+from fpp_ml_bench.loaders.storage.manifest import (
+    GENERATED,
+    MANIFEST,
+    Manifest,
+    ShardFile,
+    dataset_files,
+    file_hash,
+    read_manifest,
+)
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics import Sequence
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ImagePlaces = dict[str, list[tuple[str, str, str]]]
+"""Hash of an image -> where it stands: (split, sample, column)."""
+
+
+def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -> list[str]:
+    """Findings of a complete check of a dataset folder; an empty list means intact.
+
+    Checks: every file of the manifest is there with its checksum; no foreign file; every Arrow file holds the rows and
+    columns it should; labels and depth ranges agree with the images; depths are finite and not negative; no object is
+    in two splits, none lacks a view, the benchmark's own objects are in their split; no image appears in two splits.
+    Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file.
+    """
+    manifest = read_manifest(folder)
+    findings = foreign_files(folder, manifest)
+    places: ImagePlaces = {}
+    opened = None
+    for file in manifest.files:
+        damage = file_damage(folder, file.path, file.bytes, file.xxh3_128)
+        if damage:
+            findings.append(damage)
+        elif isinstance(file, ShardFile):
+            # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
+            opened = opened or DatasetFolder.unchecked(folder, manifest)
+            try:
+                findings += _shard_findings(opened, file, places)
+            except DatasetError as error:  # no Arrow file, or images of another size
+                findings.append(str(error))
+        progress(1)
+    return findings + coverage_findings(manifest) + split_findings(manifest) + duplicate_images(places)
+
+
+def foreign_files(folder: Path, manifest: Manifest) -> list[str]:
+    """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are not counted."""
+    listed = {MANIFEST, *(shard.path for shard in manifest.shards), *(other.path for other in manifest.others)}
+    return [
+        f"{path}: is not part of this dataset; remove it"
+        for path in dataset_files(folder)
+        if path.relative_to(folder).as_posix() not in listed and not path.name.startswith("cache-")
+    ]
+
+
+def file_damage(folder: Path, name: str, size: int, expected_hash: str) -> str | None:
+    """What is wrong with one file, or None."""
+    path = folder / name
+    if not path.is_file():
+        return f"{path}: is missing; copy or build the dataset again"
+    if path.stat().st_size != size:
+        return f"{path}: has {path.stat().st_size} bytes, expected {size}; copy or build the dataset again"
+    if file_hash(path) != expected_hash:
+        return f"{path}: its content has changed (checksum differs); copy or build the dataset again"
+    return None
+
+
+def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces) -> list[str]:
+    """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
+    import xxhash
+
+    path = opened.path / shard.path
+    manifest = opened.manifest
+    rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
+    frames = stored_groups(opened.sequence, manifest.stored).get(shard.group)
+    if frames is None or len(rows) != shard.rows:
+        return [f"{path}: the manifest has no such rows or columns"]
+    expected = group_columns(opened.sequence, shard.group, frames, manifest.exact)
+    batches = opened.record_batches(shard)
+    right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
+    if not right or sum(len(b) for b in batches) != shard.rows:
+        return [f"{path}: its rows or columns are not those the manifest says"]
+    findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
+    for column in expected:
+        if not (column.startswith("frame_") or column in (DEPTH, DEPTH_EXACT)):
+            continue
+        images = (image for batch in opened.column_images(shard, column) for image in batch)
+        for row, image in zip(rows, images, strict=True):
+            if column in (DEPTH, DEPTH_EXACT):
+                findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
+            if image.min() != image.max():  # a uniform image (black without noise) says nothing about what it shows
+                digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image).data)
+                places.setdefault(digest, []).append((shard.split, row["sample"], column))
+    opened.forget(shard)
+    return findings
+
+
+def _types(schema: "pa.Schema") -> "list[tuple[str, pa.DataType]]":
+    """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
+    return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
+
+
+def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray[np.float32]) -> list[str]:
+    if not (np.isfinite(image).all() and image.min() >= 0):
+        return [f"{where}: depths that are not finite or negative"]
+    inside = image[object_mask(image)]
+    if inside.size == 0:
+        return [f"{where}: no depth above 0, so there is nothing to measure"]
+    if column == DEPTH and (inside.min(), inside.max()) != (row["depth_min_mm"], row["depth_max_mm"]):
+        return [f"{where}: depth_min and depth_max do not fit its depth"]
+    return []
+
+
+def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: "list[pa.RecordBatch]") -> list[str]:
+    findings = []
+    stored = [record for batch in batches for record in batch.select([*LABELS, *RANGE]).to_pylist()]
+    for row, labels in zip(rows, stored, strict=True):
+        expected = {"sample": row["sample"], "object": row["object"], "view": row["view"], "split": shard.split}
+        expected.update(zip(RANGE, (row["depth_min_mm"], row["depth_max_mm"]), strict=True))
+        if labels != expected:
+            findings.append(f"{path}: expected labels {expected}, found {labels}")
+    return findings
+
+
+def coverage_findings(manifest: Manifest) -> list[str]:
+    """Rows that no file holds, or more than one: every group's files must follow on from each other."""
+    findings = []
+    sequence = Sequence(**manifest.rig["sequence"])
+    for split, rows in manifest.samples.items():
+        for group in stored_groups(sequence, manifest.stored):
+            files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
+            held = [row for shard in files for row in range(shard.first_row, shard.first_row + shard.rows)]
+            if held != list(range(len(rows))):
+                findings.append(f"{split}, {group}: the files hold {len(held)} rows, expected each of {len(rows)} once")
+    return findings
+
+
+def split_findings(manifest: Manifest) -> list[str]:
+    """Rules of the split by object, checked on the manifest's rows."""
+    findings = []
+    home: dict[str, str] = {}
+    for split, rows in manifest.samples.items():
+        views: dict[str, list[str]] = {}
+        for row in rows:
+            views.setdefault(row["object"], []).append(row["view"])
+            if row["sample"] != sample_name(row["object"], row["view"]):
+                findings.append(
+                    f"sample {row['sample']!r} in {split}: said to be view {row['view']} of {row['object']!r}"
+                )
+        for name, seen in views.items():
+            if home.setdefault(name, split) != split:
+                findings.append(f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak")
+            if sorted(seen) != sorted(VIEWS):
+                findings.append(
+                    f"object {name!r} in {split}: expected the views {', '.join(VIEWS)}, found {', '.join(seen)}"
+                )
+            if manifest.origin == GENERATED and name in OBJECTS and split_of(name) != split:
+                findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
+    return findings
+
+
+def duplicate_images(places: ImagePlaces) -> list[str]:
+    """Images that stand in more than one split, by the hash of their pixels."""
+    findings = []
+    for copies in places.values():
+        if len({split for split, _, _ in copies}) > 1:
+            named = ", ".join(f"{split}/{sample} {column}" for split, sample, column in copies[:4])
+            findings.append(f"the same image stands in two splits: {named}")
+    return findings

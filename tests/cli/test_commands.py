@@ -1,0 +1,329 @@
+"""The command line: quick help, bad input without a traceback, output for machines and people."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from conftest import TINY_SIZE
+
+from fpp_ml_bench.cli import COMMANDS, evaluate, main
+from fpp_ml_bench.constants import VIEWS
+
+ROOT = Path(__file__).resolve().parents[2]
+HEAVY = ("numpy", "torch", "datasets", "pyarrow", "scipy", "cv2", "numba", "matplotlib", "pydantic", "yaml", "trimesh")
+
+
+def call(*arguments, command=main):
+    """Exit status of a command run in this process; unexpected errors are raised."""
+    try:
+        return command([str(a) for a in arguments])
+    except SystemExit as stop:
+        return 0 if stop.code is None else stop.code
+
+
+# ---- help
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "", "fpp-eval"])
+def test_help_answers_without_importing_anything_heavy(name):
+    code = (
+        "import sys\n"
+        "from fpp_ml_bench.cli import main\n"
+        f"words, name = sys.argv[1:], {name!r}\n"
+        "if name == 'fpp-eval':\n"
+        "    from fpp_ml_bench.cli.evaluate import main\n"
+        "try:\n"
+        "    status = main([*([name] if name in words else []), '--help'])\n"
+        "except SystemExit as stop:\n"
+        "    status = stop.code\n"
+        f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules], status)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, name], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.rstrip().endswith(("HEAVY [] 0", "HEAVY [] None")), done.stdout[-200:]
+    assert "usage:" in done.stdout and "examples:" in done.stdout
+    if name and name != "fpp-eval":
+        assert f"usage: fpp-bench {name}" in done.stdout
+    for line in done.stdout.splitlines():
+        assert len(line) <= 125
+
+
+def test_version_and_no_arguments(capsys):
+    assert call("--version") == 0
+    assert capsys.readouterr().out.startswith("fpp-ml-bench ")
+    assert call() == 2
+    assert "usage: fpp-bench" in capsys.readouterr().err
+
+
+def test_every_command_of_the_table_has_what_a_command_needs():
+    from importlib import import_module
+
+    for module, _ in COMMANDS.values():
+        command = import_module(f"fpp_ml_bench.cli.{module}")
+        assert command.SUMMARY and command.EXAMPLES and callable(command.run) and callable(command.add_arguments)
+
+
+def test_examples_in_the_help_are_accepted_by_their_parsers():
+    """All examples of all commands are parsed: the help shows no option that a command lacks."""
+    import shlex
+    from importlib import import_module
+
+    from fpp_ml_bench.cli import parser_for
+
+    for name, (module, _) in COMMANDS.items():
+        command = import_module(f"fpp_ml_bench.cli.{module}")
+        lines = [line for line in command.EXAMPLES if line.startswith("fpp-bench ")]
+        assert lines, name
+        for line in lines:
+            words = shlex.split(line.split("   ")[0].split(" && ")[0].split(" | ")[0])
+            assert words[1] in COMMANDS, line
+            if words[1] == name:
+                parser_for(command, "x").parse_args(words[2:])
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["bild"], "did you mean 'build'"),
+        (["xyz"], "unknown command 'xyz'"),
+        (["--bogus"], "unknown option '--bogus'"),
+        (["--bogus", "build"], "unknown option '--bogus'"),
+        (["build"], "OUT"),
+        (["build", "OUT", "--sise", "9"], "--sise"),
+        (["build", "OUT", "--size", "big"], "--size"),
+        (["build", "OUT", "--size", "0"], "1 to 8192"),
+        (["build", "OUT", "--size", "-5"], "1 to 8192"),
+        (["build", "OUT", "--size", "9000"], "1 to 8192"),
+        (["build", "OUT", "--size", "120"], "pitch of at least"),
+        (["build", "OUT", "--preset", "huge"], "--preset"),
+        (["build", "OUT", "--frames", "some"], "--frames"),
+        (["build", "OUT", "--placement", "random"], "--placement"),
+        (["build", "OUT", "--objects", "mugg"], "did you mean mug"),
+        (["build", "OUT", "--objects", ","], "name at least one"),
+        (["build", "OUT", "--objects", "mug,mug"], "named twice"),
+        (["build", "OUT", "--seed", "-1"], "seed -1"),
+        (["build", "OUT", "--seed", "1.5"], "--seed"),
+        (["build", "OUT", "--seed", "9" * 20], "seed 9999"),
+        (["build", "OUT", "--workers", "0"], "--workers 0"),
+        (["build", "OUT", "--workers", "two"], "--workers"),
+        (["build", "OUT", "--noise-sigma", "nan"], "noise of nan"),
+        (["build", "OUT", "--noise-sigma", "-1"], "noise of -1"),
+        (["build", "OUT", "--pitch", "nan"], "pitch"),
+        (["build", "OUT", "--pitch", "inf"], "pitch"),
+        (["build", "OUT", "--pitch", "0"], "pitch"),
+        (["build", "OUT", "--pitch", "3"], "pitch"),
+        (["build", "OUT", "--pitch", "5000"], "pitch"),
+        (["build", "OUT", "--rig", "none.yaml"], "none.yaml"),
+        (["build", "OUT", "--rig", "FILE.txt"], "FILE.txt"),
+        (["build", "OUT", "--mesh", "none.stl"], "none.stl"),
+        (["build", "OUT", "--meshes", "none.yaml"], "none.yaml"),
+        (["build", "FILE", "--objects", "mug"], "is a file"),
+        (["build", "FILE/inside", "--objects", "mug"], "FILE"),
+        (["info"], "DATASET"),
+        (["info", "OUT"], "no such folder"),
+        (["info", "."], "no manifest.json"),
+        (["verify", "OUT"], "no such folder"),
+        (["verify", "FILE"], "no such folder"),
+        (["show", "TINY"], "expected either a SAMPLE or --sheet"),
+        (["show", "TINY", "mug_A0", "--sheet"], "expected either a SAMPLE or --sheet"),
+        (["show", "TINY", "mug_A1", "--out", "x.png"], "similar names: mug_A"),
+        (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
+        (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
+        (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
+        (["show", "OUT", "mug_A0", "--out", "x.png"], "no such folder"),
+        (["predict", "magic", "TINY", "--out", "OUT"], "there are classical"),
+        (["predict", "classical", "TINY"], "--out"),
+        (["predict", "classical", "TINY", "--out", "OUT", "--split", "val"], "--split"),
+        (["predict", "classical", "TINY", "--out", "OUT", "--steps", "2"], "3 to the 18"),
+        (["predict", "classical", "TINY", "--out", "OUT", "--steps", "19"], "3 to the 18"),
+        (["predict", "classical", "TINY", "--out", "OUT", "--threads", "0"], "--threads 0"),
+        (["predict", "classical", "TINY", "--out", "OUT", "--direction", "up"], "--direction"),
+        (["predict", "classical", "TINY", "--out", "TINY"], "already holds"),
+        (["predict", "classical", "OUT", "--out", "OUT2"], "no such folder"),
+        (["train", "phase-net", "TINY", "--out", "OUT", "--unions", "-1"], "unions -1"),
+        (["train", "phase-net", "TINY", "--out", "OUT", "--rate", "nan"], "rate above 0"),
+        (["train", "phase-net", "TINY", "--out", "OUT", "--steps", "0"], "steps 0"),
+        (["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"], "--rate is an option of phase-net"),
+    ],
+)
+def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    for name in ("FILE", "FILE.txt"):
+        Path(name).write_text("x")
+    before = sorted(tmp_path.iterdir())
+    assert call(*[str(tiny) if a == "TINY" else a for a in arguments]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and "Traceback" not in captured.err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_unexpected_system_errors_are_messages(tiny, monkeypatch, capsys):
+    def fail(manifest):
+        raise PermissionError(13, "Permission denied", "/somewhere")
+
+    monkeypatch.setattr("fpp_ml_bench.loaders.storage.split_statistics", fail)
+    assert call("info", tiny) == 2
+    assert "Permission denied: '/somewhere'" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_130(tiny, monkeypatch, capsys):
+    def stop(manifest):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fpp_ml_bench.loaders.storage.split_statistics", stop)
+    assert call("info", tiny) == 130
+    assert "stopped" in capsys.readouterr().err
+
+
+def test_output_cut_off_by_its_reader_is_no_traceback(tiny):
+    program = "import sys; from fpp_ml_bench.cli import main; sys.exit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "info", str(tiny)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    error = process.stderr.read().decode()
+    process.stderr.close()
+    assert process.wait() in (0, 2) and "Traceback" not in error and "Exception ignored" not in error
+
+
+# ---- info
+
+
+def test_info_json_says_what_is_there(tiny, opened, capsys):
+    assert call("info", tiny, "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["fingerprint"] == opened.fingerprint and content["size"] == [TINY_SIZE, TINY_SIZE]
+    assert content["samples"] == opened.splits
+    on_disk = sum(p.stat().st_size for p in tiny.rglob("*") if p.is_file() and p.name != "manifest.json")
+    assert content["bytes"] == on_disk
+    assert content["rig"]["sequence"]["steps"] == 18
+    for split in content["splits"]:
+        names = opened.splits[split["split"]]
+        errors, covers = [], []
+        for sample in names:
+            depth, exact = (opened.depth_mm(sample, c).astype(np.float64) for c in ("depth", "depth_exact"))
+            decoded = (depth > 0) & (exact > 0)
+            errors.append(np.abs(depth - exact)[decoded].mean())
+            covers.append((depth > 0).mean())
+        assert split["samples"] == len(names)
+        assert split["gt_mae_mm"] == pytest.approx(np.mean(errors), rel=1e-9)
+        assert split["cover_mean"] == pytest.approx(np.mean(covers), rel=1e-9)
+        assert split["cover_max"] == pytest.approx(max(covers), rel=1e-9)
+        assert 0 < split["gt_interior_mae_mm"] < split["gt_mae_mm"] < 0.5
+
+
+def test_info_for_people(tiny, opened, capsys):
+    assert call("info", tiny) == 0
+    out = capsys.readouterr().out
+    for text in (
+        opened.fingerprint,
+        "baseline 160.1 mm",
+        "1500-2100 mm",
+        "ground-truth error",
+        "single_shot, horizontal",
+    ):
+        assert text in out
+
+
+# ---- show
+
+
+def test_show_writes_a_picture_of_the_sample(tiny, tmp_path, capsys):
+    for sample in ("bowl_A0", "power_drill_A60"):
+        assert call("show", tiny, sample, "--out", tmp_path / "new" / f"{sample}.png") == 0
+    pictures = [cv2.imread(str(tmp_path / "new" / f"{s}.png")) for s in ("bowl_A0", "power_drill_A60")]
+    for picture in pictures:
+        height, width = picture.shape[:2]
+        assert width > 1000 and height > 500
+        colour = picture.max(axis=2).astype(int) - picture.min(axis=2)
+        assert (colour > 40).mean() > 0.01  # depth maps are in colour
+        assert ((colour < 3) & (picture[..., 0] > 20) & (picture[..., 0] < 235)).mean() > 0.05  # frames are grey
+        assert (picture == 255).all(axis=2).mean() < 0.8
+    assert pictures[0].shape != pictures[1].shape or (pictures[0] != pictures[1]).mean() > 0.02
+
+
+def test_show_with_a_damaged_mesh_names_it(tiny, tmp_path, capsys):
+    folder = tmp_path / "copy"
+    shutil.copytree(tiny, folder)
+    (folder / "meshes" / "cork.ply").write_bytes(b"ply\nhalf")
+    assert call("show", folder, "cork_A0", "--out", tmp_path / "x.png") == 2
+    assert "cork.ply" in capsys.readouterr().err
+
+
+def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call("show", tiny, "cork_A0") == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["cork_A0.png"]
+
+
+def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
+    out, folder = tmp_path / "x.png", tmp_path / "set"
+    assert (
+        call("build", folder, "--size", TINY_SIZE, "--objects", "cork", "--frames", "single_shot", "--workers", 1) == 0
+    )
+    shutil.rmtree(folder / "meshes")
+    assert call("show", folder, "cork_A0", "--out", out) == 0
+    assert cv2.imread(str(out)) is not None
+    from dataclasses import replace
+
+    from fpp_ml_bench.optics import Sequence, paper_rig, save_rig
+
+    coarse = replace(paper_rig(TINY_SIZE), pitch_horizontal_px=1140, pitch_vertical_px=912, sequence=Sequence(3, 1, 1))
+    save_rig(coarse, tmp_path / "rig.yaml")
+    assert call("build", tmp_path / "few", "--rig", tmp_path / "rig.yaml", "--objects", "bowl", "--workers", 1) == 0
+    assert call("show", tmp_path / "few", "bowl_A0", "--out", tmp_path / "y.png") == 0
+
+
+def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
+    out = tmp_path / "sheet.png"
+    assert call("show", tiny, "--sheet", "--out", out) == 0
+    sheet = cv2.imread(str(out), cv2.IMREAD_GRAYSCALE)
+    tile, label = 120, 18
+    assert sheet.shape == (2 * (tile + label), 2 * 6 * tile + 8)
+    for number, name in enumerate(("bowl", "cork", "mug", "power_drill")):
+        for view_number, view in enumerate(VIEWS):
+            y, x = (number // 2) * (tile + label) + label, (number % 2) * (6 * tile + 8) + view_number * tile
+            shown = sheet[y : y + tile, x : x + tile].astype(float)
+            frame = cv2.resize(opened.frame(f"{name}_{view}", 51), (tile, tile), interpolation=cv2.INTER_AREA)
+            assert np.corrcoef(shown.ravel(), frame.astype(float).ravel())[0, 1] > 0.99
+
+
+# ---- the chain of commands in the README, with a user's mesh
+
+
+def test_build_predict_and_evaluate_with_a_users_mesh(tmp_path, capsys):
+    trimesh.creation.icosphere(3, 0.08).export(tmp_path / "ball.ply")
+    data, out = tmp_path / "data", tmp_path / "predictions"
+    assert call("build", data, "--mesh", tmp_path / "ball.ply", "--size", TINY_SIZE, "--workers", 1) == 0
+    assert "6 samples, 312 images" in capsys.readouterr().out
+    assert call("verify", data) == 0
+    assert call("predict", "classical", data, "--out", out, "--steps", 6, "--direction", "vertical") == 0
+    assert "next: fpp-eval" in capsys.readouterr().out
+    result = tmp_path / "result.json"
+    options = ("--dataset", data, "--split", "test", "--target", "depth_exact", "--json", result)
+    assert call(out, *options, command=evaluate.main) == 0
+    metrics = json.loads(result.read_text())["metrics"]
+    assert 0 < metrics["object_mae_mm"] < 5
+
+
+def test_commands_work_from_any_folder_in_a_process_of_their_own(tiny, tmp_path):
+    program = "import sys; from fpp_ml_bench.cli import main; sys.exit(main())"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", program, "verify", str(tiny)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "intact" in done.stdout

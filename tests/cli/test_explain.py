@@ -1,0 +1,141 @@
+"""``--explain`` counts agree with the data, and ``--no-skip`` changes no result."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from conftest import TINY_SIZE, file_bytes, tiny_settings
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.render import explain_build
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.skipping import SWITCH, Explanation, LeftOut, explained, saved_by, skipping
+
+PIXELS = TINY_SIZE**2
+
+
+@pytest.fixture(autouse=True)
+def _switch(monkeypatch):
+    monkeypatch.delenv(SWITCH, raising=False)
+
+
+def lines_of(path):
+    content = json.loads(path.read_text())
+    return content, {line["what"]: line for line in content["left_out"]}
+
+
+def test_the_account_adds_up_and_drops_lines_with_nothing_left_out():
+    rays = LeftOut("rays", "rays", 10, 30, None, 0.5, "a rule")
+    explanation = explained("build", "nothing", [rays, LeftOut("more", "frames", 5, 0, 0, None, "another")])
+    assert explanation == Explanation("build", "nothing", (rays,), True) and rays.share == 0.75
+    content = explanation.to_dict()
+    assert content["seconds_saved"] == 0.5 and content["bytes_saved"] == 0 and content["left_out"][0]["share"] == 0.75
+    with skipping(False):
+        assert not explained("build", "nothing", [rays]).skipping
+
+
+def test_seconds_are_scaled_up_and_measured_with_skipping_on_and_off():
+    states = []
+
+    def work():
+        from fpp_ml_bench.skipping import skipping_enabled
+
+        states.append(skipping_enabled())
+        if not skipping_enabled():
+            sum(range(200_000))
+
+    saved = saved_by(work, 10, 1000)
+    assert saved is not None and saved > 0 and set(states) == {True, False}
+    assert states.count(True) == states.count(False)
+    assert saved_by(work, 0, 0) is None
+
+
+def test_build_and_its_account(tmp_path, capsys):
+    arguments = ["build", "--size", str(TINY_SIZE), "--objects", "cork", "--frames", "single_shot", "--workers", "1"]
+    account = tmp_path / "account.json"
+    assert main([*arguments, str(tmp_path / "on"), "--explain-json", str(account)]) == 0
+    assert "left out" in capsys.readouterr().out
+    assert main([*arguments, str(tmp_path / "off"), "--no-skip"]) == 0
+    assert file_bytes(tmp_path / "on") == file_bytes(tmp_path / "off")
+    content, lines = lines_of(account)
+    rows = DatasetFolder(tmp_path / "on").manifest.samples["train"]
+    assert content["skipping"] and len(rows) == 6
+    background = lines["empty background again"]
+    assert (background["done"], background["left_out"]) == (PIXELS, 5 * PIXELS)
+    truth = lines["ground truth off the object"]
+    assert truth["left_out"] == 50 * sum(PIXELS - row["exact_px"] for row in rows) and truth["seconds_saved"] > 0
+    frames = lines["frames not asked for"]
+    assert (frames["done"], frames["left_out"], frames["bytes_saved"]) == (6, 306, 306 * PIXELS)
+    exposures = lines["exposures (49 unstored frames off the object, 2 everywhere)"]
+    assert exposures["done"] + exposures["left_out"] == 6 * 52 * PIXELS and exposures["seconds_saved"] > 0
+
+
+def test_a_dataset_of_an_earlier_version_is_refused_in_words(tiny):
+    manifest = DatasetFolder(tiny).manifest
+    rows = {
+        split: [{key: value for key, value in row.items() if key != "shadow_rays"} for row in part]
+        for split, part in manifest.samples.items()
+    }
+    earlier = replace(manifest, samples=rows, generator={"name": "fpp-ml-bench", "version": "0.1.0"})
+    with pytest.raises(BuildError, match=r"built by version 0\.1\.0 .* build it again"):
+        explain_build(earlier, tiny_settings())
+
+
+def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):
+    account = tmp_path / "account.json"
+    for name, options in (("on", ["--explain-json", str(account)]), ("off", ["--no-skip"])):
+        assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "4", *options]) == 0
+    skipped, complete = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
+    assert (
+        len(skipped) == 7
+        and [name for name in skipped if name.endswith(".npy") and skipped[name] != complete[name]] == []
+    )
+    _, lines = lines_of(account)
+    frames = lines["frames that the method does not use"]
+    assert (frames["done"], frames["left_out"]) == (6 * 22, 6 * 30) and frames["bytes_saved"] == 180 * PIXELS
+    second_direction = lines["second direction where the first shows no object"]
+    dataset = DatasetFolder(tiny)
+    object_px = sum(row["object_px"] for row in dataset.manifest.samples["test"])
+    assert (
+        0.98 * object_px < second_direction["done"] < 1.05 * object_px
+        and second_direction["done"] + second_direction["left_out"] == 6 * PIXELS
+    )
+    scores = []
+    for name, options in (("a.json", ["--explain-json", str(account)]), ("b.json", ["--no-skip"])):
+        result = tmp_path / name
+        command = [str(tmp_path / "on"), "--dataset", str(tiny), "--json", str(result), *options]
+        assert evaluate(command) == 0
+        content = json.loads(result.read_text())
+        scores.append({key: value for key, value in content.items() if key != "created"})
+    assert scores[0] == scores[1]
+    _, lines = lines_of(account)
+    columns = lines["columns that no score needs"]
+    assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns["bytes_saved"] == 6 * PIXELS * (52 + 4)
+    assert lines["depth edges far from the object"]["done"] > object_px
+    assert "left out" in capsys.readouterr().out
+
+
+def test_the_phase_route_is_counted_by_its_crop(tiny, tmp_path):
+    account = tmp_path / "account.json"
+    assert main(["predict", "phase", str(tiny), "--out", str(tmp_path / "p"), "--explain-json", str(account)]) == 0
+    _, lines = lines_of(account)
+    line = lines["local fits and orders far from the object"]
+    assert (
+        line["done"] + line["left_out"] == 6 * PIXELS and 0.1 < line["share"] < 0.95 and line["seconds_saved"] is None
+    )
+    assert lines["frames that the method does not use"]["left_out"] == 6 * 51
+
+
+def test_an_account_that_cannot_be_written_is_refused_before_any_work(tiny, tmp_path, capsys):
+    command = ["predict", "classical", str(tiny), "--out", str(tmp_path / "p"), "--explain-json"]
+    assert main([*command, str(tmp_path / "none" / "a.json")]) == 2
+    assert "--explain-json" in capsys.readouterr().err and not (tmp_path / "p").exists()
+
+
+def test_data_that_was_not_generated_has_no_account(opened):
+    from dataclasses import replace
+
+    with pytest.raises(ValueError, match="generated"):
+        explain_build(replace(opened.manifest, origin="published"), None)

@@ -1,0 +1,227 @@
+"""What a scene does not need is left out, and the results are the same bytes with skipping off."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import TINY_SIZE, file_bytes, tiny_settings
+from test_decoding import LENSES, PAPER, TURNED, capture, tilted
+
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.compiled import SWITCH as COMPILED
+from fpp_ml_bench.decoding import Limits, Reason, decode_stack
+from fpp_ml_bench.loaders.render import Backdrop, Exposure, Lighting, PixelRays, SolidMesh, TracedObject, build, place
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
+
+
+def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
+    monkeypatch.delenv(SWITCH, raising=False)
+    assert skipping_enabled()
+    with skipping(False):
+        assert not skipping_enabled()
+        with skipping(True):
+            assert skipping_enabled()
+        assert not skipping_enabled()
+    assert skipping_enabled()
+    monkeypatch.setenv(SWITCH, "0")
+    assert not skipping_enabled()
+
+
+@pytest.mark.parametrize("change", [{}, {"shadows": True, "stored": "single_shot"}])
+def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
+    settings = tiny_settings(objects=("power_drill",), **change)
+    build(tmp_path / "on", settings, workers=1)
+    with skipping(False):
+        build(tmp_path / "off", settings, workers=1)
+    skipped, whole = file_bytes(tmp_path / "on"), file_bytes(tmp_path / "off")
+    assert sorted(skipped) == sorted(whole) and sum(name.endswith(".arrow") for name in skipped) in (1, 4)
+    assert [name for name in skipped if skipped[name] != whole[name]] == []
+
+
+def counting(monkeypatch):
+    """What really happens: shadow rays traced, pixels exposed whole or in part."""
+    counts = {"rays": 0, "exposed": 0}
+    blocked, expose = TracedObject.blocked, Exposure.expose
+
+    def counted_rays(self, origins, targets):
+        counts["rays"] += len(origins)
+        return blocked(self, origins, targets)
+
+    def counted_expose(self, frames, lit, pixels, *rest):
+        counts["exposed"] += len(frames) * pixels.size
+        return expose(self, frames, lit, pixels, *rest)
+
+    monkeypatch.setattr(TracedObject, "blocked", counted_rays)
+    monkeypatch.setattr(Exposure, "expose", counted_expose)
+    return counts
+
+
+def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeypatch):
+    counts = counting(monkeypatch)
+    settings = tiny_settings(objects=("cork",), stored="single_shot", shadows=True)
+    manifest = build(tmp_path / "on", settings, workers=1)
+    rows = manifest.samples["train"]
+    pixels, traced = TINY_SIZE**2, counts["rays"]
+    assert traced == sum(row["shadow_rays"] for row in rows) < 0.1 * len(rows) * pixels
+    # Frame 0 whole; 49 that only the ground truth needs at the object alone; black and white nowhere.
+    assert counts["exposed"] == sum(pixels + 49 * row["exact_px"] for row in rows)
+    counts.update(rays=0, exposed=0)
+    with skipping(False):
+        build(tmp_path / "off", settings, workers=1)
+    assert counts["rays"] > 2 * traced
+    assert counts["exposed"] == len(rows) * 52 * pixels
+
+
+def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
+    rig, lighting = paper_rig(TINY_SIZE), Lighting(shadows=True)
+    ball = trimesh.creation.icosphere(3, 0.15)
+    mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
+    traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
+    covered = traced.primary(PixelRays.of(rig.camera)).pixels
+    backdrop, counts = Backdrop(rig, lighting), counting(monkeypatch)
+    fewer = backdrop.behind(traced, covered)
+    traced_rays = counts["rays"]
+    with skipping(False):
+        every = backdrop.behind(traced, covered)
+    assert 0 < traced_rays == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - traced_rays)
+    elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
+    elsewhere[covered] = False
+    np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
+    unshaded = Backdrop(rig, Lighting()).behind(traced, covered).gain
+    assert ((fewer.gain == 0) & (unshaded > 0))[elsewhere].sum() > 100
+
+
+# ---- decoding
+
+RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
+
+
+def sparse(rig, share=0.3):
+    """Frames of a tilted plane that fills a band of the image, far background elsewhere, some of it dark."""
+    shape = rig.camera.height, rig.camera.width
+    surface = tilted(rig)
+    surface[int(share * shape[0]) :] = 3.2
+    albedo = np.full(shape, 0.45)
+    albedo[-shape[0] // 4 :] = 0.005
+    return capture(rig, surface, albedo=albedo), surface < 3
+
+
+@RIGS
+@pytest.mark.parametrize("compiled", ["1", "0"])
+@pytest.mark.parametrize("steps", [3, None])
+def test_depth_alone_is_the_depth_with_reasons(rig, compiled, steps, monkeypatch):
+    monkeypatch.setenv(COMPILED, compiled)
+    frames, seen = sparse(rig)
+    everything = decode_stack(frames, rig, steps=steps)
+    alone = decode_stack(frames, rig, steps=steps, reasons=False)
+    np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
+    decoded = alone.depth_mm > 0
+    assert decoded.sum() > 0.5 * seen.sum()
+    # A pixel without depth says so, though perhaps for another reason; one with depth is decoded.
+    np.testing.assert_array_equal(alone.reason == 0, decoded)
+    assert everything.second_px == seen.size
+    if rig is LENSES:  # no bound is known for a projector with distortion: nothing is left out
+        assert alone.second_px == seen.size
+    else:
+        assert decoded.sum() <= alone.second_px < 1.1 * seen.sum() < 0.4 * seen.size
+    with skipping(False):
+        off = decode_stack(frames, rig, steps=steps, reasons=False)
+    np.testing.assert_array_equal(off.depth_mm, alone.depth_mm)
+    np.testing.assert_array_equal(off.reason, everything.reason)
+    assert off.second_px == seen.size
+
+
+@pytest.mark.parametrize("disagreement", [0.02, 1.5, 8.0])
+def test_no_pixel_near_the_ends_of_the_range_is_lost(disagreement):
+    """Planes at the very ends of the range, noise that moves pixels across them, and any tolerance."""
+    near_mm, far_mm = PAPER.working_range_mm
+    shape = PAPER.camera.height, PAPER.camera.width
+    for depth_mm in (near_mm, far_mm):
+        frames = capture(PAPER, np.full(shape, depth_mm / 1000), noise=12.0)
+        limits = Limits(max_disagreement_px=disagreement)
+        everything = decode_stack(frames, PAPER, steps=3, limits=limits)
+        alone = decode_stack(frames, PAPER, steps=3, limits=limits, reasons=False)
+        assert 0.01 < (everything.depth_mm > 0).mean() < 0.9
+        np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
+
+
+def test_inside_a_mask_the_bytes_are_those_of_the_whole_image():
+    frames, seen = sparse(PAPER)
+    mask = seen.copy()
+    mask[:, ::3] = False
+    whole = decode_stack(frames, PAPER)
+    for reasons in (True, False):
+        part = decode_stack(frames, PAPER, mask=mask, reasons=reasons)
+        np.testing.assert_array_equal(part.depth_mm, np.where(mask, whole.depth_mm, 0))
+        assert part.counts["not_asked"] == (~mask).sum()
+    # Frames in which everything outside the mask is destroyed: nothing there is looked at.
+    destroyed = [np.where(mask, frame, 255 - frame).astype(np.uint8) for frame in frames]
+    np.testing.assert_array_equal(decode_stack(destroyed, PAPER, mask=mask).depth_mm, part.depth_mm)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_a_mask_costs_nothing_in_exactness_however_much_it_covers(share):
+    frames = capture(PAPER, tilted(PAPER))
+    mask = np.zeros(tilted(PAPER).shape, dtype=bool)
+    mask[: int(share * len(mask))] = True
+    whole = decode_stack(frames, PAPER)
+    with skipping(False):
+        off = decode_stack(frames, PAPER, mask=mask)
+    for decoded in (off, decode_stack(frames, PAPER, mask=mask)):
+        np.testing.assert_array_equal(decoded.depth_mm, np.where(mask, whole.depth_mm, 0))
+        np.testing.assert_array_equal(decoded.reason, np.where(mask, whole.reason, Reason.NOT_ASKED))
+        assert sum(decoded.counts.values()) == mask.size and decoded.counts["not_asked"] == (~mask).sum()
+
+
+def test_an_image_without_object_never_reads_the_second_direction():
+    frames = capture(PAPER, np.full((PAPER.camera.height, PAPER.camera.width), 3.2))
+    decoded = decode_stack(frames, PAPER, reasons=False, threads=2)
+    assert decoded.second_px == 0 and not decoded.depth_mm.any()
+
+
+# ---- reading
+
+
+def mapped_bytes(folder):
+    """Bytes of files below ``folder`` that lie in this process's memory, by the kernel's count (proc(5), smaps)."""
+    total, counted = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if "-" in line.split(" ", 1)[0]:
+            counted = str(folder) in line
+        elif counted and line.startswith("Rss:"):
+            total += 1024 * int(line.split()[1])
+    return total
+
+
+def test_memory_of_a_split_that_is_gone_through_does_not_grow_with_its_samples(tiny, tmp_path):
+    own = tmp_path / "dataset"  # other tests of this process may have the shared one mapped
+    shutil.copytree(tiny, own)
+    opened = DatasetFolder(own)
+    size, copies, resident = TINY_SIZE**2, [], []
+    for sample in opened.samples("all"):
+        copies.append([image.copy() for image in (*opened.frames(sample, range(52)), opened.depth_mm(sample))])
+        opened.release(sample)
+        resident.append(mapped_bytes(own))
+    # Opening a file maps what stands between its images; that is there from the first sample on.
+    assert len(resident) == 24 and max(resident) <= resident[0] + 56 * size < 24 * 56 * size / 4
+    # Views of what was let go are still good, and count again.
+    for images, sample in zip(copies, opened.samples("all"), strict=True):
+        for image, again in zip(images, (*opened.frames(sample, range(52)), opened.depth_mm(sample)), strict=True):
+            np.testing.assert_array_equal(image, again)
+    assert mapped_bytes(own) > 24 * 56 * size
+
+
+def test_frames_that_a_method_does_not_use_are_not_read(tiny):
+    opened = DatasetFolder(tiny)
+    method = ClassicalMethod(opened.rig, "vertical", 3)
+    sample = opened.samples("test")[0]
+    frames = captured_frames(opened, method, sample)
+    assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)
+    groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path, _ in opened._images}
+    assert groups == {"test/vertical", "test/codes"} and len(opened._images) == len(method.frames_used) == 10
+    assert set(opened._maps) == {path for path, _ in opened._images}  # nor are other files mapped

@@ -1,0 +1,282 @@
+"""The whole decoder: depth and reasons of simulated captures, compiled and in NumPy."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from fpp_ml_bench.compiled import SWITCH, numba_enabled
+from fpp_ml_bench.decoding.blocks import Limits, Reason
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.phase import phase_weights
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.optics import Pinhole, Rig, Sequence, paper_rig, pattern_image, rotation_matrix
+
+MODULATION = 0.45 * 127.5
+
+
+def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):
+    """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8 bits."""
+    x, y = rig.camera.rays()
+    u, v = (
+        coordinates.astype(np.float32)
+        for coordinates in rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1))
+    )
+    rng = np.random.default_rng(seed)
+    frames = []
+    for index in range(len(rig.sequence)):
+        pattern = cv2.remap(pattern_image(rig, index).astype(np.float32), u, v, cv2.INTER_LINEAR)
+        image = ambient + albedo * pattern + noise * rng.standard_normal(pattern.shape)
+        frames.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return frames
+
+
+def tilted(rig):
+    x, y = rig.camera.rays()
+    return 1.8 / (1.0 - 0.4 * x + 0.25 * y)
+
+
+PAPER = paper_rig(200)
+TURNED = Rig(
+    camera=Pinhole(180, 160, 420.0, 415.0, 91.0, 77.0, (-0.15, 0.06, 0.001, -0.001, 0.0)),
+    projector=Pinhole(900, 1100, 1800.0, 1790.0, 455.0, 540.0),
+    rotation=rotation_matrix((-0.03, 0.04, 0.05)),
+    translation_m=(0.15, -0.12, 0.03),
+    pitch_horizontal_px=17.3,
+    pitch_vertical_px=20.0,
+    sequence=Sequence(9, 8, 7),
+)
+LENSES = replace(TURNED, projector=replace(TURNED.projector, distortion=(0.05, -0.03, 0.001, -0.001, 0.0)))
+RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
+NEEDS_NUMBA = pytest.mark.skipif(not numba_enabled(), reason="numba is not in use")
+
+
+@RIGS
+@pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
+def test_depth_error_is_the_noise_it_must_have(rig, direction):
+    depth = tilted(rig)
+    decoded = decode_stack(capture(rig, depth), rig, direction)
+    x, y = rig.camera.rays()
+    u, v = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
+    # 2 px inside the pattern, to exclude interpolation with the dark outside its border.
+    good = (np.abs(u - (rig.projector.width - 1) / 2) < (rig.projector.width - 1) / 2 - 2) & (
+        np.abs(v - (rig.projector.height - 1) / 2) < (rig.projector.height - 1) / 2 - 2
+    )
+    assert good.mean() > 0.8 and (decoded.reason[good] == Reason.DECODED).all() and decoded.depth_mm.dtype == np.float32
+    steps = rig.sequence.steps
+    # Noise of one grey level and the variance of rounding, 1/12.
+    predicted = depth_noise_mm(rig, depth * 1000, direction, steps, MODULATION, np.sqrt(1 + 1 / 12), rig.camera.rays())
+    error = (decoded.depth_mm - depth * 1000)[good]
+    assert np.abs(error).max() < 30  # an order wrong by 1 is 250 mm
+    core = np.abs(error / predicted[good])
+    assert np.median(core) == pytest.approx(0.6745, rel=0.06)
+
+
+@pytest.mark.parametrize("direction", ["vertical", "both"])
+def test_error_follows_one_over_root_n(direction):
+    depth = tilted(PAPER)
+    frames = capture(PAPER, depth, noise=1.5)
+    errors = {}
+    for steps in (3, 4, 6, 9, 18):
+        decoded = decode_stack(frames, PAPER, direction, steps=steps)
+        good = decoded.depth_mm > 0
+        errors[steps] = np.median(np.abs(decoded.depth_mm - depth * 1000)[good]) * np.sqrt(steps)
+        per_direction = 2 if direction == "both" else 1
+        assert len(decoded.frames_used) == per_direction * (steps + 7)
+    mean = np.mean(list(errors.values()))
+    # N = 4 of 18 is not quite even: its shifts are 0, 100, 180 and 280 degrees.
+    assert all(error == pytest.approx(mean, rel=0.08) for error in errors.values()), errors
+
+
+@pytest.mark.parametrize("steps", [5, 7, 8, 10, 11, 13, 17])
+def test_uneven_subsets_are_unbiased(steps):
+    depth = tilted(PAPER)
+    decoded = decode_stack(capture(PAPER, depth, noise=0.5), PAPER, "vertical", steps=steps)
+    error = (decoded.depth_mm - depth * 1000)[decoded.depth_mm > 0]
+    assert abs(np.median(error)) < 0.05 and np.median(np.abs(error)) < 1.0
+
+
+@RIGS
+@pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
+@NEEDS_NUMBA
+def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
+    frames = capture(rig, tilted(rig), noise=3.0, albedo=0.9)
+    for frame in frames[::3]:
+        frame[:20] = np.random.default_rng(1).integers(0, 256, frame[:20].shape, dtype=np.uint8)  # no signal at all
+    compiled = decode_stack(frames, rig, direction, details=True)
+    monkeypatch.setenv(SWITCH, "0")
+    plain = decode_stack(frames, rig, direction, details=True)
+    assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
+    assert len(np.unique(plain.reason)) >= 3
+    # Both round a float64 depth once to float32: at most one unit in the last place apart.
+    ulp = np.spacing(np.maximum(plain.depth_mm, np.float32(1)))
+    assert (np.abs(compiled.depth_mm - plain.depth_mm) <= ulp).all()
+    for name in compiled.details:
+        np.testing.assert_allclose(compiled.details[name].phase, plain.details[name].phase, atol=1e-12, rtol=0)
+        np.testing.assert_array_equal(compiled.details[name].modulation, plain.details[name].modulation)
+        np.testing.assert_allclose(
+            compiled.details[name].coordinate_px, plain.details[name].coordinate_px, atol=1e-10, rtol=0
+        )
+
+
+@NEEDS_NUMBA
+def test_the_compiled_arctangent_is_numpys_on_every_side():
+    from fpp_ml_bench.decoding.kernels import _minus_atan2
+
+    angles = np.concatenate([np.linspace(-np.pi, np.pi, 5001), np.arange(-8, 9) * np.pi / 8])
+    for radius in (1e-3, 1.0, 250.0):
+        for y, x in zip(radius * np.sin(angles), radius * np.cos(angles), strict=True):
+            assert _minus_atan2(y, x) == pytest.approx(
+                (lambda p: p if p < np.pi else -np.pi)(-np.arctan2(y, x)), abs=1e-15
+            )
+    assert [_minus_atan2(0.0, -1.0), _minus_atan2(-0.0, -1.0), _minus_atan2(0.0, 0.0)] == [-np.pi, -np.pi, 0.0]
+
+
+@pytest.mark.parametrize("switch", ["0", "1"])
+def test_mask_threads_and_layout_change_no_bit(switch, monkeypatch):
+    monkeypatch.setenv(SWITCH, switch)
+    frames = capture(PAPER, tilted(PAPER))
+    full = decode_stack(frames, PAPER, details=True)
+    mask = np.random.default_rng(3).random(frames[0].shape) < 0.3
+    masked = decode_stack(frames, PAPER, mask=mask, details=True)
+    assert np.array_equal(masked.depth_mm, np.where(mask, full.depth_mm, 0))
+    assert np.array_equal(masked.reason, np.where(mask, full.reason, Reason.NOT_ASKED))
+    for name in full.details:
+        assert np.array_equal(masked.details[name].phase[mask], full.details[name].phase[mask])
+    assert masked.counts["not_asked"] == (~mask).sum() and sum(masked.counts.values()) == mask.size
+    read_only = np.stack(frames)
+    read_only.flags.writeable = False
+    columns = [np.asfortranarray(frame) for frame in frames]
+    for variant in (read_only, columns):
+        again = decode_stack(variant, PAPER, threads=2)
+        assert np.array_equal(again.depth_mm, full.depth_mm) and np.array_equal(again.reason, full.reason)
+    nothing = decode_stack(frames, PAPER, mask=np.zeros_like(mask))
+    assert not nothing.depth_mm.any() and nothing.counts["not_asked"] == mask.size
+
+
+def reasons(frames, rig=PAPER, direction="both", **arguments):
+    return decode_stack(frames, rig, direction, **arguments).reason
+
+
+@pytest.mark.parametrize("switch", ["0", "1"])
+def test_every_reason_is_given_where_it_holds(switch, monkeypatch):
+    monkeypatch.setenv(SWITCH, switch)
+    depth = tilted(PAPER)
+    frames = capture(PAPER, depth, noise=0.3)
+    inside = np.s_[80:120, 80:120]
+    assert (reasons(frames)[inside] == Reason.DECODED).all()
+
+    dark = [frame.copy() for frame in frames]
+    for frame in dark:
+        frame[inside] = 7
+    assert (reasons(dark)[inside] == Reason.LOW_MODULATION).all()
+
+    glaring = [np.minimum(frame * 4.0, 255).astype(np.uint8) for frame in frames]
+    assert (reasons(glaring)[inside] == Reason.SATURATED).mean() > 0.95
+    assert (reasons(glaring, limits=Limits(max_clipped_steps=18))[inside] == Reason.DECODED).mean() > 0.9
+
+    flipped = [frame.copy() for frame in frames]
+    sequence = PAPER.sequence
+    level = np.stack([frames[i] for i in sequence.sinusoids("vertical")]).mean(axis=0)
+    blurred = list(sequence.gray("vertical"))[2:4]
+    for index in blurred:
+        flipped[index][inside] = level[inside]
+    assert (reasons(flipped, direction="vertical")[inside] == Reason.INCONSISTENT_ORDER).all()
+    assert (reasons(flipped, direction="horizontal")[inside] == Reason.DECODED).all()
+
+    shifted = list(frames)  # v as of a surface 100 mm farther, u of the true surface
+    farther = capture(PAPER, depth + 0.1, noise=0.3)
+    for index in [*sequence.sinusoids("horizontal"), *sequence.gray("horizontal")]:
+        shifted[index] = farther[index]
+    assert (reasons(shifted)[inside] == Reason.DIRECTIONS_DISAGREE).all()
+
+    background = capture(PAPER, np.full_like(depth, 3.2), noise=0.3)
+    decoded = decode_stack(background, PAPER)
+    assert (decoded.reason[inside] == Reason.OUTSIDE_RANGE).all() and not decoded.depth_mm.any()
+
+    # A lens that folds 0.3 from the axis, and an image that reaches 0.35: the corners have no ray.
+    folded = replace(PAPER, camera=replace(PAPER.camera, fx=280.0, fy=280.0, distortion=(-1.8, 0.0, 0.0, 0.0, 0.0)))
+    no_ray = np.isnan(folded.camera.rays()[0])
+    assert no_ray.any() and not no_ray.all()
+    assert (reasons(frames, folded)[no_ray] == Reason.NO_RAY).all()
+    assert (reasons(frames, folded)[inside] != Reason.NO_RAY).any()
+
+
+def test_a_coordinate_beyond_the_patterns_border_is_outside():
+    rig = PAPER
+    depth = tilted(rig)
+    frames = capture(rig, depth, noise=0.0)
+    # A rig whose projector is 305 px narrower than the projected pattern: the last cells are outside.
+    narrow = replace(rig, projector=replace(rig.projector, width=rig.projector.width - 305))
+    decoded = decode_stack(frames, narrow, "vertical", details=True)
+    x, y = rig.camera.rays()
+    u, _ = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
+    rejected = np.isin(decoded.reason, [Reason.OUTSIDE_PATTERN, Reason.INCONSISTENT_ORDER])
+    assert rejected[(u > 607) & (u < 905)].all() and not rejected[(u > 2) & (u < 606)].any()
+    assert (decoded.reason == Reason.OUTSIDE_PATTERN).any()
+
+
+def test_frames_that_are_not_used_may_be_missing():
+    frames = capture(PAPER, tilted(PAPER))
+    full = decode_stack(frames, PAPER, "horizontal", steps=6)
+    needed = [frame if i in full.frames_used else None for i, frame in enumerate(frames)]
+    again = decode_stack(needed, PAPER, "horizontal", steps=6)
+    assert np.array_equal(again.depth_mm, full.depth_mm)
+    assert full.frames_used == (0, 3, 6, 9, 12, 15, *range(36, 43))
+    with pytest.raises(DecodeError, match=r"frame 18: vertical sinusoid, step 0: expected an image, got None"):
+        decode_stack(needed, PAPER, "vertical", steps=6)
+
+
+@pytest.mark.parametrize(
+    "change, arguments, message",
+    [
+        (lambda f: f[:-1], {}, "52 frames.*got 51"),
+        (lambda f: [x[:, :-1] for x in f], {}, r"expected shape.*\(200, 200\).*got \(200, 199\)"),
+        (lambda f: [x.astype(np.float32) for x in f], {}, "expected uint8.*float32"),
+        (lambda f: [np.stack([x] * 3, axis=-1) for x in f], {}, r"got \(200, 200, 3\)"),
+        (lambda f: f, {"direction": "diagonal"}, "horizontal, vertical or both"),
+        (lambda f: f, {"steps": 2}, "3 to the 18"),
+        (lambda f: f, {"steps": 19}, "3 to the 18"),
+        (lambda f: f, {"threads": 0}, "threads"),
+        (lambda f: f, {"mask": np.ones((200, 200))}, "mask: expected bool"),
+        (lambda f: f, {"mask": np.ones((20, 20), dtype=bool)}, "mask: expected bool"),
+        (lambda f: f, {"limits": Limits(min_modulation=float("nan"))}, "min_modulation"),
+        (lambda f: f, {"limits": Limits(max_disagreement_px=-1.0)}, "max_disagreement_px"),
+        (lambda f: f, {"limits": Limits(max_clipped_steps=-1)}, "max_clipped_steps"),
+    ],
+)
+def test_what_cannot_be_decoded_is_refused(change, arguments, message):
+    frames = [np.zeros((200, 200), dtype=np.uint8)] * 52
+    with pytest.raises(DecodeError, match=message):
+        decode_stack(change(frames), PAPER, **arguments)
+
+
+def test_noise_alone_is_never_given_a_depth_by_both_directions():
+    frames = list(np.random.default_rng(8).integers(0, 256, (52, 200, 200), dtype=np.uint8))
+    decoded = decode_stack(frames, PAPER)
+    assert (decoded.depth_mm > 0).mean() < 1e-3
+
+
+def test_without_numba_the_decoder_still_works():
+    """In a separate process in which numba can't be imported."""
+    code = (
+        "import sys; sys.modules['numba'] = None\n"
+        "import numpy as np\n"
+        "from fpp_ml_bench.compiled import numba_enabled, njit\n"
+        "from fpp_ml_bench.decoding.decode import decode_stack\n"
+        "from fpp_ml_bench.optics.rig import paper_rig\n"
+        "assert not numba_enabled() and njit(len) is len\n"
+        "decoded = decode_stack(np.zeros((52, 200, 200), np.uint8), paper_rig(200))\n"
+        "assert decoded.counts['low_modulation'] == 40000, decoded.counts\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_weights_of_the_chosen_subset_are_the_least_squares_solution():
+    shifts = 2 * np.pi * np.array([0, 4, 7, 11, 14]) / 18
+    model = np.stack([np.ones(5), np.cos(shifts), np.sin(shifts)], axis=1)
+    np.testing.assert_allclose(phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14)

@@ -1,0 +1,148 @@
+"""Phase, modulation and mean against closed forms, the paper's Eq. 2, and the noise law."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.restoration import unwrap_phase
+
+from fpp_ml_bench.decoding.blocks import CLIPPED_STEPS_DIVISOR
+from fpp_ml_bench.decoding.phase import choose_steps, clipped_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.errors import DecodeError
+
+
+def frames_of(phase, shifts, mean=120.0, modulation=80.0):
+    return mean + modulation * np.cos(np.asarray(phase) + np.reshape(shifts, (-1, 1, 1)))
+
+
+def equal(count):
+    return 2 * np.pi * np.arange(count) / count
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 7, 9, 18, 31])
+@pytest.mark.parametrize("dtype, rounding", [(np.float64, 0), (np.float32, 2**-24)])
+def test_exact_frames_give_exact_phase(count, dtype, rounding):
+    """All sums are float64; their results are rounded once to ``dtype``."""
+    phase = np.linspace(-np.pi, np.pi, 400, endpoint=False).reshape(8, 50)
+    wrapped = wrapped_phase(frames_of(phase, equal(count)), dtype=dtype)
+    assert all(array.dtype == dtype for array in wrapped)
+    difference = np.angle(np.exp(1j * (wrapped.phase.astype(np.float64) - phase)))
+    assert np.abs(difference).max() < 1e-13 + rounding * np.pi
+    assert (wrapped.phase >= -np.pi).all() and (wrapped.phase < np.pi).all()
+    np.testing.assert_allclose(wrapped.modulation, 80, rtol=1e-12 + rounding)
+    np.testing.assert_allclose(wrapped.mean, 120, rtol=1e-12 + rounding)
+
+
+def test_equal_steps_are_the_papers_equation():
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (18, 20, 30), dtype=np.uint8)
+    delta = equal(18)
+    sines = sum(frame * np.sin(d) for frame, d in zip(frames.astype(float), delta, strict=True))
+    cosines = sum(frame * np.cos(d) for frame, d in zip(frames.astype(float), delta, strict=True))
+    wrapped = wrapped_phase(frames)
+    np.testing.assert_allclose(wrapped.phase, -np.arctan2(sines, cosines), atol=1e-12)
+    np.testing.assert_allclose(wrapped.modulation, 2 / 18 * np.hypot(sines, cosines), atol=1e-12)
+    np.testing.assert_allclose(wrapped.mean, frames.mean(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_plus_pi_comes_out_as_minus_pi(dtype):
+    for frames in ([0, 1, 2, 1], [0.0, 5.0, 10.0, 5.0]):  # cos(phi + delta) with phi = pi
+        stack = np.array(frames, dtype=dtype).reshape(4, 1, 1)
+        assert wrapped_phase(stack, dtype=dtype).phase[0, 0] == dtype(-np.pi)
+    # Just below pi in float64 rounds up to pi in float32.
+    wrapped = wrapped_phase(frames_of([[np.pi - 1e-9]], equal(18)), dtype=np.float32)
+    assert wrapped.phase[0, 0] == np.float32(-np.pi)
+
+
+@given(
+    shifts=st.lists(st.floats(0, 6.28), min_size=3, max_size=9),
+    phase=st.floats(-3.1, 3.1),
+    modulation=st.floats(1, 120),
+)
+@settings(max_examples=150, deadline=None)
+def test_any_shifts_that_determine_a_phase_give_it_and_the_others_are_refused(shifts, phase, modulation):
+    model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
+    condition = np.linalg.cond(model)
+    if condition > 1e6:
+        with pytest.raises(DecodeError, match="don't determine"):
+            phase_weights(shifts)
+        return
+    frames = frames_of([[phase]], shifts, modulation=modulation)
+    wrapped = wrapped_phase(frames, shifts)
+    tolerance = 1e-12 * condition**2 * 200 / modulation
+    assert abs(np.angle(np.exp(1j * (wrapped.phase[0, 0] - phase)))) < tolerance
+
+
+@pytest.mark.parametrize("count", range(3, 19))
+def test_chosen_steps_are_distinct_even_and_sufficient(count):
+    chosen = choose_steps(18, count)
+    assert len(set(chosen)) == count and chosen[0] == 0 and max(chosen) < 18
+    gaps = np.diff([*chosen, 18])
+    assert gaps.max() - gaps.min() <= 1
+    if 18 % count == 0:
+        assert chosen == tuple(range(0, 18, 18 // count))
+    # The noise gain of the weights stays within a tenth of that of equal steps, sqrt(2 / n).
+    gain = np.sqrt((phase_weights(2 * np.pi * np.array(chosen) / 18)[1:] ** 2).sum(axis=1)).max()
+    assert gain < 1.1 * np.sqrt(2 / count)
+
+
+@pytest.mark.parametrize("count", [2, 19, 0, -3, 4.0, "6", True])
+def test_impossible_numbers_of_steps_are_refused(count):
+    with pytest.raises(DecodeError, match="3 to the 18"):
+        choose_steps(18, count)
+
+
+@pytest.mark.parametrize("steps", [3, 4, 6, 9, 18])
+def test_phase_noise_follows_the_law(steps):
+    rng = np.random.default_rng(steps)
+    phase = rng.uniform(-np.pi, np.pi, (200, 250))
+    sigma, modulation = 1.5, 60.0
+    frames = frames_of(phase, equal(steps), modulation=modulation)
+    noisy = wrapped_phase(frames + sigma * rng.standard_normal(frames.shape)).phase
+    error = np.angle(np.exp(1j * (noisy - phase)))
+    assert error.std() == pytest.approx(np.sqrt(2 / steps) * sigma / modulation, rel=0.02)
+
+
+def test_a_ramp_unwraps_to_itself():
+    ramp = np.add.outer(np.linspace(0, 40, 60), np.linspace(0, 25, 80))
+    unwrapped = unwrap_phase(wrapped_phase(frames_of(ramp, equal(5))).phase)
+    np.testing.assert_allclose(unwrapped - unwrapped[0, 0], ramp - ramp[0, 0], atol=1e-9)
+
+
+def test_clipped_steps_counts_both_ends():
+    frames = np.array([[[255, 0]], [[255, 1]], [[254, 0]]], dtype=np.uint8)
+    assert clipped_steps(frames).tolist() == [[2, 0]]
+    assert clipped_steps(frames, level=0).tolist() == [[0, 2]]
+
+
+@pytest.mark.parametrize("steps", [9, 12, 18, 27])
+def test_the_clipping_that_the_decoder_allows_moves_the_phase_by_under_five_mrad(steps):
+    """What `CLIPPED_STEPS_DIVISOR` promises, by exhaustion over phase and clipping level."""
+    phase = np.linspace(-np.pi, np.pi, 2000, endpoint=False).reshape(1, -1)
+    worst = 0.0
+    for ceiling in np.linspace(0.5, 1.0, 60):
+        frames = np.minimum(np.cos(phase + equal(steps).reshape(-1, 1, 1)), ceiling)
+        allowed = (frames >= ceiling).sum(axis=0) <= steps // CLIPPED_STEPS_DIVISOR
+        error = np.angle(np.exp(1j * (wrapped_phase(frames).phase - phase)))
+        worst = max(worst, np.abs(error[allowed]).max(initial=0.0))
+    assert 0 < worst < 5e-3
+
+
+@pytest.mark.parametrize(
+    "frames, arguments, message",
+    [
+        (np.zeros((2, 3, 3)), {}, "at least 3 frames, got 2"),
+        ([np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))], {}, r"frame 2: expected shape.*\(3, 4\)"),
+        (np.zeros((3, 3)), {}, "frame 0: expected shape"),
+        (np.zeros((3, 3, 3), dtype=complex), {}, "dtype complex128"),
+        (np.zeros((3, 3, 3), dtype=bool), {}, "dtype bool"),
+        (np.zeros((3, 3, 3)), {"dtype": np.float16}, "float32 or float64"),
+        (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, 2, 3]}, "each of the 3 frames, got 4"),
+        (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, np.nan]}, "finite"),
+        (np.zeros((3, 3, 3)), {"shifts_rad": [0, 1, 1]}, "don't determine"),
+    ],
+)
+def test_frames_that_hold_no_phase_are_refused(frames, arguments, message):
+    with pytest.raises(DecodeError, match=message):
+        wrapped_phase(frames, **arguments)

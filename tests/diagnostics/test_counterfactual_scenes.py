@@ -1,0 +1,140 @@
+"""Counterfactual scenes: the unchanged one is the dataset's, and a changed one differs in what it says."""
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.diagnostics.counterfactual_original import original
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import LARGEST_SHIFT_RAD, chosen_samples, counterfactuals
+from fpp_ml_bench.baselines.diagnostics.synth import PITCH_FACTOR, SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.synth_surface import moved, normals_of_depth, plane
+from fpp_ml_bench.errors import DiagnosisError
+
+SAMPLE, OTHER = "power_drill_A0", "mug_A60"
+
+
+@pytest.fixture(scope="module")
+def renderer(opened):
+    return SceneRenderer.of(opened)
+
+
+@pytest.fixture(scope="module")
+def scenes(opened, renderer):
+    return counterfactuals(opened, renderer, SAMPLE, "horizontal", [OTHER])
+
+
+def test_an_unchanged_scene_is_the_datasets_own(opened, renderer):
+    for sample in (SAMPLE, OTHER):
+        sample_scene = original(opened, renderer, sample)
+        frames = renderer.frames(sample_scene.scene, range(len(opened.sequence)))
+        for index, frame in enumerate(frames):
+            difference = np.abs(frame.astype(int) - opened.frame(sample, index))
+            assert difference.max() <= 1
+            assert (difference > 0).sum() <= 5
+
+
+def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
+    sample_scene, sequence = scenes.original, opened.sequence
+    before = scenes.layer.at(sample_scene.target).absolute_phase(sample_scene.depth_mm[sample_scene.target])
+    names = [move.name for move in scenes.moves]
+    assert set(names) == {"constant", "ramp across", "ramp down", "bump"}
+    near_mm, far_mm = renderer.rig.working_range_mm
+    for move in scenes.moves:
+        assert ((move.depth_mm > 0) == (sample_scene.depth_mm > 0)).all()
+        object_depths = move.depth_mm[move.depth_mm > 0]
+        assert near_mm - 1e-6 <= object_depths.min() and object_depths.max() <= far_mm + 1e-6
+        shift = scenes.layer.at(sample_scene.target).absolute_phase(move.depth_mm[sample_scene.target]) - before
+        assert np.abs(shift).max() <= abs(move.amplitude_rad) + 1e-9 <= LARGEST_SHIFT_RAD + 2e-9
+        white = renderer.frames(move.phase, [sequence.white])[sequence.white]
+        np.testing.assert_array_equal(white, renderer.frames(sample_scene.scene, [sequence.white])[sequence.white])
+    bump = next(move for move in scenes.moves if move.name == "bump")
+    fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.light, sample_scene.scene))
+    assert (fringe != unmoved).any()
+
+
+def test_a_moved_plane_keeps_its_law():
+    from fpp_ml_bench.optics import paper_rig
+
+    rig = paper_rig(176)
+    surface = plane(rig, 1.8, (15.0, -10.0))
+    still = moved(surface, rig, "vertical", lambda x, y: np.zeros_like(x))
+    np.testing.assert_allclose(still.depth_m, surface.depth_m, rtol=1e-12)
+    np.testing.assert_allclose(still.normals, surface.normals, atol=1e-5)
+    # psi = gain / Z is linear in 1 / Z on the paper's rig, so a plane moved by a linear shift is a plane again.
+    tilted = moved(surface, rig, "vertical", lambda x, y: 1.0 + 8.0 * x - 5.0 * y)
+    design = np.column_stack([surface.x, surface.y, np.ones_like(surface.x)])
+    law, *_ = np.linalg.lstsq(design, 1 / tilted.depth_m, rcond=None)
+    np.testing.assert_allclose(design @ law, 1 / tilted.depth_m, rtol=1e-9)
+    normal = -law / np.linalg.norm(law)
+    np.testing.assert_allclose(tilted.normals, np.tile(normal, (surface.x.size, 1)), atol=1e-5)
+    x, y = rig.camera.rays()
+    normals = normals_of_depth(surface.depth_mm(x.shape), x, y)
+    np.testing.assert_allclose(normals, surface.normals, atol=1e-9)
+
+
+def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
+    sample_scene = scenes.original
+    frame = renderer.frames(sample_scene.scene, [0])[0]
+    assert [outline_change.name for outline_change in scenes.outline_changes] == [
+        "ellipse",
+        "another object's outline",
+        "grown",
+    ]
+    for outline_change in scenes.outline_changes:
+        assert outline_change.unchanged.any() and (outline_change.unchanged <= sample_scene.target).all()
+        changed_frame = renderer.frames(outline_change.scene, [0])[0]
+        np.testing.assert_array_equal(changed_frame[outline_change.unchanged], frame[outline_change.unchanged])
+        assert (changed_frame != frame).any()
+        masked_frame = renderer.frames(outline_change.scene, [0], masked=True)[0]
+        assert (masked_frame[~outline_change.scene.mask] == 0).all()
+    ellipse, _, grown = scenes.outline_changes
+    assert 0.45 < ellipse.unchanged.sum() / sample_scene.target.sum() < 0.55
+    assert grown.unchanged.sum() == sample_scene.target.sum() < grown.scene.mask.sum()
+
+
+def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer, scenes):
+    sample_scene, sequence = scenes.original, opened.sequence
+    inside = np.zeros(renderer.shape, dtype=bool)
+    inside.ravel()[sample_scene.surface.pixels] = True
+    steps = [*sequence.sinusoids("horizontal")[:6]]
+    usual = np.stack([renderer.frames(sample_scene.scene, steps)[index] for index in steps]).astype(float)
+
+    def swing(name):
+        frames = renderer.frames(scenes.reprojected[name], steps)
+        return np.ptp(np.stack([frames[index] for index in steps]).astype(float), axis=0)
+
+    bright = np.ptp(usual, axis=0) > 30
+    assert (swing("no fringe inside")[bright & inside] < 15).all()
+    np.testing.assert_array_equal(swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside])
+    np.testing.assert_array_equal(swing("no fringe outside")[inside], np.ptp(usual, axis=0)[inside])
+    swapped = renderer.frames(scenes.reprojected["other direction"], [0, sequence.white])
+    np.testing.assert_array_equal(swapped[0], renderer.frames(sample_scene.scene, [sequence.steps])[sequence.steps])
+    np.testing.assert_array_equal(
+        swapped[sequence.white], renderer.frames(sample_scene.scene, [sequence.white])[sequence.white]
+    )
+    column = renderer.frames(scenes.reprojected["other pitch"], [0])[0][:, 4].astype(float)
+    plain = renderer.frames(sample_scene.scene, [0])[0][:, 4].astype(float)
+
+    def period(values):
+        return 1 / np.fft.rfftfreq(4096)[np.argmax(np.abs(np.fft.rfft(values - values.mean(), 4096)))]
+
+    assert period(column) / period(plain) == pytest.approx(PITCH_FACTOR, rel=0.03)
+
+
+def test_samples_are_spread_over_objects_and_views(opened):
+    chosen = chosen_samples(opened, "train", 3)
+    assert [sample for sample, _ in chosen] == [
+        "bowl_A0", "bowl_A120", "bowl_A240", "cork_A120", "cork_A240", "cork_A60",
+    ]  # fmt: skip
+    assert all(outlines and outlines[0].split("_")[0] != sample.split("_")[0] for sample, outlines in chosen)
+    with pytest.raises(DiagnosisError, match="no sample with an object"):
+        chosen_samples_of_nothing(opened)
+
+
+def chosen_samples_of_nothing(opened):
+    class Empty:
+        path = opened.path
+
+        def samples(self, split):
+            return []
+
+    return chosen_samples(Empty(), "test", 2)

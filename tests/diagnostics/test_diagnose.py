@@ -1,0 +1,304 @@
+"""``fpp-bench diagnose``: reports that are whole, probes that are not run twice, models that can't be looked into."""
+
+import json
+import re
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
+
+from fpp_ml_bench.baselines.diagnostics import diagnosis
+from fpp_ml_bench.baselines.diagnostics.page import report_page
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Table, load_finding, save_finding
+from fpp_ml_bench.baselines.diagnostics.probe import spread as spread_over
+from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names
+from fpp_ml_bench.baselines.diagnostics.subjects import subject
+from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DiagnosisError
+
+NETWORK = """
+import torch
+from torch import nn
+
+class Net(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.encoder = nn.Sequential(nn.Conv2d(1, 4, 3, padding=1), nn.ReLU())
+        self.decoder = nn.Sequential(nn.Conv2d(4, 4, 3, padding=1), nn.ReLU())
+        self.head = nn.Conv2d(4, 1, 1)
+        self.unused = nn.Conv2d(4, 1, 1)
+    def forward(self, x):
+        return self.head(self.decoder(self.encoder(x)))
+
+class Odd(Net):
+    def __init__(self, how):
+        super().__init__()
+        self.how = how
+    def forward(self, x):
+        y = super().forward(x)
+        if self.how == "fails":
+            return y @ 1
+        return {"shape": y[:, :, ::2], "nan": y / 0 * 0, "tuple": (y, y)}[self.how]
+
+def make(): return Net()
+def shape(): return Odd("shape")
+def nan(): return Odd("nan")
+def several(): return Odd("tuple")
+def fails(): return Odd("fails")
+def raises(): raise RuntimeError("no weights here")
+def number(): return 3
+"""
+
+
+@pytest.fixture(scope="module")
+def module_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("module") / "my_net.py"
+    path.write_text(NETWORK)
+    return path
+
+
+def call(*arguments):
+    try:
+        return main(["diagnose", *map(str, arguments)])
+    except SystemExit as stop:
+        return stop.code
+
+
+# ---- the command
+
+
+def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, module_file, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "report"
+    arguments = (f"{module_file}:make", tiny, "--out", out, "--layers", "encoder", "decoder", "--quick", "--samples", 4)
+    assert call(*arguments, "--probe", "linear", "--threads", 1) == 0
+    assert call(*arguments, "--probe", "grad-cam", "--threads", 1) == 0
+    printed = capsys.readouterr().out
+    assert "reused" in printed  # the linear probe joined the second report
+    content = json.loads((out / "diagnose.json").read_text())
+    assert set(content["findings"]) == {"linear", "grad-cam"}
+    assert content["subject"]["layers"] == ["encoder", "decoder"]
+    values = content["findings"]["linear"]["values"]
+    assert set(values["linear"]["trained"]) == {"encoder", "decoder"}
+    assert set(values["linear"]["controls"]) == {"input", "position"}
+    assert set(values["linear"]["untrained"]["encoder"]) == {"edges", "depth", "distance", "phase", "order"}
+    layer = values["four_convolutions"]["trained"]["encoder"]
+    assert layer["edges"]["r2"] == pytest.approx(1 - layer["edges"]["mse"] / layer["edges"]["mse_of_mean"])
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == 4 and "encoder" in page
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    assert "fpp-bench diagnose" in page and "--layers encoder decoder" in page
+
+    def never(*args):
+        raise AssertionError("run again")
+
+    monkeypatch.setattr(diagnosis, "_run_probe", never)
+    assert call(*arguments, "--probe", "linear", "--probe", "grad-cam", "--threads", 1) == 0
+    assert (out / "index.html").read_text().count("data:image/png") == 4
+
+
+def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tmp_path):
+    out = tmp_path / "report"
+    assert call("classical", tiny, "--out", out, "--probe", "linear", "--probe", "grad-cam") == 0
+    content = json.loads((out / "diagnose.json").read_text())
+    assert all("without a network" in finding["skipped"] for finding in content["findings"].values())
+    assert "Not run: classical is a method without a network" in (out / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "says"),
+    [
+        ("unett", (), "unknown model 'unett'; there are classical"),
+        ("MINE:make", ("--probe", "gradcam"), "unknown probe 'gradcam'; did you mean 'grad-cam'"),
+        ("MINE:make", ("--layers", "encodr"), "has no layer 'encodr'; there are encoder"),
+        ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
+        ("MINE:make", ("--frame", "99"), "expected 0 to 51"),
+        ("MINE:nothing", (), "holds no function 'nothing'"),
+        ("MINE:shape", (), "expected an output of shape (1, 1, 176, 176), one depth per pixel, got (1, 1, 88, 176)"),
+        ("MINE:nan", (), "30976 of 30976 values of its output are NaN"),
+        ("MINE:several", (), "got tuple"),
+        ("MINE:fails", (), "on fringes of shape (1, 1, 176, 176) it failed"),
+        ("MINE:raises", (), "RuntimeError: no weights here"),
+        ("MINE:number", (), "expected it to return a torch module, got int"),
+        ("FOLDER/absent.py:make", (), "no such file"),
+        ("FOLDER/broken.py:make", (), "importing it failed: ModuleNotFoundError"),
+        ("classical", ("--layers", "enc1"), "has no layers"),
+        ("phase", ("--units", "mm"), "its units are known"),
+        ("unet-individual-rmse", (), "was trained at (224, 224) px"),
+    ],
+)
+def test_what_cannot_be_looked_into_is_refused_with_a_reason(tiny, module_file, tmp_path, capsys, model, options, says):
+    (module_file.parent / "broken.py").write_text("import a_package_that_there_is_not\n")
+    model = model.replace("MINE", str(module_file)).replace("FOLDER", str(module_file.parent))
+    assert call(model, tiny, "--out", tmp_path / "report", *options) == 2
+    printed = capsys.readouterr().err
+    assert says in printed and "Traceback" not in printed
+    assert not (tmp_path / "report" / "index.html").exists()
+
+
+def test_a_folder_with_something_else_in_it_is_not_written_into(tiny, module_file, tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("x")
+    assert call("classical", tiny, "--out", tmp_path) == 2
+    assert "holds thesis.tex" in capsys.readouterr().err
+    assert call("classical", tiny, "--out", tmp_path / "thesis.tex") == 2
+    assert call("classical", tiny, "--out", tmp_path / "r", "--samples", 0) == 2
+
+
+# ---- resuming
+
+
+class Counted:
+    name, title, question, version = "linear", "Counted", "How often?", 1
+
+    def __init__(self) -> None:
+        self.runs = 0
+
+    def applies_to(self, model):
+        return None
+
+    def run(self, model, dataset, settings, folder, progress):
+        self.runs += 1
+        if settings.samples == 13:
+            raise KeyboardInterrupt
+        return Finding(self.name, self.title, "Once.", {"runs": self.runs})
+
+
+def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_path, monkeypatch):
+    counted = Counted()
+    monkeypatch.setattr(diagnosis, "probe", lambda name: counted)
+    classical, phase = subject("classical", opened), subject("phase", opened)
+
+    def ask(model, settings):
+        diagnosis.diagnose(model, opened, ["linear"], settings, tmp_path / "out", lambda probe: lambda *progress: None)
+        return counted.runs
+
+    assert ask(classical, ProbeSettings()) == 1
+    assert ask(classical, ProbeSettings()) == 1
+    assert ask(classical, ProbeSettings(seeds=3)) == 2
+    assert ask(phase, ProbeSettings(seeds=3)) == 3
+    with pytest.raises(KeyboardInterrupt):
+        ask(phase, ProbeSettings(samples=13))
+    assert ask(phase, ProbeSettings(seeds=3)) == 4  # what the stopped run did not replace is still there
+    counted.version = 2
+    assert ask(phase, ProbeSettings(seeds=3)) == 5
+
+
+def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
+    finding = Finding(
+        "linear", "Title", "Said.", {"a": [1, None], "b": {"c": 0.5}},
+        (Table("T", ("x", "y"), (("a", 1.5), ("b", None))),), (Figure("F", "f.png", "alt"),),
+    )  # fmt: skip
+    (tmp_path / "f.png").write_bytes(b"png")
+    save_finding(tmp_path, "key", finding, 1.25)
+    stored, seconds = load_finding(tmp_path, "linear", "key")
+    assert seconds == 1.25 and stored.values == finding.values and stored.figures == finding.figures
+    assert [list(row) for row in stored.tables[0].rows] == [["a", 1.5], ["b", None]]
+    assert load_finding(tmp_path, "linear", "other") is None and load_finding(tmp_path, "absent", "key") is None
+    (tmp_path / "f.png").unlink()
+    assert load_finding(tmp_path, "linear", "key") is None
+    (tmp_path / "linear.json").write_text('{"key": "key"')
+    assert load_finding(tmp_path, "linear", "key") is None
+    with pytest.raises(ValueError, match="Out of range float"):
+        save_finding(tmp_path, "key", Finding("x", "", "", {"a": float("nan")}), 0.0)
+    with pytest.raises(ValueError, match="3 cells"):
+        Table("T", ("x", "y"), (("a", 1, 2),))
+
+
+def test_text_of_a_finding_can_only_be_text(tmp_path):
+    context = {
+        "subject": {"name": "<b>x</b>", "title": "t", "frames_used": [0], "direction": "both", "layers": []},
+        "dataset": {"name": "d", "fingerprint": "0" * 64, "size": [4, 4], "samples": {"test": 1}},
+        "settings": {"samples": None}, "software": {}, "command": "fpp-bench <i>", "hardware": {"cpu": "c", "cores": 1},
+    }  # fmt: skip
+    table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
+    page = report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
+    for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
+        assert tag not in page
+    assert "0.1235" in page
+
+
+def test_probes_by_name_and_samples_evenly():
+    assert checked_names(()) == tuple(PROBES)
+    assert checked_names(("theory", "linear", "theory")) == ("linear", "theory")
+    assert spread_over("abcdefgh", 3) == ["b", "e", "g"]
+    assert spread_over("abc", None) == spread_over("abc", 9) == ["a", "b", "c"]
+    with pytest.raises(DiagnosisError, match="expected 1 or more"):
+        ProbeSettings(samples=0)
+
+
+# ---- subjects
+
+
+def float32_tolerance(network, values):
+    """How far the float32 output of ``network`` may be from ``values``, its exact output, on any processor.
+
+    Processors add the products of a convolution in different orders: n terms are off by n u at most, relative to the
+    sum of their magnitudes. Normalisation keeps the maps between convolutions at one scale, so the errors of the
+    convolutions in a row add up, relative to the largest output.
+    """
+    sums = [layer.weight[0].numel() for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)]
+    return float(len(sums) * max(sums) * U32 * np.abs(values).max())
+
+
+def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_path):
+    network = tiny_network("unet", width=4, seed=3)
+    path = tmp_path / "net.safetensors"
+    save_weights(
+        path, network, config_of(network, image_size=opened.size, normalisation="raw", background_removed=True)
+    )
+    weights_subject = subject(str(path), opened)
+    sample = opened.samples("test")[0]
+    frames = weights_subject.captured(opened, sample)
+    inside = object_mask(opened.depth_mm(sample))
+    assert (
+        weights_subject.layer_names[0] == "enc1"
+        and weights_subject.layer_names[-1] == "dec1"
+        and len(weights_subject.layer_names) == 9
+    )
+    assert (
+        weights_subject.units == "mm"
+        and weights_subject.direction == "horizontal"
+        and weights_subject.uses_ground_truth_mask
+    )
+    assert not frames[0][~inside].any() and frames[0][inside].any() and frames[1] is None
+    with torch.inference_mode():
+        expected = deepcopy(network).double()(weights_subject.input_tensor(frames).double())[0, 0].numpy()
+    tolerance = float32_tolerance(network, expected)
+    with torch.inference_mode():
+        changed = deepcopy(network)
+        changed.head.weight.mul_(1.01)  # a layer that is wrong by 1% must show
+        assert np.abs(changed(weights_subject.input_tensor(frames))[0, 0].numpy() - expected).max() > 4 * tolerance
+    assert weights_subject.represent(frames) == pytest.approx(expected, abs=tolerance)
+    assert weights_subject.predict(frames) == pytest.approx(expected, abs=tolerance)
+    same_seed, other_seed = weights_subject.untrained(3), weights_subject.untrained(4)
+    assert torch.equal(next(same_seed.parameters()), next(network.parameters()))  # seed 3 is what made the network
+    assert not torch.equal(next(other_seed.parameters()), next(same_seed.parameters()))
+    assert list(weights_subject.layers_of(other_seed)) == list(weights_subject.layer_names)
+    two_layers = subject(str(path), opened, layers=["dec1", "enc1"])
+    assert two_layers.layer_names == ("enc1", "dec1") and two_layers.sha256 == weights_subject.sha256
+    with pytest.raises(DiagnosisError, match="frame 0, which is missing"):
+        weights_subject.input_tensor([None])
+    with pytest.raises(DiagnosisError, match="no network"):
+        subject("classical", opened).represent(frames)
+
+
+def test_units_of_a_users_module_turn_its_output_into_mm(opened, module_file):
+    frames = opened.frames(opened.samples("test")[0], range(1))
+    normalised, metres, mm = (
+        subject(f"{module_file}:make", opened, units=units) for units in ("normalised", "m", "mm")
+    )
+    assert (normalised.units, metres.units, mm.units) == ("normalised", "mm", "mm")
+    expected = mm.predict(frames)
+    tolerance = float32_tolerance(mm.network, expected)
+    assert metres.predict(frames) == pytest.approx(1000 * expected, abs=1000 * tolerance)
+    assert normalised.predict(frames) == pytest.approx(expected, abs=tolerance)
+    assert len({module_subject.sha256 for module_subject in (normalised, metres, mm)}) == 3
+    assert (
+        subject(f"{module_file}:make", opened, units="mm").sha256 == mm.sha256
+    )  # drawn weights are the same every time
+    assert mm.layer_names == ("encoder", "decoder", "head", "unused")
+    assert subject(f"{module_file}:make", opened, layers=["decoder.0"]).layer_names == ("decoder.0",)

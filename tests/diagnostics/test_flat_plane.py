@@ -1,0 +1,79 @@
+"""Flat planes: what a right, a collapsed and a template answer look like in the numbers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.diagnostics import flat_plane
+from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
+from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
+from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
+from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
+from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.stability import U32
+
+
+def answering(dataset, answer, units="mm"):
+    return SimpleNamespace(
+        name="known", units=units, normalisation=None, uses_ground_truth_mask=False, frames_used=(51,),
+        image_size=dataset.size, predict=lambda frames: answer(frames).astype(np.float32), weights_sha256=None,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def decoded(opened, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("planes")
+    exact = subject_of_method(method("classical", opened.rig, direction="horizontal"), opened)
+    return FlatPlane().run(exact, opened, ProbeSettings(quick=True), folder, silent), folder
+
+
+def test_the_exact_decoder_finds_every_plane(decoded):
+    finding, folder = decoded
+    planes = finding.values["planes"]
+    assert {row["distance_m"] for row in planes} == {1.6, 1.8, 2.0}
+    assert {row["outline"] for row in planes} == {"fills the frame", "rectangle", "power_drill_A0"}
+    for row in planes:
+        assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
+        assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
+    assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
+    assert all((folder / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    save_finding(folder, "key", finding, 1.0)
+
+
+def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
+    background = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
+    finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), tmp_path, silent)
+    assert all(row["collapsed_share"] == 1 for row in finding.values["planes"])
+    low, high = finding.values["range_mm"]
+    records = [opened.measured(sample) for sample in opened.samples("test")]
+    assert low == pytest.approx(np.mean([record["depth_min_mm"] for record in records]))
+    assert high == pytest.approx(np.mean([record["depth_max_mm"] for record in records]))
+    # The answer 0.05 is rounded to float32 once.
+    assert finding.values["planes"][0]["mean_mm"] == pytest.approx(low + 0.05 * (high - low), abs=U32 * (high - low))
+    assert finding.values["objects"]["collapsed_share"] == 1 > finding.values["objects"]["collapsed_share_true"]
+    assert "100% of a rectangular plane" in finding.summary
+
+
+def test_collapse_is_nearer_to_background_than_to_any_object():
+    mm, normalised = Scale(False, (1700.0, 1900.0), 1500.0), Scale(True, (1700.0, 1900.0), 1500.0)
+    values = np.array([-1.0, 0.0, 749.0, 751.0])
+    assert mm.collapsed(values).tolist() == [True, True, True, False] and mm.mm(values) is values
+    assert normalised.collapsed(np.array([-1.2, 0.09, 0.11])).tolist() == [True, True, False]
+    assert normalised.mm(np.array([0.5])).tolist() == [1800.0]
+
+
+def test_who_is_told_the_mask_is_not_asked(opened):
+    masked = answering(opened, lambda frames: frames[51])
+    masked.uses_ground_truth_mask = True
+    assert "uses the object's mask" in FlatPlane().applies_to(masked) and Counterfactual().applies_to(masked) is None
+
+
+def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
+    still = answering(opened, lambda frames: np.full(frames[51].shape, 1800.0))
+    finding = Counterfactual().run(still, opened, ProbeSettings(quick=True), tmp_path, silent)
+    assert finding.values["reliance"]["score"] == 0
+    assert "does not follow the phase" in finding.summary
+    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    save_finding(tmp_path, "key", finding, 1.0)

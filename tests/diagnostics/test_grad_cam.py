@@ -1,0 +1,144 @@
+"""Grad-CAM against gradients by hand, and the correlations that are made of it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from test_probes import oracle
+from torch import nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, Mean, correlation, ratio
+from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam, cam_layers, heatmaps, measure
+from fpp_ml_bench.baselines.diagnostics.grad_cam_report import ratio_text
+from fpp_ml_bench.baselines.diagnostics.probe import silent
+from fpp_ml_bench.baselines.diagnostics.user_module import randomised
+from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.errors import DiagnosisError
+
+
+def convolutions(*channels, kernel=1):
+    layers = (nn.Conv2d(a, b, kernel, padding=kernel // 2) for a, b in pairwise(channels))
+    return nn.Sequential(*layers)
+
+
+def test_a_linear_network_has_the_heatmap_that_pen_and_paper_give():
+    """Output mean = sum_c v_c mean(A_c) + const, so each channel weighs v_c / (H W), whatever the image."""
+    network = convolutions(1, 3, 1)
+    v = torch.tensor([2.0, -1.0, 0.5])
+    network[1].weight.data[:] = v.view(1, 3, 1, 1)
+    network.requires_grad_(False)
+    fringe = torch.rand(2, 1, 6, 8)
+    heatmap = heatmaps(network, {"first": network[0]}, fringe)["first"]
+    weighted = v.view(3, 1, 1) * network[0](fringe) / (6 * 8)
+    # A channel's weight is a sum over 6 x 8 pixels; fewer than 64 roundings of the magnitudes in all.
+    tolerance = 64 * U32 * float(weighted.abs().sum(1).max())
+    assert torch.allclose(heatmap, weighted.sum(1), rtol=0, atol=tolerance)
+
+
+def test_a_bent_network_at_half_the_size_has_that_of_its_own_gradients():
+    torch.manual_seed(1)
+    first, second = nn.Conv2d(1, 4, 3, stride=2, padding=1), nn.ConvTranspose2d(4, 1, 2, stride=2)
+    network = nn.Sequential(first, nn.ReLU(), second, nn.Sigmoid()).requires_grad_(False)
+    fringe = torch.rand(3, 1, 8, 12)
+    for sample in range(3):
+        activations = first(fringe[sample : sample + 1]).requires_grad_(True)
+        (gradient,) = torch.autograd.grad(second(activations.relu()).sigmoid().mean(), activations)
+        heat = (gradient.mean((2, 3), keepdim=True) * activations).sum(1, keepdim=True)
+        magnitudes = (gradient.abs().mean((2, 3), keepdim=True) * activations.abs()).sum(1).detach()
+        expected = functional.interpolate(heat, size=(8, 12), mode="bilinear")[0, 0].detach()
+        heatmap = heatmaps(network, {"first": first}, fringe)["first"][sample]
+        # Sums over 24 gradients, 9 products, 4 channels and 4 neighbours: fewer than 64 roundings of the magnitudes.
+        assert torch.allclose(heatmap, expected, rtol=0, atol=64 * U32 * float(magnitudes.max()))
+
+
+def test_layers_that_have_no_heatmap_are_refused():
+    flat = nn.Sequential(nn.Flatten(), nn.Linear(16, 16), nn.Unflatten(1, (1, 4, 4)))
+    with pytest.raises(DiagnosisError, match="layer '1'"):
+        heatmaps(flat, {"1": flat[1]}, torch.rand(2, 1, 4, 4))
+    idle = convolutions(1, 2, 1)
+    idle.add_module("unused", nn.Sequential())
+    network = nn.Sequential(idle[0], idle[1])
+    with pytest.raises(DiagnosisError, match="leave it out"):
+        heatmaps(network, {"other": nn.Conv2d(1, 1, 1)}, torch.rand(2, 1, 4, 4))
+
+
+def test_correlation_is_pearsons():
+    a, b = np.random.default_rng(0).normal(size=(2, 9, 7))
+    assert correlation(a, b) == pytest.approx(np.corrcoef(a.ravel(), b.ravel())[0, 1], abs=1e-12)
+    assert correlation(a * 1e-9, 5 - 3e6 * a) == pytest.approx(-1)
+    assert correlation(a, np.full((9, 7), 0.3)) is None and correlation(np.zeros((9, 7)), b) is None
+
+
+def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
+    correlations = Correlations(("a", "b"), ["x", "x", "y"])
+    for layer, edges in (("a", [0.4, 0.2, None]), ("b", [0.1, 0.1, 0.1])):
+        for r in edges:
+            correlations.add("trained", layer, EDGES, r)
+            correlations.add("trained", layer, FRINGES, 0.1)
+    for seed, r in ((0, 0.2), (1, 0.4)):
+        for _ in range(3):
+            correlations.add(f"untrained {seed}", "a", OWN, r)
+    assert correlations.mean("a", EDGES).r == pytest.approx(0.3) and correlations.mean("a", EDGES).count == 2
+    assert correlations.mean("a", OWN, trained=False).r == pytest.approx(0.3)
+    assert correlations.average(EDGES).r == pytest.approx(0.2)
+    assert ratio(correlations.average(EDGES).r, correlations.average(FRINGES).r) == pytest.approx(2)
+    assert ratio(0.1, 0.0) is None and ratio(None, 0.1) is None
+
+
+@pytest.mark.parametrize(("fields", "wins"), [(("edges",), EDGES), (("inside",), FRINGES)])
+def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(opened, fields, wins):
+    """A network that outputs the Sobel map correlates with it by 1, at the layer where it is."""
+    subject = oracle(opened, fields)
+    correlations = measure(subject, opened, opened.samples("test")[:3], ("out",), 1, silent)
+    edges, fringes = correlations.mean("out", EDGES).r, correlations.mean("out", FRINGES).r
+    assert (edges > fringes) == (wins == EDGES)
+    if wins == EDGES:
+        assert edges == pytest.approx(1, abs=1e-6)
+        assert ratio(edges, fringes) > 1.5
+    # The stand-in for random weights is the network itself: the sanity check must say that nothing changed.
+    assert correlations.mean("out", OWN, trained=False).r == pytest.approx(1, abs=1e-6)
+    assert correlations.references.r == pytest.approx(fringes if wins == EDGES else correlations.references.r)
+
+
+def test_random_weights_come_from_the_seed_alone():
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    random_networks = [randomised(convolutions(1, 3, 1, kernel=3), seed) for seed in (1, 1, 2)]
+    weights = [network[0].weight for network in random_networks]
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+    assert not torch.equal(torch.get_rng_state(), state)  # making the networks drew from it ...
+    torch.set_rng_state(state)
+    randomised(random_networks[0], 1)
+    assert torch.equal(torch.get_rng_state(), state)  # ... randomising them did not
+
+    class Bare(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(torch.arange(30.0))
+
+    shuffled = randomised(Bare(), 0).weight
+    assert torch.equal(shuffled.sort().values, torch.arange(30.0)) and not torch.equal(shuffled, torch.arange(30.0))
+
+
+def test_the_papers_six_layers_are_taken_where_there_are_nine(opened):
+    subject = oracle(opened, ("edges",))
+    assert cam_layers(subject) == ("out",)
+    names = ("enc1", "enc2", "enc3", "enc4", "bottleneck", "dec4", "dec3", "dec2", "dec1")
+    object.__setattr__(subject, "layer_names", names)
+    assert cam_layers(subject) == ("enc3", "enc4", "bottleneck", "dec4", "dec2", "dec1")
+    object.__setattr__(subject, "network", None)
+    assert "no gradient" in GradCam().applies_to(subject)
+
+
+@pytest.mark.parametrize(
+    ("fringes", "says"),
+    [
+        (Mean(0.1, (0.05, 0.2), 3), "ratio 2.00"),
+        (Mean(0.1, (-0.05, 0.2), 3), "ratio 2.00, which says nothing: its divisor can't be told from 0"),
+        (Mean(None, None, 0), "no ratio"),
+    ],
+)
+def test_a_ratio_over_something_near_zero_says_so(fringes, says):
+    assert ratio_text(Mean(0.2, (0.1, 0.3), 3), fringes) == says

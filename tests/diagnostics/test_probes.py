@@ -1,0 +1,288 @@
+"""Probes against closed forms: what they are asked for, how they are fitted, and networks whose answer is known."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from torch import nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.diagnostics import convolution_probe as convolution
+from fpp_ml_bench.baselines.diagnostics import linear_measure as measuring
+from fpp_ml_bench.baselines.diagnostics.activations import INPUT, at_pixels, at_size, tapped
+from fpp_ml_bench.baselines.diagnostics.ridge import NormalEquations, apply
+from fpp_ml_bench.baselines.diagnostics.scores import score
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.diagnostics.targets import edge_map, fringe_variation, truth
+from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.decoding import depth_from_coordinate, wrapped_phase
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DiagnosisError
+
+RNG = np.random.default_rng(7)
+
+
+class Oracle(nn.Module):
+    """A network that knows the truth of the samples it is shown: its layer ``out`` holds the maps it was given."""
+
+    def __init__(self, maps: dict[float, torch.Tensor]) -> None:
+        super().__init__()
+        self.out = nn.Identity()
+        self.maps = maps
+
+    def forward(self, fringe: torch.Tensor) -> torch.Tensor:
+        maps = torch.stack([self.maps[float(image.detach().double().sum())] for image in fringe])
+        return self.out(maps + 0 * fringe).mean(1, keepdim=True)
+
+
+def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
+    """A subject around ``network``, whose ``layers`` are its children."""
+    return Subject(
+        name="known", title="known", sha256="0" * 64, units="normalised", image_size=size, frames_used=(0,),
+        direction="horizontal", predict_frames=lambda frames: np.zeros(size, np.float32), normalisation="individual",
+        network=network, layer_names=layers, find_layers=lambda any_network: dict(any_network.named_children()),
+        untrained=lambda seed: network,
+    )  # fmt: skip
+
+
+def oracle(opened, fields):
+    """An `Oracle` of the maps ``fields`` of `Truth`, as a subject."""
+    maps = {}
+    for sample in opened.samples("all"):
+        ground_truth = truth(opened.depth_mm(sample), opened.rig, "horizontal")
+        key = subject_with(nn.Identity(), opened.size).input_tensor([opened.frame(sample, 0)])[0]
+        maps[float(key.double().sum())] = torch.from_numpy(np.stack([getattr(ground_truth, name) for name in fields]))
+    return subject_with(Oracle(maps), opened.size)
+
+
+# ---- what is asked for
+
+
+def test_edges_are_scipys_sobel():
+    depth = ndimage.gaussian_filter(RNG.normal(size=(20, 30)), 2)
+    across, down = (ndimage.sobel(depth, axis, mode="mirror") for axis in (1, 0))
+    expected = np.hypot(across, down)
+    # Sobel's weights have magnitudes that sum to 8; depth, products, sums and root are rounded to float32 8 times.
+    tolerance = 8 * 8 * U32 * np.abs(depth).max() / expected.max()
+    assert edge_map(depth) == pytest.approx(expected / expected.max(), abs=tolerance)
+    assert not edge_map(np.full((5, 5), 1800.0)).any()
+
+
+@pytest.mark.parametrize(("period", "side"), [(5.26, 7), (5.0, 5), (22.56, 23), (1.0, 3)])
+def test_fringe_variation_is_the_spread_in_a_window_of_a_period(period, side):
+    grey = RNG.integers(0, 256, (40, 50)).astype(np.uint8)
+    expected = ndimage.generic_filter(grey.astype(float), np.std, size=side, mode="mirror")
+    # Sums are in float64; the result is rounded to float32 once.
+    assert fringe_variation(grey, period) == pytest.approx(expected, rel=2 * U32)
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_true_phase_is_the_one_that_eighteen_frames_measure(opened, direction):
+    sample = opened.samples("test")[0]
+    ground_truth = truth(opened.depth_mm(sample), opened.rig, direction)
+    measured = wrapped_phase(opened.frames(sample, opened.sequence.sinusoids(direction)))
+    inside = ndimage.binary_erosion(ground_truth.inside & (measured.modulation > 20), iterations=3)
+    assert inside.sum() > 200
+    error_rad = np.angle(np.exp(1j * (measured.phase - np.arctan2(ground_truth.sine, ground_truth.cosine))))[inside]
+    assert np.median(np.abs(error_rad)) < 0.02
+    assert not ground_truth.sine[~ground_truth.inside].any() and not ground_truth.order[~ground_truth.inside].any()
+
+
+def test_phase_and_order_together_are_the_depth(opened):
+    depth_mm = opened.depth_mm(opened.samples("test")[0])
+    rig, inside = opened.rig, object_mask(depth_mm)
+    ground_truth = truth(depth_mm, rig, "horizontal")
+    x, y = rig.camera.rays()
+    points = np.stack([x, y, np.ones_like(x)], axis=-1) * rig.standoff_m
+    reference = np.floor(rig.project(points)[1] / rig.pitch("horizontal"))
+    phase = np.arctan2(ground_truth.sine, ground_truth.cosine) % (2 * np.pi)
+    row = (reference + ground_truth.order + phase / (2 * np.pi)) * rig.pitch("horizontal")
+    decoded_mm = depth_from_coordinate(rig.camera.rays(), np.where(inside, row, np.nan), rig, "horizontal")
+    # Sine and cosine are rounded to float32: 2 u in phase, and 1 rad is less than half of the depth.
+    assert decoded_mm[inside] == pytest.approx(depth_mm[inside], rel=2 * U32)
+    with pytest.raises(ValueError, match="background throughout"):
+        truth(np.zeros_like(depth_mm), rig, "horizontal")
+
+
+# ---- how it is fitted
+
+
+def ridge_by_numpy(x, y, strength):
+    """The same estimate by its definition: standardised features, a bias that is free."""
+    mean, spread = x.mean(0), x.std(0)
+    z = (x - mean) / spread
+    inner = z.T @ z / len(x) + strength * np.eye(x.shape[1])
+    weight = np.linalg.solve(inner, z.T @ (y - y.mean(0)) / len(x)) / spread[:, None]
+    return np.vstack([weight, y.mean(0) - mean @ weight])
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-6, 0.3])
+def test_streamed_ridge_is_the_closed_form(strength):
+    x = RNG.normal(size=(400, 6)) * [1, 2, 30, 0.1, 5, 1] + [0, 4, 500, 0, 1, 0]
+    y = x[:, :2] @ RNG.normal(size=(2, 3)) + RNG.normal(size=(400, 3))
+    parts, whole = NormalEquations(6, 3), NormalEquations(6, 3)
+    for start in range(0, 400, 37):
+        parts.add(torch.from_numpy(x[start : start + 37]), torch.from_numpy(y[start : start + 37]))
+    whole.add(torch.from_numpy(x), torch.from_numpy(y))
+    weights = parts.solve(strength)
+    assert weights.numpy() == pytest.approx(ridge_by_numpy(x, y, strength), rel=1e-7, abs=1e-9)
+    assert weights.numpy() == pytest.approx(whole.solve(strength).numpy(), rel=1e-9, abs=1e-12)
+    if not strength:
+        design = np.hstack([x, np.ones((400, 1))])
+        expected = design @ np.linalg.lstsq(design, y, rcond=None)[0]
+        assert apply(weights, torch.from_numpy(x)).numpy() == pytest.approx(expected, abs=1e-8)
+    assert parts.target_mean.numpy() == pytest.approx(y.mean(0))
+
+
+def test_constant_and_copied_channels_do_no_harm():
+    x = RNG.normal(size=(200, 1))
+    both = np.hstack([x, x, np.full_like(x, 3.0)])
+    y = 2 * x + 1
+    equations = NormalEquations(3, 1)
+    equations.add(torch.from_numpy(both), torch.from_numpy(y))
+    assert apply(equations.solve(), torch.from_numpy(both)).numpy() == pytest.approx(y, abs=1e-4)
+    with pytest.raises(ValueError, match="observations"):
+        NormalEquations(3, 1).solve()
+
+
+def test_pixels_of_a_coarse_layer_are_those_of_the_upsampled_one():
+    features, size = torch.randn(2, 3, 5, 7), (20, 28)
+    pixels = torch.arange(size[0] * size[1]).expand(2, -1)
+    expected = functional.interpolate(features, size=size, mode="bilinear", align_corners=False).flatten(2)
+    # A place in the map is rounded to some u of its width, and neighbours differ by twice the largest value at most.
+    tolerance = 8 * U32 * 2 * 7 * float(features.abs().max())
+    assert torch.allclose(at_pixels(features, pixels, size), expected.transpose(1, 2), rtol=0, atol=tolerance)
+    fine = torch.randn(2, 3, *size)
+    assert torch.equal(at_pixels(fine, pixels, size), fine.flatten(2).transpose(1, 2))
+    # Means of 16 values, added in any order.
+    tolerance = 16 * U32 * float(fine.abs().max())
+    assert torch.allclose(at_size(fine, (5, 7)), functional.avg_pool2d(fine, 4), rtol=0, atol=tolerance)
+    assert at_size(fine, size).data_ptr() != fine.data_ptr()
+
+
+def test_activations_are_taken_before_a_later_layer_works_in_place_on_them():
+    network = nn.Sequential(nn.Conv2d(1, 2, 1), nn.ReLU(inplace=True))
+    network[0].weight.data[:] = torch.tensor([1.0, -1.0]).view(2, 1, 1, 1)
+    image = torch.linspace(-2, 3, 16).view(1, 1, 4, 4)
+    expected = network[0](image)
+    assert (expected < 0).any()
+    with tapped({"conv": network[0]}, lambda features: at_size(features, (4, 4))) as activations:
+        network(image)
+    assert torch.equal(activations["conv"], expected)
+    with (
+        tapped({"flat": network[0]}, lambda features: features) as activations,
+        pytest.raises(DiagnosisError, match="expected activations"),
+    ):
+        network(image[0])  # an image without its batch axis: (C, h, w)
+    assert not network[0]._forward_hooks
+
+
+def test_score_is_share_of_variance_with_an_interval_that_holds_it():
+    errors = [[1.0, 2.0, 3.0, 2.0], [1.0, 2.0, 5.0, 2.0]]
+    result = score(errors, [4.0, 4.0, 8.0, 4.0], ["a", "a", "b", "c"])
+    assert result.mse == pytest.approx(2.25) and result.r2 == pytest.approx(1 - 2.25 / 5)
+    assert result.seeds == pytest.approx((1 - 2 / 5, 1 - 2.5 / 5))
+    low, high = result.r2_interval
+    assert low < result.r2 < high
+    half_error = score(
+        [[2.0, 4.0, 8.0]], [4.0, 8.0, 16.0], ["a", "b", "c"]
+    )  # large objects, large errors: half either way
+    assert half_error.r2_interval == pytest.approx((0.5, 0.5))
+    assert score([[0.0, 0.0]], [1.0, 1.0], ["a", "b"]).r2 == 1
+    assert score([[0.0, 0.0]], [1.0, 1.0], ["a", "a"]).r2_interval is None
+    with pytest.raises(ValueError, match="nothing to explain"):
+        score([[0.0]], [0.0], ["a"])
+
+
+# ---- four convolutions
+
+
+def test_moments_are_mean_and_spread_of_each_channel():
+    batches = [torch.randn(n, 3, 4, 5) * torch.tensor([1.0, 10.0, 0.0]).view(3, 1, 1) + 2 for n in (2, 3)]
+    moments = convolution.Moments()
+    for batch in batches:
+        moments.add(batch)
+    mean, factor = moments.standard()
+    flat = torch.cat(batches).transpose(0, 1).flatten(1).double()
+    # Sums are in float64; mean and factor are rounded to float32 once.
+    assert torch.allclose(mean.double(), flat.mean(1), rtol=2 * U32, atol=0)
+    assert torch.allclose(1 / factor[:2].double(), flat.std(1, correction=0)[:2], rtol=2 * U32, atol=0)
+    assert factor[2] == 0  # a constant channel says nothing
+
+
+def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
+    torch.manual_seed(0)
+
+    def batch():
+        features = {"here/a": torch.randn(8, 3, 12, 12), "else/b": torch.randn(8, 3, 12, 12)}
+        bumps = features["here/a"][:, :1].abs()
+        return features, {"edges": functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)}
+
+    features, target = batch()
+    moments = {name: convolution.Moments() for name in features}
+    for name, moment in moments.items():
+        moment.add(features[name])
+    mean = float(target["edges"].mean())
+    probes = convolution.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
+    assert set(probes.probes) == {("here/a", "edges", 0), ("here/a", "edges", 1), ("else/b", "edges", 0)}
+    reference = (target["edges"].double() - mean).square().mean((1, 2, 3))
+    for errors in probes.errors(features, target).values():
+        # Each difference is rounded to float32 once, which its square doubles.
+        assert errors == pytest.approx(reference.tolist(), rel=4 * U32)
+    for _ in range(90):
+        probes.step(*batch())
+    remaining = {
+        key: np.mean(moment) / float(reference.mean()) for key, moment in probes.errors(features, target).items()
+    }
+    assert remaining["here/a", "edges", 0] < 0.7 and remaining["here/a", "edges", 1] < 0.7
+    assert remaining["else/b", "edges", 0] > 0.9
+
+
+# ---- networks whose answer is known
+
+
+def linear_r2(subject, opened, targets=tuple(measuring.TARGETS)):
+    train, validation = opened.samples("train")[::2], opened.samples("validation")
+    pixels = measuring.Pixels(subject, opened, targets)
+    errors, reference = measuring.linear_errors(
+        subject, subject.network, pixels, train, validation, True, lambda count, activity: None
+    )
+    return {key: 1 - np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
+
+
+@pytest.mark.parametrize("target", measuring.TARGETS)
+def test_what_a_layer_holds_is_read_from_it(opened, target):
+    """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine reads the phase."""
+    r2 = linear_r2(oracle(opened, measuring.TARGETS[target]), opened)
+    assert r2["out", target] > 0.999
+    for other_target in {"edges", "phase"} - {target}:
+        assert r2["out", other_target] < 0.5
+
+
+def test_the_layer_of_an_identity_is_the_raw_input(opened):
+    class Same(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.out = nn.Identity()
+
+        def forward(self, fringe):
+            return self.out(fringe)
+
+    r2 = linear_r2(subject_with(Same(), opened.size), opened)
+    for target in measuring.TARGETS:
+        assert r2["out", target] == r2[INPUT, target]
+    # One grey level holds the cosine, up to brightness, and nothing of the sine: half of the phase at most.
+    assert 0.2 < r2[INPUT, "phase"] < 0.5
+    assert abs(r2["position", "phase"]) < 0.05
+
+
+def test_spatial_probes_of_an_edge_reader_read_edges(opened):
+    subject = oracle(opened, ("edges",))
+    train, validation = opened.samples("train")[::3], opened.samples("validation")
+    errors, reference = measuring.spatial_errors(
+        subject, {"trained": subject.network}, opened, train, validation, {"trained": 1, INPUT: 1}, 25,
+        lambda count, activity: None,
+    )  # fmt: skip
+    remaining = {key[:3]: np.mean(sample_errors) / np.mean(reference[key[2]]) for key, sample_errors in errors.items()}
+    assert remaining["trained", "out", "edges"] < 0.25
+    assert remaining["trained", "out", "edges"] < remaining[INPUT, INPUT, "edges"]

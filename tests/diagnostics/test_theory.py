@@ -1,0 +1,64 @@
+"""The two theorems: frames that are the same bytes at two depths, and exponents against closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
+from fpp_ml_bench.baselines.diagnostics.synth import SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.theory import Theory, depth_error_mm, error_curves, kappa_per_m, twins_of
+from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.optics import paper_rig
+
+
+@pytest.mark.parametrize("direction, other_frame", [("horizontal", 18), ("vertical", 0)])
+def test_two_depths_give_the_same_bytes(direction, other_frame, opened):
+    twins = twins_of(opened, SceneRenderer.of(opened), direction)
+    inside = twins.depths_mm[0] > 0
+    distance_mm = np.abs(twins.depths_mm[1] - twins.depths_mm[0])[inside]
+    assert distance_mm.min() > 150 and ((twins.depths_mm[1] > 0) == inside).all()
+    np.testing.assert_array_equal(twins.frames[0], twins.frames[1])
+    np.testing.assert_array_equal(twins.noiseless[0], twins.noiseless[1])
+    assert twins.other_frame == other_frame and (twins.other_frames[0] != twins.other_frames[1]).mean() > 0.01
+    assert (twins.frames[0] != twins.noiseless[0]).any()  # the noise is there
+    assert 0 < twins.paint.min() <= twins.paint.max() <= 1
+
+
+def test_no_room_for_a_period_is_said(opened):
+    renderer = SceneRenderer.of(opened)
+    renderer.rig = replace(renderer.rig, working_range_mm=(1700.0, 1900.0))
+    with pytest.raises(DiagnosisError, match="no test object fits twice"):
+        twins_of(opened, renderer)
+
+
+@pytest.mark.parametrize("direction, baseline_m", [("horizontal", 0.1), ("vertical", 0.125)])
+def test_one_period_against_the_closed_form(direction, baseline_m):
+    rig, z = paper_rig(176), np.geomspace(0.3, 9.0, 50)
+    kappa = 18 / (1824 * baseline_m)
+    assert kappa_per_m(rig, direction) == pytest.approx(kappa, rel=1e-12)
+    away, toward = (depth_error_mm(rig, direction, z, periods) for periods in (1.0, -1.0))
+    np.testing.assert_allclose(away, 1000 * z**2 * kappa / (1 - z * kappa), rtol=1e-9)
+    np.testing.assert_allclose(toward, 1000 * z**2 * kappa / (1 + z * kappa), rtol=1e-9)
+    beyond = 1.01 / kappa
+    assert np.isinf(depth_error_mm(rig, direction, np.array([beyond]), 1.0)).all()
+
+
+def test_the_exponent_is_two_where_the_mistake_is_small_and_the_baseline_thin():
+    small, away, toward, both, behind = error_curves(paper_rig(176), "horizontal")
+    assert small.exponent == pytest.approx(2, rel=0.01) and small.quadratic_m() == pytest.approx((0.3, 10.0))
+    assert away.exponent > 2.1 and toward.exponent < 1.9
+    assert both.quadratic_m() is not None and both.quadratic_m()[1] == pytest.approx(1.0, rel=0.05)
+    assert both.exponent == pytest.approx(2, rel=0.01)
+    # With a projector 0.1 m behind, psi = gain / (Z + 0.1): the local exponent is 2 Z / (Z + 0.1) for a small mistake.
+    at = np.searchsorted(behind.distances_m, 0.5)
+    z = behind.distances_m[at]
+    assert behind.local[at] == pytest.approx(2 * z / (z + 0.1), rel=0.01)
+
+
+def test_the_probe_needs_no_model(opened, tmp_path):
+    finding = Theory().run(None, opened, ProbeSettings(), tmp_path, silent)
+    assert Theory().applies_to(None) is None
+    assert finding.values["twins"]["differing_pixels"] == 0
+    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    assert "0 of the image's pixels differ" in finding.summary

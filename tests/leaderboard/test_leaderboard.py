@@ -1,0 +1,271 @@
+"""The leaderboard: ranking, groups, the paper's rows, and what a hostile result file can do (nothing)."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from scored_dataset import make_dataset, write_predictions
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.evaluation.result import write_result
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.leaderboard import ranking, rows
+from fpp_ml_bench.leaderboard.export import markdown_text
+from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, SHOWN_BY_DEFAULT, paper_tables
+from fpp_ml_bench.leaderboard.short_names import cut_at_word
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Run in an empty folder, with no shipped rows."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
+
+
+@pytest.fixture
+def make(tmp_path, dataset):
+    """Score predictions off by ``offset_mm`` and write the result as ``file``."""
+
+    def act(file: str, offset_mm: float, split: str = "test", target: str = "depth", **changes) -> Path:
+        folder = tmp_path / "predictions" / file
+        write_predictions(folder, dataset, split, offset_mm=offset_mm, **changes)
+        path = tmp_path / "here" / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_result(evaluate(folder, dataset, split, target), path)
+        return path
+
+    return act
+
+
+def board(capsys, *arguments: object) -> str:
+    assert main(["leaderboard", *map(str, arguments)]) == 0
+    return capsys.readouterr().out
+
+
+def ranked(tmp_path, *arguments: object) -> list[dict]:
+    assert main(["leaderboard", *map(str, arguments), "--json", str(tmp_path / "board")]) == 0
+    return json.loads((tmp_path / "board").read_text())["groups"]
+
+
+def test_ranks_by_object_error_with_time_beside_it(make, capsys, tmp_path):
+    worse = make("a.json", 4.0, name="Worse", seconds_per_sample=0.001)
+    better = make("b.json", 1.0, name="Better", frames_used=[0, 1, 2], seconds_source="self-reported")
+    out = board(capsys, worse, better)
+    lines = [line for line in out.splitlines() if "Worse" in line or "Better" in line]
+    assert re.search(r"1 .*Better.* 1\.000 .* 0\.25\* .* 3 ", lines[0])
+    assert re.search(r"2 .*Worse.* 4\.000 .* 0\.001 .* 1 ", lines[1])
+    assert [row["name"] for row in ranked(tmp_path, worse, better)[0]["rows"]] == ["Better", "Worse"]
+    by_time = ranked(tmp_path, worse, better, "--sort", "seconds_per_sample")[0]["rows"]
+    assert [row["name"] for row in by_time] == ["Worse", "Better"]
+    by_frames = ranked(tmp_path, better, worse, "--sort", "frames_used")[0]["rows"]
+    assert [row["name"] for row in by_frames] == ["Worse", "Better"]
+
+
+def test_order_of_files_changes_nothing_and_ties_share_ranks(make, tmp_path):
+    files = [make(f"{n}.json", offset, name=n) for n, offset in (("d", 2.0), ("a", 2.0), ("c", 1.0), ("b", 3.0))]
+    first, second = ranked(tmp_path, *files), ranked(tmp_path, *reversed(files))
+    assert first == second
+    ranks = [(row["best_rank"], row["worst_rank"], row["name"]) for row in first[0]["rows"]]
+    assert ranks == [(1, 1, "c"), (2, 3, "a"), (2, 3, "d"), (4, 4, "b")]
+
+
+def test_unknown_time_comes_last(make, tmp_path):
+    files = [make("a.json", 1.0, name="a", seconds_per_sample=None), make("b.json", 2.0, name="b")]
+    rows = ranked(tmp_path, *files, "--sort", "seconds_per_sample")[0]["rows"]
+    assert [(row["name"], row["seconds_per_sample"]) for row in rows] == [("b", 0.25), ("a", None)]
+
+
+def test_what_differs_in_data_or_rules_is_never_ranked_together(make, capsys, tmp_path):
+    larger = make_dataset(tmp_path / "larger", size=(40, 40))
+    folder = write_predictions(tmp_path / "p", larger)
+    write_result(evaluate(folder, larger), tmp_path / "larger.json")
+    files = [
+        make("metric.json", 1.0),
+        make("oracle.json", 1.0, uses_ground_truth_range=True),
+        make("exact.json", 1.0, target="depth_exact"),
+        make("train.json", 1.0, split="train"),
+        tmp_path / "larger.json",
+    ]
+    groups = ranked(tmp_path, *files)
+    assert [len(group["rows"]) for group in groups] == [1] * 5
+    assert [group["track"] for group in groups] == ["metric"] * 4 + ["oracle range"]
+    out = board(capsys, *files)
+    out = " ".join(out.split())
+    for words in (
+        "metric track, test split, against exact depth", "oracle range track, test split, against decoded depth",
+        "metric track, train split", "40 x 40 px, data",
+    ):  # fmt: skip
+        assert words in out
+
+
+def test_results_of_the_current_folder_are_read(make, capsys):
+    make("result.json", 1.0, name="In the folder")
+    make("results/first.json", 2.0, name="In results")
+    out = board(capsys)
+    assert out.index("In the folder") < out.index("In results")
+
+
+def test_new_user_is_told_what_to_do(capsys):
+    out = board(capsys)
+    assert "No results here yet" in out and "fpp-eval predictions --dataset" in out
+    assert "Reported by the paper on other data (not measured here)" in out and "TransUNet" in out
+    assert "oracle range: told the test sample's depth range." in out
+
+
+PAPER = {
+    ("normalization", "raw"): (35.20, 85.64, 148.07, 214.37, 19.41, 52.38),
+    ("normalization", "individual"): (2.30, 6.80, 16.20, 21.19, 0.92, 3.00),
+    ("background_removed", "global"): (115.41, 191.63, 598.40, 723.93, 92.26, 151.88),
+    ("multi_frame", "vertical"): (1.26, 5.54, 12.36, 16.94, 0.16, 2.29),
+    ("loss", "masked_rmse"): (122.38, 673.08, 18.83, 23.02, 135.67, 714.82),
+    ("loss", "hybrid_l1_0.7"): (3.31, 9.85, 14.54, 17.88, 2.01, 8.44),
+    ("architecture", "pix2pix"): (5.48, 12.20, 27.73, 38.22, 3.16, 5.15),
+}
+
+
+def test_paper_rows_are_the_papers():
+    """Spot values retyped from the paper's tables, and what its text derives from them."""
+    tables = paper_tables()
+    assert {name: len(table.rows) for name, table in tables.items()} == {
+        "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 4,
+    }  # fmt: skip
+    rows = {(table.name, row.row): row for table in tables.values() for row in table.rows}
+    for table_and_row, errors in PAPER.items():
+        assert tuple(rows[table_and_row].errors_mm.values()) == errors
+    mae = {row.row: row.errors_mm["object_mae_mm"] for row in tables["architecture"].rows}
+    # "UNet ... outperforming TransUNet by 29%, ResUNet by 60%"
+    assert [round(100 * (mae[network] / mae["unet"] - 1)) for network in ("transunet", "resunet")] == [29, 60]
+    for (table, name), row in rows.items():
+        ranged, masked = name not in ("raw", "global"), table == "background_removed"
+        assert row.track == (
+            ("oracle range + mask" if masked else "oracle range") if ranged else "oracle mask" if masked else "metric"
+        )
+        for pixels in ("overall", "object", "background"):
+            assert 0 < row.errors_mm[f"{pixels}_mae_mm"] < row.errors_mm[f"{pixels}_rmse_mm"]
+        # Overall is a mixture of the other two, also after averaging over samples.
+        inside, outside = row.errors_mm["object_mae_mm"], row.errors_mm["background_mae_mm"]
+        assert min(inside, outside) < row.errors_mm["overall_mae_mm"] < max(inside, outside)
+    assert rows["multi_frame", "all"].test_samples == 1560
+
+
+@pytest.mark.parametrize("choice", [*PAPER_TABLES, "all", "none"])
+def test_paper_tables_by_choice(choice, capsys, tmp_path):
+    out = board(capsys, "--paper", choice, "--markdown", tmp_path / "t.md")
+    expected = PAPER_TABLES if choice == "all" else () if choice == "none" else (choice,)
+    for name in PAPER_TABLES:
+        assert (f"{name}: " in out) == (name in expected)
+        assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (name in expected)
+    assert SHOWN_BY_DEFAULT == ("architecture", "normalization")
+
+
+def test_paper_rows_stay_out_of_the_ranking(make, tmp_path):
+    path = make("a.json", 1.0)
+    assert main(["leaderboard", str(path), "--json", str(tmp_path / "board")]) == 0
+    content = json.loads((tmp_path / "board").read_text())
+    assert [row["name"] for group in content["groups"] for row in group["rows"]] == ["A method"]
+    assert [table["name"] for table in content["reported_by_the_paper"]] == list(SHOWN_BY_DEFAULT)
+
+
+HOSTILE = "| a `b` <script>alert(1)</script> [x](http://e) ![i](y) **z** @me www.e.org &amp; \\| #1 [red]"
+
+
+def test_submitted_text_is_only_text(make, capsys, tmp_path):
+    path = make("a.json", 1.0, name=HOSTILE)
+    board(capsys, path, "--markdown", tmp_path / "t.md")
+    line = next(line for line in (tmp_path / "t.md").read_text().splitlines() if "script" in line)
+    head = (tmp_path / "t.md").read_text().splitlines()[2]
+    assert line.count("|") == head.count("|")
+    short, *_, full = (cell.strip() for cell in line.split("|")[2:-1])
+    for cell in (short, full):
+        assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
+    import html
+
+    assert html.unescape(full) == HOSTILE[:90] + ("..." if len(HOSTILE) > 90 else "")
+    assert html.unescape(short) == cut_at_word(HOSTILE)
+
+
+@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "![i](y) **z** @me", "[red]x[/red]", "[link=http://e]"])
+def test_terminals_show_names_as_they_are(name, make, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert name in board(capsys, make("a.json", 1.0, name=name))
+
+
+@pytest.mark.parametrize("text", ["plain", "a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
+def test_markdown_text_shows_exactly_the_text(text):
+    import html
+
+    assert html.unescape(markdown_text(text)) == text
+    assert not set("|*~$") & set(markdown_text(text)) and "www." not in markdown_text(text).lower()
+
+
+def test_files_are_the_same_bytes_every_time(make, tmp_path):
+    files = [make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")]
+    for run in ("1", "2"):
+        order = files if run == "1" else files[::-1]
+        arguments = [*map(str, order), "--markdown", str(tmp_path / f"{run}.md"), "--json", str(tmp_path / f"{run}.j")]
+        assert main(["leaderboard", *arguments]) == 0
+    assert (tmp_path / "1.md").read_bytes() == (tmp_path / "2.md").read_bytes()
+    assert (tmp_path / "1.j").read_bytes() == (tmp_path / "2.j").read_bytes()
+
+
+def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
+    good = make("good.json", 1.0, name="good")
+    bad = make("bad.json", 2.0, name="bad")
+    whole = bad.read_text()
+    for text, message in (
+        (whole[:-50], "no valid JSON"),
+        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": NaN', 1), "NaN"),
+        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": -2.0', 1), "greater than or equal to 0"),
+        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": 1.0', 1), "does not follow"),
+        (whole.replace('"schema_version": "2.1.0"', '"schema_version": "7"'), "schema_version 7"),
+        ("{}", "no schema_version"),
+    ):
+        bad.write_text(text)
+        assert main(["leaderboard", str(good), str(bad), "--markdown", str(tmp_path / "t.md")]) == 2
+        captured = capsys.readouterr()
+        assert "bad.json" in captured.err and message in captured.err
+        assert captured.out == "" and not (tmp_path / "t.md").exists()
+
+
+def test_repetition_is_refused(make, capsys, tmp_path):
+    first, second = make("first.json", 1.0), make("second.json", 2.0)
+    assert main(["leaderboard", str(first), str(second)]) == 2
+    message = capsys.readouterr().err
+    assert "first.json" in message and "second.json" in message and "another name" in message
+    assert main(["leaderboard", str(first), str(first.parent / ".." / "here" / "first.json")]) == 2
+    assert "given twice" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert main(["leaderboard", str(tmp_path / "empty")]) == 2
+    assert "found none" in capsys.readouterr().err
+    assert main(["leaderboard", "nowhere.json"]) == 2
+    assert "nowhere.json: expected a result file" in capsys.readouterr().err
+
+
+def test_shipped_rows_are_sound():
+    """Every row that ships with the package is read and ranked as strictly as any other."""
+    folder = Path(ranking.__file__).parent / "rows"
+    files = sorted(folder.glob("*.json"))
+    groups = ranking.rank(ranking.read_entries(files))
+    assert sum(len(group.rows) for group in groups) == len(files)
+
+
+def test_unwritable_output_is_an_error(make, capsys, tmp_path):
+    assert main(["leaderboard", str(make("a.json", 1.0)), "--json", str(tmp_path / "no" / "board.json")]) == 2
+    assert "can't be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("width", [80, 99, 100, 140, 200])
+def test_numbers_stay_whole_in_narrow_terminals(width, make, capsys, monkeypatch):
+    path = make("a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps")
+    monkeypatch.setenv("COLUMNS", str(width))
+    out = board(capsys, path, "--sort", "object_edge_mae_mm", "--paper", "none")
+    assert all(len(line) <= width for line in out.splitlines())
+    assert out.count("1234.500") == {80: 4, 99: 4, 100: 4, 140: 5, 200: 6}[width]
+    assert ("In a wider terminal" in " ".join(out.split())) == (width < 170)

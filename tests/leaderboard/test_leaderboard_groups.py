@@ -1,0 +1,218 @@
+"""Rank ranges, groups and their titles, legacy data, short names, and what a method assumes."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+from board_rows import some_rows
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE, assumption, assumption_sentences
+from fpp_ml_bench.leaderboard.page import page_files
+from fpp_ml_bench.leaderboard.paper import chosen_tables
+from fpp_ml_bench.leaderboard.ranking import rank, rank_ranges, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.readme_block import readme_block
+from fpp_ml_bench.leaderboard.short_names import LONGEST_NAME, cut_at_word, short_names
+from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    work = tmp_path_factory.mktemp("rows")
+    return some_rows(work / "rows", make_dataset(work / "tiny"))
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return read_entries(shipped_rows())
+
+
+spans = st.lists(st.tuples(st.integers(0, 20), st.integers(0, 5), st.integers(0, 5)), max_size=10)
+
+
+@given(spans, st.integers(0, 3))
+@settings(max_examples=300, deadline=None)
+def test_rank_ranges_against_their_definition(drawn, without_value):
+    values = [float(value) for value, _, _ in drawn] + [None] * without_value
+    intervals = [(float(value - low), float(value + high)) for value, low, high in drawn] + [None] * without_value
+    ranges = rank_ranges(values, intervals)
+    for (best, worst), interval in zip(ranges, intervals, strict=True):
+        if interval is None:
+            assert (best, worst) == (len(drawn) + 1, len(values))
+            continue
+        with_value = intervals[: len(drawn)]
+        assert best == 1 + sum(rival[1] < interval[0] for rival in with_value)
+        assert worst == len(values) - without_value - sum(rival[0] > interval[1] for rival in with_value)
+    # Sorted by value, each row is within its range.
+    order = sorted(range(len(drawn)), key=lambda index: values[index])
+    assert all(ranges[index][0] <= place <= ranges[index][1] for place, index in enumerate(order, start=1))
+
+
+def test_the_same_ranks_everywhere(tmp_path, capsys, monkeypatch):
+    files = [path for path in shipped_rows() if path.stem.startswith("phase")]
+    (group,) = groups = rank(read_entries(files))
+    ranks = [row.ranks for row in group.rows]
+    assert any("-" in text for text in ranks)
+    cells = re.findall(r"<td data-v=[^>]*>([\d-]+)</td><th", page_files(groups, [])["index.html"].decode())
+    assert cells == ranks
+    shown = re.findall(r"^\| ([\d-]*\d) ", readme_block(groups), flags=re.MULTILINE)
+    assert shown == ranks[:5]
+    monkeypatch.setenv("COLUMNS", "120")
+    assert main(["leaderboard", *map(str, files), "--paper", "none"]) == 0
+    assert re.findall(r"^│ +([\d-]+) │", capsys.readouterr().out, flags=re.MULTILINE) == ranks
+    assert main(["leaderboard", *map(str, files), "--json", str(tmp_path / "board.json")]) == 0
+    rows = json.loads((tmp_path / "board.json").read_text())["groups"][0]["rows"]
+    assert [(row["best_rank"], row["worst_rank"]) for row in rows] == [
+        (row.best_rank, row.worst_rank) for row in group.rows
+    ]
+
+
+def test_shipped_rows_stay_sorted_by_error_with_ranks_that_hold_their_place(shipped):
+    for group in rank(shipped):
+        errors = [row.entry.value("object_mae_mm") for row in group.rows]
+        assert errors == sorted(errors)
+        assert all(row.best_rank <= place <= row.worst_rank for place, row in enumerate(group.rows, start=1))
+
+
+def with_fingerprint(entry, fingerprint):
+    dataset = entry.result.dataset.model_copy(update={"fingerprint": fingerprint})
+    return replace(entry, result=entry.result.model_copy(update={"dataset": dataset}))
+
+
+def test_groups_are_headed_by_their_benchmark_and_legacy_comes_last(files, monkeypatch):
+    named, legacy = "a" * 64, min(LEGACY_FINGERPRINTS)
+    monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full", 0, "full", 960, named),))
+    entry = read_entries(files[:1])[0]
+    groups = rank([with_fingerprint(entry, legacy), entry, with_fingerprint(entry, named)])
+    titles = [group.key.title for group in groups]
+    rest = "40 x 32 px"
+    words = ": metric track, test split, against decoded depth"
+    assert titles == [
+        f"fpp-bench-full version 0, {rest}{words}",
+        f"{rest}, data {entry.result.dataset.fingerprint[:8]}{words}",
+        f"{rest}, data {legacy[:8]}, legacy{words}",
+    ]
+    block, index = readme_block(groups), page_files(groups, [])["index.html"].decode()
+    for text in (block, index):
+        assert text.count(LEGACY_NOTE) == 1
+        assert text.index("fpp-bench-full version 0") < text.index(f"{legacy[:8]}")
+    assert LEGACY_NOTE not in readme_block(groups[:2])
+
+
+def test_data_of_a_named_benchmark_is_not_legacy(files, monkeypatch):
+    fingerprint = min(LEGACY_FINGERPRINTS)
+    monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full-224", 0, "full", 224, fingerprint),))
+    (group,) = rank([with_fingerprint(read_entries(files[:1])[0], fingerprint)])
+    assert not group.key.is_legacy and group.key.title.startswith("fpp-bench-full-224 version 0")
+
+
+def test_shipped_rows_are_of_a_benchmark_or_legacy(shipped):
+    for group in rank(shipped):
+        assert group.key.is_legacy or benchmark_of(group.key.fingerprint) is not None
+
+
+def test_short_names_of_shipped_rows(shipped):
+    names = {}
+    for group in rank(shipped):
+        shown = [row.short_name for row in group.rows]
+        assert len(set(shown)) == len(shown)
+        assert all(len(name) <= LONGEST_NAME and "…" not in name and "(" not in name for name in shown)
+        names |= {row.entry.path.stem: row.short_name for row in group.rows}
+    expected = {
+        "phase-03-vertical": "Phase, 3 vertical",
+        "phase-net-horizontal": "phase-net, 1 horizontal",
+        "phase-net-fresh-vertical": "phase-net-fresh, 1 vertical",
+        "classical-18-both": "Classical 18+Gray, both",
+        "classical-03-both-fewest": "Classical 3, both, no Gray",
+        "cpu-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
+        "cpu-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
+        "cpu-unet-individual-rmse-all": "UNet RMSE all frames",
+        "cpu-unet-raw-rmse-bgremoved": "UNet raw RMSE, no background",
+    }
+    assert {stem: names[stem] for stem in expected} == expected
+
+
+def submission(name, method="mine", **settings):
+    return Submission(
+        name=name, method=method, units="mm", frames_used=[0], uses_ground_truth_range=False, seconds_per_sample=None,
+        settings=settings,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "changes", "short"),
+    [
+        ("Phase route, mine", "phase", {}, "Phase, 1 vertical"),
+        ("Phase route, mine", "phase", {"shading": False}, "Phase, 1 vertical, no shading"),
+        ("Phase route, mine", "phase", {"prior": "standoff"}, "Phase, 1 vertical, standoff"),
+        ("Phase route, mine", "phase", {"error_mm": 3.0}, "Phase, fewest vertical, 3 mm"),
+        ("Phase route, mine", "phase", {"direction": "<b>"}, "Phase route, mine"),
+        ("Phase route, mine", "phase", {"frames": "9"}, "Phase route, mine"),
+        ("A better phase route", "phase", {}, "A better phase route"),
+        ("UNet, mine", "unet", {"network": "unet", "loss": "hybrid_l1_x"}, "UNet, mine"),
+    ],
+)
+def test_only_rows_of_the_packages_methods_get_a_name_from_settings(name, method, changes, short):
+    given = {"direction": "vertical", "frames": 1, "shading": True, "prior": "none", **changes}
+    assert short_names([submission(name, method, **given)]) == [short]
+
+
+words = st.text("ab ,;", min_size=1, max_size=60).filter(str.strip)
+
+
+@given(st.lists(words, min_size=1, max_size=12, unique=True))
+@settings(max_examples=200, deadline=None)
+def test_short_names_of_a_group_differ_whatever_the_names(names):
+    chosen = short_names([submission(name) for name in names])
+    assert len(set(chosen)) == len(names) and all(len(name) <= LONGEST_NAME for name in chosen)
+    assert short_names([submission(name) for name in reversed(names)]) == chosen[::-1]
+
+
+def test_a_long_name_is_cut_at_a_word():
+    assert cut_at_word("A fringe network with attention, trained on everything") == "A fringe network with attention…"
+    assert cut_at_word("x" * 50) == "x" * (LONGEST_NAME - 1) + "…"
+    assert cut_at_word("short enough") == "short enough"
+
+
+def test_the_full_name_is_in_the_title_and_on_the_rows_own_page(files):
+    entry = read_entries(files[:1])[0]
+    name = "A fringe network with attention, trained on everything there is"
+    about = entry.result.submission.model_copy(update={"name": name})
+    pages = page_files(rank([replace(entry, result=entry.result.model_copy(update={"submission": about}))]), [])
+    index = pages["index.html"].decode()
+    assert f'title="{name}">A fringe network with attention…</a>' in index
+    (own,) = (text.decode() for file, text in pages.items() if file.startswith("submissions/"))
+    assert f"<h1>{name}</h1>" in own
+
+
+def test_metric_phase_rows_say_what_they_assume(shipped):
+    for group in rank(shipped):
+        for row in group.rows:
+            result = row.entry.result
+            if result.submission.method in ("phase", "phase-net"):
+                assert assumption(result) == "one albedo, known exposure"
+                assert "one albedo for all surfaces and a known exposure" in assumption_sentences(result)
+            else:
+                assert assumption(result) == ""
+            assert ("Told the test sample's" in assumption_sentences(result)) == (result.track != "metric")
+    (group,) = (group for group in rank(shipped) if any(row.entry.path.stem == "phase-vertical" for row in group.rows))
+    pages = page_files([group], [])
+    own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
+    assert own and all("known exposure" in text for text in own)
+    assert "phase and phase-net assume one albedo, known exposure." in readme_block([group])
+
+
+def test_the_papers_errors_are_shown_apart(shipped):
+    groups = rank(shipped)
+    block = readme_block(groups)
+    line = "| UNet | 14.54 | 17.88 | 3.31 | told the test sample&#39;s depth range |"
+    assert block.index("Reported by the paper on other data") < block.index(line)
+    index = page_files(groups, chosen_tables(None))["index.html"].decode()
+    paper = index[index.index('<section id="paper">') :]
+    assert "14.54" in paper and "told the test sample" in paper and "Other data, not ranked" in paper
+    assert "14.54" not in index[: index.index('<section id="paper">')]

@@ -1,0 +1,243 @@
+"""The leaderboard's page as a static Space, results in a model's repository, and what decides which file is sent."""
+
+import hashlib
+import itertools
+import json
+
+import numpy as np
+import pytest
+import yaml
+from hub_server import Repo, git_sha1
+from huggingface_hub import parse_eval_result_entries
+from publishing import SIZE, listed, running_hub
+from scored_dataset import make_dataset, write_predictions
+
+from fpp_ml_bench.errors import PublishError
+from fpp_ml_bench.evaluation.result import write_result
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.leaderboard.publish_tasks import score
+from fpp_ml_bench.loaders.hub import Change, Publication, Remote, RemoteFile, changes
+from fpp_ml_bench.loaders.hub_client import check_repo_name
+from fpp_ml_bench.loaders.storage import preview
+
+HOSTILE = "</script>: [*x]({y}) | `z` - !!python/object:os.system"
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    with running_hub(tmp_path_factory.mktemp("hub") / "home") as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def scored(client, tmp_path_factory):
+    """Published dataset ``alice/scored``, and result files by name."""
+    folder = tmp_path_factory.mktemp("scored")
+    dataset = make_dataset(folder / "dataset", size=SIZE)
+    small = make_dataset(folder / "other", size=(28, 28))
+    client.good(["dataset", str(dataset.path), "--repo", "alice/scored"])
+    results = {}
+    for name, data, split, target, changed in (
+        ("good", dataset, "test", "depth", {"name": HOSTILE, "seconds_source": "self-reported"}),
+        ("better", dataset, "test", "depth", {"offset_mm": 1.0}),
+        ("many", dataset, "test", "depth", {"frames_used": list(range(18)), "uses_ground_truth_range": True}),
+        ("other", small, "test", "depth", {}),
+        ("train", dataset, "train", "depth", {}),
+        ("exact", dataset, "test", "depth_exact", {}),
+    ):
+        predictions = write_predictions(folder / "predictions" / name, data, split, **{"offset_mm": 10.0, **changed})
+        results[name] = folder / f"{name}.json"
+        write_result(evaluate(predictions, data, split, target), results[name])
+    return results
+
+
+def entry(client, repo: str, task: str):
+    """The one entry of a task's file, as the client reads it."""
+    content = client.server.repos["models", repo].files[f".eval_results/{task}--alice--scored.yaml"]
+    (parsed,) = parse_eval_result_entries(yaml.safe_load(content))
+    return parsed
+
+
+def test_results_parse_back(client, scored):
+    client.server.repos["models", "alice/unet"] = Repo(files={"README.md": b"card", ".eval_results/hle.yaml": b"[]"})
+    call = [
+        "results",
+        str(scored["good"]),
+        str(scored["many"]),
+        "--repo",
+        "alice/unet",
+        "--dataset-repo",
+        "alice/scored",
+    ]
+    client.server.writes()
+    dry = client.good([*call, "--dry-run", "--source-url", "https://example.org/page"])
+    assert client.server.writes() == []
+    output = client.good([*call, "--source-url", "https://example.org/page"])
+    assert listed(output) == listed(dry) == {
+        ".eval_results/multi_frame_depth_oracle_range--alice--scored.yaml": "new",
+        ".eval_results/single_shot_depth--alice--scored.yaml": "new",
+    }  # fmt: skip
+    repo = client.server.repos["models", "alice/unet"]
+    assert repo.files["README.md"] == b"card" and repo.files[".eval_results/hle.yaml"] == b"[]"
+    single = entry(client, "alice/unet", "single_shot_depth")
+    result = json.loads(scored["good"].read_text())
+    assert result["metrics"]["object_mae_mm"] == pytest.approx(10.0, rel=1e-6)
+    assert single.value == pytest.approx(50.0, abs=1e-4)  # 100 / (1 + 10 mm / 10 mm)
+    assert (single.dataset_id, single.task_id) == ("alice/scored", "single_shot_depth")
+    assert single.dataset_revision == client.server.repos["datasets", "alice/scored"].commits[-1]
+    assert single.date == result["created"][:10]
+    assert (single.source_url, single.source_name) == ("https://example.org/page", "FPP-ML-Bench leaderboard")
+    assert "Object MAE 10.000 mm" in single.notes and "higher is better" in single.notes
+    assert "metric track, 1 frame" in single.notes and "self-reported" in single.notes
+    assert HOSTILE not in single.notes and "script" not in single.notes
+    assert "oracle range track, 18 frames" in entry(client, "alice/unet", "multi_frame_depth_oracle_range").notes
+
+
+def test_a_second_run_sends_nothing_and_a_better_result_replaces(client, scored):
+    client.server.repos["models", "alice/mlp"] = Repo()
+    call = ["--repo", "alice/mlp", "--dataset-repo", "alice/scored"]
+    first, second, better = client.run(
+        *(["results", str(scored[name]), *call] for name in ("good", "good", "better"))
+    )  # fmt: skip
+    assert first[0] == second[0] == better[0] == 0
+    assert "Nothing to send" in second[1]
+    assert list(listed(better[1]).values()) == ["changed"]
+    assert entry(client, "alice/mlp", "single_shot_depth").value == pytest.approx(100 / 1.1, abs=1e-4)
+    assert len(client.server.repos["models", "alice/mlp"].commits) == 3
+
+
+def test_results_that_belong_to_no_task_are_refused(client, scored, tmp_path):
+    client.server.repos["models", "alice/refused"] = Repo()
+    client.server.repos["datasets", "alice/unmarked"] = Repo()
+    broken = tmp_path / "broken.json"
+    broken.write_text("{")
+    call = ["results", "--repo", "alice/refused", "--dataset-repo", "alice/scored"]
+    cases = [
+        ([*call, str(scored["other"])], "other data"),
+        ([*call, str(scored["train"])], "this result on train against depth"),
+        ([*call, str(scored["exact"])], "against depth_exact"),
+        ([*call, str(scored["good"]), str(scored["better"])], "both results of single_shot_depth"),
+        ([*call, str(broken)], "no valid JSON"),
+        ([*call, str(scored["good"]), "--source-url", "javascript:alert(1)"], "https address"),
+        ([*call[:-1], "alice/unmarked", str(scored["good"])], "not published by fpp-bench"),
+        ([*call[:-1], "alice/nowhere", str(scored["good"])], "no such dataset"),
+    ]
+    client.server.writes()
+    for (arguments, message), (status, _, error) in zip(cases, client.run(*(case for case, _ in cases)), strict=True):
+        assert status == 2 and message in error and "Traceback" not in error, (arguments, error)
+    assert client.server.writes() == []
+
+
+def make_page(folder, submissions=("a", "b")):
+    """A page as a folder: index, data, a page and a picture a submission."""
+    (folder / "submissions").mkdir(parents=True)
+    (folder / "index.html").write_text("<!doctype html><title>FPP-ML-Bench</title>")
+    (folder / "data.json").write_text("{}")
+    for name in submissions:
+        (folder / "submissions" / f"{name}.html").write_text(f"<!doctype html><title>{name}</title>")
+        (folder / "submissions" / f"{name}.png").write_bytes(b"\x89PNG\r\n\x1a\n" + name.encode())
+    return folder
+
+
+def test_the_page_becomes_a_static_space(client, tmp_path):
+    page, fewer = make_page(tmp_path / "page"), make_page(tmp_path / "fewer", submissions=("a",))
+    call = ["leaderboard", "--repo", "alice/board", "--dataset-repo", "alice/scored", "--page"]
+    client.server.writes()
+    dry = client.good([*call, str(page), "--dry-run"])
+    assert ("spaces", "alice/board") not in client.server.repos and client.server.writes() == []
+    first, second, third = client.run([*call, str(page)], [*call, str(page)], [*call, str(fewer)])
+    assert first[0] == second[0] == third[0] == 0
+    assert listed(dry) == listed(first[1])
+    assert "Nothing to send" in second[1]
+    deleted = {name for name, status in listed(third[1]).items() if status == "deleted"}
+    assert deleted == {"submissions/b.html", "submissions/b.png"}
+    space = client.server.repos["spaces", "alice/board"]
+    assert space.sdk == "static" and len(space.commits) == 3
+    assert space.files["index.html"] == (page / "index.html").read_bytes()
+    head = yaml.safe_load(space.files["README.md"].decode().split("---\n")[1])
+    assert (head["sdk"], head["app_file"], head["datasets"]) == ("static", "index.html", ["alice/scored"])
+    assert len(head["short_description"]) <= 60  # the Hub refuses more
+    assert set(space.files) == {
+        ".gitattributes", "README.md", "fpp-bench.json", "index.html", "data.json", "submissions/a.html",
+        "submissions/a.png",
+    }  # fmt: skip
+
+
+def test_the_page_of_results(client, scored, tmp_path):
+    """The leaderboard's own page, made from results, passes as a page; without any it is that of the shipped rows."""
+    call = ["leaderboard", str(scored["good"]), str(scored["many"]), "--repo", "alice/ranked"]
+    first, second, none, both = client.run(
+        call, call, ["leaderboard", "--repo", "alice/ranked"], [*call, "--page", "x"]
+    )
+    assert first[0] == second[0] == none[0] == 0, (first, second, none)
+    assert "Nothing to send" in second[1]
+    pages = [name for name in listed(first[1]) if name.startswith("submissions/")]
+    assert len(pages) == 2
+    assert {name: listed(none[1])[name] for name in pages} == dict.fromkeys(pages, "deleted")
+    assert both[0] == 2 and "got both" in both[2]
+
+
+def test_what_is_no_part_of_a_page_stays_home(client, tmp_path):
+    names = (".env", ".git/config", "notes.docx", "README.md", "sub/key.pem")
+    calls = []
+    for number, name in enumerate(names):
+        page = make_page(tmp_path / f"page{number}")
+        (page / name).parent.mkdir(exist_ok=True)
+        (page / name).write_text("secret")
+        calls.append(["leaderboard", "--page", str(page), "--repo", "alice/leak"])
+    for name, (status, _, error) in zip(names, client.run(*calls), strict=True):
+        assert status == 2 and name in error and "no part of a page" in error
+    assert ("spaces", "alice/leak") not in client.server.repos
+
+
+def test_the_score_falls_with_the_error_and_stays_between_0_and_100():
+    errors = [0.0, 1e-3, 0.5, 1.0, 9.99, 10.0, 100.0, 1800.0, 1e6]
+    scores = [score(error) for error in errors]
+    assert all(higher > lower for higher, lower in itertools.pairwise(scores))
+    assert scores[0] == 100.0 and score(10.0) == 50.0 and score(1e30) == 0.0
+
+
+@pytest.mark.parametrize("name", ["a/b", "A-1/b.c_d", "alice/" + "n" * 96])
+def test_repository_names(name):
+    assert check_repo_name(name) == name
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "a/b/c", "/b", "a/", "a/b c", "a/..", "../b", "a/b--c", "a/b.git", "a/-b", "a/b\n", "ä/b"]
+)
+def test_no_repository_names(name):
+    with pytest.raises(PublishError, match="OWNER/NAME"):
+        check_repo_name(name)
+
+
+def test_changes_compare_with_the_hashes_the_hub_keeps(tmp_path):
+    for name, content in {"same.txt": b"1", "same.bin": b"2", "other.txt": b"3", "d/new.txt": b""}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    stored = {
+        "same.txt": RemoteFile("same.txt", 1, "56a6051ca2b02b04ef92d5150c9ef600403cb1de"),  # git hash-object of "1"
+        "same.bin": RemoteFile("same.bin", 1, "0" * 40, hashlib.sha256(b"2").hexdigest()),
+        "other.txt": RemoteFile("other.txt", 1, git_sha1(b"4")),
+        "d/gone.txt": RemoteFile("d/gone.txt", 7, git_sha1(b"")),
+        "kept.txt": RemoteFile("kept.txt", 8, git_sha1(b"")),
+    }
+    remote = Remote("c" * 40, files=stored)
+    assert changes(Publication("dataset", "a/b", tmp_path, "m", owned=("d/",)), remote) == [
+        Change("deleted", "d/gone.txt", 7), Change("new", "d/new.txt", 0), Change("changed", "other.txt", 1),
+        Change("unchanged", "same.bin", 1), Change("unchanged", "same.txt", 1),
+    ]  # fmt: skip
+    assert not any(c.status == "deleted" for c in changes(Publication("model", "a/b", tmp_path, "m"), remote))
+    (tmp_path / "link").symlink_to("/etc/passwd")
+    with pytest.raises(PublishError, match="symbolic link"):
+        changes(Publication("dataset", "a/b", tmp_path, "m"), remote)
+
+
+def test_preview_is_white_where_near():
+    depth = np.zeros((500, 300), dtype=np.float32)
+    depth[100:400, 50:250] = np.linspace(1800, 1900, 300, dtype=np.float32)[:, None]
+    small = preview(depth)
+    assert small.shape == (167, 100) and small.dtype == np.uint8
+    assert (small[depth[::3, ::3] == 0] == 0).all() and small.max() > 250 and small[small > 0].min() >= 64
+    column = small[:, 50][small[:, 50] > 0].astype(int)
+    assert (np.diff(column) <= 0).all()
+    assert not preview(np.zeros((4, 4), dtype=np.float32)).any()

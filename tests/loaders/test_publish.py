@@ -1,0 +1,260 @@
+"""Publishing a dataset to a Hub on the loopback interface, through the real client; read back with ``load_dataset``."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from hub_server import Repo
+from publishing import DATA, ODD_OBJECT, ROOT, SIZE, listed, make_all_frames, running_hub
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.loaders.sample import config_columns
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    with running_hub(tmp_path_factory.mktemp("hub") / "home") as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_all_frames(tmp_path_factory.mktemp("all") / "dataset", odd=True)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Frame 0 alone."""
+    return make_dataset(tmp_path_factory.mktemp("small") / "dataset", size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def published(client, dataset):
+    """What the runs said that published the dataset as ``alice/fpp``: dry, real, again."""
+    call = ["dataset", str(dataset.path), "--repo", "alice/fpp"]
+    client.server.writes()
+    dry = client.good([*call, "--dry-run"])
+    dry_writes, dry_repos = client.server.writes(), dict(client.server.repos)
+    real = client.good(call)
+    real_writes = client.server.writes()
+    again = client.good(call)
+    return {"dry": (dry, dry_writes, dry_repos), "real": (real, real_writes), "again": (again, client.server.writes())}
+
+
+def test_a_dry_run_says_everything_and_changes_nothing(published):
+    output, writes, repos = published["dry"]
+    assert listed(output) == dict.fromkeys(
+        [*DATA, "README.md", "eval.yaml", "fpp-bench.json", "meshes/bowl.ply", "rig.yaml"], "new"
+    )
+    assert "(new, public)" in output
+    assert "Dry run: nothing was sent." in output
+    assert (writes, repos) == ([], {})
+
+
+def test_the_real_run_does_what_the_dry_run_said(published, client):
+    output, writes = published["real"]
+    assert listed(output) == listed(published["dry"][0])
+    repo = client.server.repos["datasets", "alice/fpp"]
+    assert set(repo.files) == {*listed(output), ".gitattributes"}
+    assert len(repo.commits) == 2  # the Hub's own, and one that makes everything visible at once
+    assert not repo.private
+    assert sum(method == "PUT" for method, _ in writes) == 4  # three Parquet files and a mesh
+
+
+def test_a_second_run_sends_nothing(published):
+    output, writes = published["again"]
+    assert set(listed(output).values()) == {"unchanged"}
+    assert "Nothing to send" in output
+    assert writes == []
+
+
+READ_BACK = """
+import json, sys, datasets, numpy as np
+out = sys.argv[1]
+for config in datasets.get_dataset_config_names("alice/fpp"):
+    for split, rows in datasets.load_dataset("alice/fpp", config).items():
+        features = {name: type(feature).__name__ for name, feature in rows.features.items()}
+        rows = list(rows.with_format("numpy"))
+        columns = {name: np.stack([row[name] for row in rows]) for name in features}
+        np.savez(f"{out}/{config}-{split}.npz", **columns, features=json.dumps(features))
+first = next(iter(datasets.load_dataset("alice/fpp", split="test", streaming=True)))
+assert first["frame_00"].mode == "L", first["frame_00"].mode
+np.save(f"{out}/streamed.npy", np.asarray(first["frame_00"]))
+"""
+
+
+def test_load_dataset_reads_the_same_rows_of_every_configuration(published, client, dataset, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", READ_BACK, str(tmp_path)], env=client.environment(), capture_output=True, text=True,
+        timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    same_bits(np.load(tmp_path / "streamed.npy"), dataset.frame(dataset.splits["test"][0], 0))
+    assert dataset.configs == ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
+    for config in dataset.configs:
+        for split, samples in dataset.splits.items():
+            names = config_columns(dataset.sequence, config, exact=True)
+            with np.load(tmp_path / f"{config}-{split}.npz") as columns:
+                features = json.loads(str(columns["features"]))
+                images = {"depth_preview", *(name for name in names if name.startswith("frame_"))}
+                assert set(features) == {*names, "depth_preview"}
+                assert {name for name, kind in features.items() if kind == "Image"} == images
+                assert list(columns["sample"]) == samples
+                assert list(columns["object"]) == [dataset.measured(sample)["object"] for sample in samples]
+                for row, sample in enumerate(samples):
+                    for index in dataset.sequence.config(config):
+                        same_bits(columns[f"frame_{index:02d}"][row], dataset.frame(sample, index))
+                    for name in ("depth", "depth_exact"):
+                        same_bits(columns[name][row], dataset.depth_mm(sample, name))
+                    assert columns["depth_max"][row] == dataset.depth_mm(sample).max()
+
+
+def same_bits(loaded: np.ndarray, expected: np.ndarray) -> None:
+    assert loaded.shape == expected.shape and loaded.dtype == expected.dtype
+    assert loaded.tobytes() == expected.tobytes()
+
+
+def test_a_name_with_markup_is_shown_as_it_is(published, client):
+    card = client.server.repos["datasets", "alice/fpp"].files["README.md"].decode()
+    head, body = card.split("---\n", 2)[1:]
+    assert ODD_OBJECT not in body
+    assert "&#60;b&#62;&#95;&#91;x&#93;(y)&#124;&#96;z&#96;" in body
+    assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == {
+        "single_shot", "horizontal", "vertical", "sinusoidal", "all"
+    }  # fmt: skip
+
+
+def test_the_benchmark_is_registered(published, client):
+    evaluation = yaml.safe_load(client.server.repos["datasets", "alice/fpp"].files["eval.yaml"])
+    assert evaluation["evaluation_framework"] == "fpp-ml-bench"
+    assert {"id": "single_shot_depth", "config": "single_shot", "split": "test"} in evaluation["tasks"]
+    assert {"id": "multi_frame_depth", "config": "all", "split": "test"} in evaluation["tasks"]
+
+
+def test_other_data_replaces_what_changed_and_leaves_what_others_added(client, tmp_path):
+    first = make_dataset(tmp_path / "first", size=SIZE)
+    second = make_all_frames(tmp_path / "second", seed=1)
+    call = ["--repo", "alice/replaced"]
+    client.good(["dataset", str(first.path), *call])
+    repo = client.server.repos["datasets", "alice/replaced"]
+    repo.files |= {"NOTES.txt": b"by hand", "data/stray.parquet": b"old"}
+    staged = tmp_path / "staged"
+    output = client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
+    assert listed(output)["data/stray.parquet"] == "deleted"
+    assert "NOTES.txt" not in listed(output)
+    assert listed(output)[DATA[2]] == "changed"
+    assert "data/stray.parquet" not in repo.files and repo.files["NOTES.txt"] == b"by hand"
+    # A kept staging folder is continued, not written again; and it changes nothing on the Hub.
+    modified = {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")}
+    assert len(modified) == 3
+    (staged / "files" / "data" / ".test.parquet.1.tmp").write_bytes(b"of a run that was killed")
+    client.server.writes()
+    assert "Nothing to send" in client.good(["dataset", str(second.path), *call, "--staging", str(staged)])
+    assert {path: path.stat().st_mtime_ns for path in staged.rglob("*.parquet")} == modified
+    assert client.server.writes() == []
+
+
+def test_a_run_that_was_cut_off_sends_only_what_is_missing(client, small):
+    call = ["dataset", str(small.path), "--repo", "cut/fpp"]
+    client.server.large.clear()
+    client.server.writes()
+    (first, second) = client.run(call, call)
+    assert first[0] == 2 and "the Hub has a fault (500)" in first[2]
+    assert second[0] == 0, second[2]
+    writes = client.server.writes()
+    assert sum(method == "PUT" for method, _ in writes) == 3  # each large file once, over both runs
+    assert sum("/commit/" in path for _, path in writes) == 2
+    assert len(client.server.repos["datasets", "cut/fpp"].commits) == 2
+
+
+def test_refusals(client, small, tmp_path):
+    """Everything that can go wrong before or on the way says what and what to do, with status 2 and no traceback."""
+    good = ["dataset", str(small.path), "--repo"]
+    client.good([*good, "alice/public"])
+    client.server.repos["datasets", "alice/other"] = Repo(files={"train.csv": b"a,b\n"})
+    client.server.repos["datasets", "raced/fpp"] = Repo()
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "thesis.tex").write_text("mine")
+    (tmp_path / "page").mkdir()
+    cases = [
+        ([*good, "nobody"], "OWNER/NAME"),
+        ([*good, "a/b/c"], "OWNER/NAME"),
+        ([*good, "alice/\x1b[31mred"], r"\\x1b"),
+        ([*good, "bob/fpp"], "make repositories of alice"),
+        ([*good, "forbidden/fpp"], r"403\); it needs write access.*The Hub says: You don't have the rights"),
+        ([*good, "broken/fpp"], r"fault \(500\)"),
+        ([*good, "alice/other"], r"did not publish \(train.csv.*--adopt"),
+        ([*good, "raced/fpp"], r"committed meanwhile \(412\)"),
+        ([*good, "alice/public", "--private"], "exists and is public"),
+        ([*good, "alice/new", "--staging", str(tmp_path / "occupied")], "holds files"),
+        ([*good, "alice/new", "--license", "all rights: reserved"], "--license"),
+        (["dataset", str(tmp_path), "--repo", "alice/new"], "no dataset"),
+        (["leaderboard", "--page", str(tmp_path / "page"), "--repo", "alice/new"], "index.html"),
+        (["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"], "no such model"),
+    ]
+    client.server.writes()
+    for (call, message), (status, _, error) in zip(cases, client.run(*(call for call, _ in cases)), strict=True):
+        assert status == 2, call
+        assert re.search(message, error, re.DOTALL), (call, error)
+        assert "Traceback" not in error and "\x1b" not in error
+    assert set(client.server.repos["datasets", "raced/fpp"].files) == {".gitattributes"}
+    assert ("datasets", "alice/new") not in client.server.repos
+    assert (tmp_path / "occupied" / "thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"HF_TOKEN": None}, "no token for the Hub: run 'hf auth login'"),
+        ({"HF_TOKEN": "hf_bad"}, r"does not accept the token \(401\)"),
+        ({"HF_ENDPOINT": "http://127.0.0.1:9"}, "can't be reached.*check the network"),
+        ({"HF_ENDPOINT": "127.0.0.1"}, "HF_ENDPOINT"),
+        ({"HF_HUB_OFFLINE": "1"}, "HF_HUB_OFFLINE is set"),
+    ],
+    ids=("no token", "bad token", "connection refused", "bad endpoint", "offline"),
+)
+def test_no_way_to_the_hub(client, small, environment, message):
+    client.server.writes()
+    ((status, _, error),) = client.run(["dataset", str(small.path), "--repo", "alice/never"], **environment)
+    assert status == 2
+    assert re.search(message, error, re.DOTALL), error
+    assert "Traceback" not in error
+    assert client.server.writes() == []
+
+
+def test_adopting_and_private(client, small):
+    repo = client.server.repos["datasets", "alice/adopted"] = Repo()
+    repo.files["train.csv"] = b"a,b\n"
+    call = ["dataset", str(small.path), "--repo"]
+    (adopted, private, unseen) = client.run(
+        [*call, "alice/adopted", "--adopt"], [*call, "alice/secret", "--private"], [*call, "alice/secret", "--dry-run"]
+    )
+    assert adopted[0] == private[0] == unseen[0] == 0
+    assert repo.files["train.csv"] == b"a,b\n" and DATA[0] in repo.files
+    assert client.server.repos["datasets", "alice/secret"].private
+    assert "(private)" in unseen[1]
+
+
+def test_a_damaged_dataset_is_not_published(client, tmp_path):
+    dataset = make_dataset(tmp_path / "d", size=SIZE)
+    path = dataset.path / dataset.manifest.shards[0].path
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    ((status, _, error),) = client.run(["dataset", str(dataset.path), "--repo", "alice/damaged"])
+    assert status == 2 and path.name in error and "checksum" in error
+    assert ("datasets", "alice/damaged") not in client.server.repos
+
+
+def test_help_does_not_wait_for_the_client():
+    code = (
+        "import sys\nfrom fpp_ml_bench.cli import main\n"
+        "try:\n    main(['publish', 'dataset', '--help'])\nexcept SystemExit as done:\n    assert done.code == 0\n"
+        "print({'numpy', 'huggingface_hub', 'datasets', 'pyarrow', 'pydantic', 'rich'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"

@@ -1,0 +1,252 @@
+"""Trained networks on the command line and on the board: tracks, units, masks, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scored_dataset import make_dataset, write_predictions
+from tiny_network import config_of, rounding_error, tiny_network
+
+from fpp_ml_bench.baselines.networks.inference import fringe_batch
+from fpp_ml_bench.baselines.networks.model import load
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.networks.range_heads import fit_heads
+from fpp_ml_bench.baselines.run import captured_frames, predict_split
+from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
+from fpp_ml_bench.evaluation.result import read_result, result_json, write_result
+from fpp_ml_bench.evaluation.score import differences, evaluate
+from fpp_ml_bench.evaluation.submission import Submission, read_submission
+from fpp_ml_bench.leaderboard.publish_tasks import task_of
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.loaders.training import FringeDepthDataset
+
+SIZE = (32, 48)
+
+
+def grey_scene(seed):
+    """Noise on a disk of depth 1700 to 1900 mm."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+    inside = (rows - 16) ** 2 + (columns - 20) ** 2 < 80
+    depth = np.where(inside, 1700 + 4 * columns + seed, 0).astype(np.float32)
+    return rng.integers(1, 256, SIZE, dtype=np.uint8), depth
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "small", SIZE, scene=grey_scene)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory, dataset):
+    """Folder of weights: raw, global, individual without and with heads, and the last with the background removed."""
+    folder = tmp_path_factory.mktemp("weights")
+    network = tiny_network(width=2)
+    network.head.weight.data.mul_(0.1)  # keeps what it says within what normalised depth can be
+    network.head.bias.data.fill_(0.3)
+    for name, normalisation, heads, removed in (
+        ("raw", "raw", False, False),
+        ("global", "global", False, False),
+        ("bare", "individual", False, False),
+        ("full", "individual", True, False),
+        ("removed", "individual", True, True),
+        ("global-removed", "global", False, True),
+    ):
+        config = config_of(
+            network, name=f"unet-{name}", title=f"UNet {name}", normalisation=normalisation, background_removed=removed,
+            image_size=SIZE, dataset_fingerprint=dataset.fingerprint,
+        )  # fmt: skip
+        range_heads = fit_heads(network, config, dataset.path) if heads else None
+        save_weights(folder / f"{name}.safetensors", network, config, range_heads)
+    return folder
+
+
+def method(weights, name, *args, **options):
+    return NetworkMethod(load(weights / f"{name}.safetensors", "cpu"), *args, **options)
+
+
+@pytest.mark.parametrize(
+    "name, depth_range, units, track, mode, title",
+    [
+        ("raw", None, "mm", "metric", "standard", "UNet raw"),
+        ("global", None, "mm", "metric", "standard", "UNet global"),
+        ("bare", None, "normalised", "oracle range", "paper-individual", "UNet bare, oracle range"),
+        ("full", None, "mm", "metric", "standard", "UNet full, predicted range"),
+        ("full", "predicted", "mm", "metric", "standard", "UNet full, predicted range"),
+        ("full", "mean", "mm", "metric", "standard", "UNet full, mean range"),
+        ("full", "oracle", "normalised", "oracle range", "paper-individual", "UNet full, oracle range"),
+        ("removed", "oracle", "normalised", "oracle range + mask", "paper-individual", "UNet removed, oracle range"),
+        ("removed", "mean", "mm", "oracle mask", "standard", "UNet removed, mean range"),
+        ("global-removed", None, "mm", "oracle mask", "standard", "UNet global-removed"),
+    ],
+)
+def test_what_a_submission_says(dataset, weights, tmp_path, name, depth_range, units, track, mode, title):
+    network_method = method(weights, name, depth_range)
+    predict_split(dataset, network_method, "test", tmp_path / "p")
+    about = read_submission(tmp_path / "p")
+    assert (about.units, about.track, network_method.mode, about.name) == (units, track, mode, title)
+    assert about.method == f"unet-{name}" and about.frames_used == [0] and about.seeds == {"training": 42}
+    assert {"torch", "numpy", "fpp_ml_bench"} <= set(about.software) and "numba" not in about.software
+    settings = about.settings
+    assert (settings["network"], settings["width"], settings["loss"]) == ("unet", 2, "hybrid_l1_0.7")
+    assert (settings["preset"], settings["seed"], settings["epochs"]) == ("cpu", 42, 2)
+    assert (
+        len(settings["weights_sha256"]) == 64 and settings["normalisation"] == network_method.model.config.normalisation
+    )
+    written = yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())
+    assert ("uses_ground_truth_mask" in written) == ("removed" in name)
+    sample = dataset.samples("test")[0]
+    fringe = captured_frames(dataset, network_method, sample)[0]
+    expected = (
+        network_method.model.predict_representation([fringe])[0] if units == "normalised"
+        else network_method.model.predict(fringe, depth_range or "predicted")
+    )  # fmt: skip
+    np.testing.assert_array_equal(np.load(tmp_path / "p" / f"{sample}.npy"), expected)
+
+
+def test_frames_with_the_background_removed_are_those_of_training(dataset, weights):
+    network_method = method(weights, "removed")
+    trained = FringeDepthDataset(dataset.path, "test", background_removed=True)
+    for row, sample in enumerate(trained.samples):
+        frame = captured_frames(dataset, network_method, sample)[0]
+        assert torch.equal(fringe_batch([frame], SIZE, "x")[0], trained[row].fringe)
+        depth = dataset.depth_mm(sample)
+        assert frame[depth > 0].all() and not frame[depth == 0].any()
+        assert captured_frames(dataset, method(weights, "full"), sample)[0].all()
+
+
+def test_a_batch_is_its_images(dataset, weights):
+    for depth_range in ("oracle", "predicted", "mean"):
+        network_method = method(weights, "full", depth_range, threads=1)
+        stacks = [captured_frames(dataset, network_method, sample) for sample in dataset.samples("test")]
+        together = network_method.predict_batch(stacks)
+        apart = [network_method.predict(stack) for stack in stacks]
+        tolerance = rounding_error(network_method.model.network, apart)
+        np.testing.assert_allclose(together, apart, rtol=0, atol=tolerance)
+    assert network_method.device == "cpu" and network_method.parameters == sum(
+        p.numel() for p in network_method.model.network.parameters()
+    )
+
+
+def test_ranges_and_frames_that_there_are_not(dataset, weights):
+    for name, options, words in (
+        ("raw", {"depth_range": "oracle"}, "puts out mm on its own; leave out"),
+        ("bare", {"depth_range": "mean"}, "holds no range heads, so its depth range can only be oracle"),
+        ("full", {"depth_range": "guessed"}, "unknown depth range 'guessed'; there are oracle, predicted, mean"),
+        ("raw", {"frame": 52}, "expected 0 to 51"),
+        ("raw", {"frame": -1}, "expected 0 to 51"),
+        ("raw", {"threads": 0}, "expected 1 or more"),
+    ):
+        with pytest.raises(PredictionError, match=words):
+            method(weights, name, **options)
+    of_frame_7 = method(weights, "raw", frame=7)
+    assert of_frame_7.frames_used == (7,) and of_frame_7.title == "UNet raw, frame 7"
+    with pytest.raises(DatasetError, match="frame 7 is not stored here"):
+        captured_frames(dataset, of_frame_7, dataset.samples("test")[0])
+    with pytest.raises(PredictionError, match="needs frame 7"):
+        of_frame_7.predict([None] * 52)
+
+
+def test_the_frame_is_the_first_it_was_trained_on(tmp_path, dataset):
+    network = tiny_network(width=2)
+    config = config_of(network, normalisation="raw", data_config="vertical", image_size=SIZE)
+    save_weights(tmp_path / "v.safetensors", network, config)
+    assert method(tmp_path, "v").frames_used == (18,) and method(tmp_path, "v").title == config.title
+
+
+# ---- commands
+
+
+def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, capsys):
+    out, data, path = str(tmp_path / "p"), str(dataset.path), str(weights / "full.safetensors")
+    for depth_range, words in (("oracle", " --mode paper-individual --json"), ("predicted", "--split test --json")):
+        assert main(["predict", path, data, "--range", depth_range, "--out", f"{out}-{depth_range}"]) == 0
+        printed = capsys.readouterr().out.splitlines()[-1]
+        assert words in printed and "depth_exact" not in printed
+        line = printed.removeprefix("next: fpp-eval ").split()
+        line[-1] = result = str(tmp_path / f"{depth_range}.json")
+        assert fpp_eval(line) == 0
+        capsys.readouterr()
+        timed = ["time", path, data, "--range", depth_range, "--repeats", "2", "--into", result]
+        assert main(timed) == 0
+        assert "parameters" in capsys.readouterr().out
+        timing = read_result(tmp_path / f"{depth_range}.json").timing
+        assert timing.batched and timing.parameters > 1000 and timing.frames == 1 and timing.device == "cpu"
+        assert "torch" in timing.software
+    assert main([*timed[:3], "--range", "mean", "--repeats", "2", "--into", result]) == 2
+    assert "settings is" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["magic"], "unknown method 'magic'; there are classical, phase"),
+        (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
+        (["recipe.yaml"], "recipe.yaml"),
+        (["{w}/raw.safetensors", "--range", "mean"], "leave out the depth range 'mean'"),
+        (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, not of"),
+        (["classical", "--range", "mean"], "--range is an option of trained networks, not of classical"),
+        (["{w}/raw.safetensors", "--frame", "3"], "frame 3 is not stored here"),
+        (["{w}/raw.safetensors", "--device", "abacus"], "device 'abacus' can't be used"),
+        (["{w}/raw.safetensors", "--threads", "0"], "--threads 0: expected 1 or more"),
+    ],
+)
+def test_refusals_on_the_command_line(dataset, weights, tmp_path, capsys, arguments, words):
+    first, *rest = (part.format(w=weights) for part in arguments)
+    assert main(["predict", first, str(dataset.path), *rest, "--out", str(tmp_path / "p")]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "p" / "submission.yaml").exists()
+
+
+def test_a_dataset_of_another_size(weights, tmp_path, capsys):
+    larger = make_dataset(tmp_path / "other", (48, 48))
+    assert main(["predict", str(weights / "raw.safetensors"), str(larger.path), "--out", str(tmp_path / "p")]) == 2
+    assert "trained at 32x48 px (H x W)" in (message := capsys.readouterr().err) and "images of 48x48 px" in message
+
+
+# ---- tracks
+
+
+def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys):
+    paths = []
+    for given_range in (False, True):
+        for given_mask in (False, True):
+            name = f"{given_range}-{given_mask}"
+            folder = write_predictions(
+                tmp_path / name, dataset, offset_mm=1.0, name=name, uses_ground_truth_range=given_range,
+                **({"uses_ground_truth_mask": True} if given_mask else {}),
+            )  # fmt: skip
+            result = evaluate(folder, dataset)
+            assert not differences(result, folder, dataset)
+            write_result(result, tmp_path / f"{name}.json")
+            assert read_result(tmp_path / f"{name}.json") == result
+            paths.append(tmp_path / f"{name}.json")
+    groups = rank(read_entries(paths))
+    assert [group.key.track for group in groups] == ["metric", "oracle mask", "oracle range", "oracle range + mask"]
+    assert all(len(group.rows) == 1 for group in groups)
+    assert main(["leaderboard", *map(str, paths), "--page", str(tmp_path / "page")]) == 0
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "oracle mask track" in page and "told the test sample's depth range and object mask" in page
+    with pytest.raises(PublishError, match="no task for the oracle mask track"):
+        task_of(groups[1].rows[0].entry.result, "masked.json")
+
+
+def test_the_key_changes_no_file_without_it(dataset, tmp_path):
+    folder = write_predictions(tmp_path / "p", dataset)
+    result = evaluate(folder, dataset)
+    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.1.0"
+    # A result that hides the mask, and one that claims it, both differ from their predictions.
+    masked = result.model_copy(
+        update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}
+    )
+    assert b'"uses_ground_truth_mask": true' in result_json(masked) and masked.track == "oracle mask"
+    assert differences(masked, folder, dataset) == [
+        "submission.uses_ground_truth_mask: True in the result, None in submission.yaml"
+    ]
+    write_predictions(tmp_path / "p", dataset, uses_ground_truth_mask=True)
+    assert differences(result, folder, dataset) == [
+        "submission.uses_ground_truth_mask: None in the result, True in submission.yaml"
+    ]

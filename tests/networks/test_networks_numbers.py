@@ -1,0 +1,127 @@
+"""The networks' blocks against closed forms, and gradients where a normalisation has nothing to divide by."""
+
+import pytest
+import torch
+from tiny_network import SMALL, one_thread  # noqa: F401
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.networks import NETWORKS, build
+from fpp_ml_bench.baselines.networks.blocks import Attention, DoubleConvolution, DropPath, InstanceNorm, Join
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("value", [0.0, 0.5])
+@pytest.mark.parametrize("bfloat16", [False, True])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_gradients_of_a_constant_image_are_finite(name, value, bfloat16, batch):
+    network = build(name, **SMALL[name])
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
+        depth = network(torch.full((batch, 1, 64, 64), value))
+    assert depth.isfinite().all()
+    (depth.float() - 0.3).abs().mean().backward()
+    for parameter in network.parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_parameter_learns(name):
+    network = build(name, **SMALL[name])
+    network(torch.rand(2, 1, 64, 64)).square().mean().backward()
+    still = [key for key, p in network.named_parameters() if p.grad is None or not p.grad.any()]
+    assert still == []
+
+
+@pytest.mark.parametrize("affine", [False, True])
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_instance_norm_is_torchs(affine, layout):
+    ours, torchs = (InstanceNorm(3, affine=affine).double(), nn.InstanceNorm2d(3, affine=affine).double())
+    for parameter in ours.parameters():
+        nn.init.normal_(parameter)
+    torchs.load_state_dict(ours.state_dict())
+    x = (5.0 + torch.randn(2, 3, 6, 4, dtype=torch.float64)).to(memory_format=layout).requires_grad_()
+    torch.testing.assert_close(ours(x), torchs(x), rtol=1e-12, atol=1e-12)
+    weight = torch.randn_like(x)
+    our_gradients = torch.autograd.grad((ours(x) * weight).sum(), [x, *ours.parameters()])
+    torch_gradients = torch.autograd.grad((torchs(x) * weight).sum(), [x, *torchs.parameters()])
+    torch.testing.assert_close(our_gradients, torch_gradients, rtol=1e-10, atol=1e-10)
+    assert torch.autograd.gradcheck(ours, (x,))
+
+
+def test_a_large_offset_costs_no_digits():
+    x = torch.randn(1, 2, 16, 16, dtype=torch.float64) + 1000.0
+    # float32 numbers near 1000 are 2**-14 apart: a pixel is off by half of that, the mean by less, and the spread is 1.
+    torch.testing.assert_close(InstanceNorm(2)(x.float()).double(), InstanceNorm(2)(x), rtol=0, atol=2**-14)
+
+
+def _normed(x: Tensor, norm: nn.Module) -> Tensor:
+    mean = x.mean((2, 3), keepdim=True)
+    variance = ((x - mean) ** 2).mean((2, 3), keepdim=True)
+    scaled = (x - mean) / torch.sqrt(variance + 1e-5)
+    return scaled * norm.weight[None, :, None, None] + norm.bias[None, :, None, None]
+
+
+def test_unet_block_is_two_convolutions_normed_and_cut_at_zero():
+    block = DoubleConvolution(2, 5).double()
+    for layer in (block[1], block[4]):
+        nn.init.normal_(layer.weight)
+        nn.init.normal_(layer.bias)
+    x = torch.randn(2, 2, 9, 7, dtype=torch.float64)
+    expected = x
+    for convolution, norm in ((block[0], block[1]), (block[3], block[4])):
+        expected = _normed(functional.conv2d(expected, convolution.weight, padding=1), norm).clamp_min(0)
+    torch.testing.assert_close(block(x), expected, rtol=1e-10, atol=1e-10)
+
+
+def test_attention_is_a_plain_softmax():
+    attention = Attention(12, heads=3).double()
+    tokens = torch.randn(2, 7, 12, dtype=torch.float64)
+    q, k, v = attention.qkv(tokens).chunk(3, dim=-1)
+    mixed = []
+    for head in range(3):
+        part = slice(4 * head, 4 * head + 4)
+        scores = q[..., part] @ k[..., part].transpose(1, 2) / 2.0  # square root of the head's 4 channels
+        mixed.append(torch.softmax(scores, dim=-1) @ v[..., part])
+    torch.testing.assert_close(attention(tokens), attention.out(torch.cat(mixed, dim=-1)), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("skip_first", [True, False])
+def test_join_concatenates_in_the_order_it_says(skip_first):
+    join = Join(4, 3, nn.Identity(), skip_first=skip_first)
+    skip = torch.randn(1, 3, 8, 8)
+    out = join(torch.randn(1, 4, 4, 4), skip)
+    assert torch.equal(out[:, :3] if skip_first else out[:, 3:], skip)
+
+
+def test_drop_path_keeps_the_mean_and_sleeps_outside_training():
+    drop = DropPath(0.4)
+    x = torch.ones(20_000, 1, 1)
+    dropped = drop(x)
+    assert dropped.unique().tolist() == pytest.approx([0.0, 1 / 0.6])
+    assert abs(dropped.mean().item() - 1.0) < 0.03
+    assert torch.equal(drop.eval()(x), x)
+
+
+def test_first_weights_have_the_spread_they_should():
+    unet = build("unet", width=16)
+    weight = unet.encoder[1][0].weight  # 32 x 16 x 3 x 3: fan out 32 x 9
+    assert weight.std().item() == pytest.approx((2 / (32 * 9)) ** 0.5, rel=0.05)
+    pix2pix = build("pix2pix", width=8)
+    assert pix2pix.generator.down[3][0].weight.std().item() == pytest.approx(0.02, rel=0.02)
+    assert not pix2pix.generator.stem[0].bias.any()
+
+
+@pytest.mark.parametrize("name", ["unet", "resunet", "hformer", "pix2pix"])
+def test_under_bfloat16_the_last_layer_is_in_float32(name):
+    """bfloat16 has 8 significant bits: at 1.8 m its steps are 8 mm."""
+    torch.manual_seed(0)
+    network = build(name, width=4).eval()
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+        answer = network(torch.rand(1, 1, 64, 64))
+    assert answer.dtype == torch.float32
+    assert not torch.equal(answer, answer.bfloat16().float())

@@ -1,0 +1,90 @@
+"""The projected patterns against the formula, OpenCV's Gray code, and their PNG files."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fpp_ml_bench.errors import FppBenchError, RigError
+from fpp_ml_bench.optics.gray_code import cell_count
+from fpp_ml_bench.optics.patterns import export_patterns, pattern_image, pattern_profile, pattern_profiles
+from fpp_ml_bench.optics.rig import Pinhole, Rig, paper_rig
+from fpp_ml_bench.optics.sequence import Sequence
+
+SMALL = Rig(
+    camera=Pinhole(24, 24, 50.0, 50.0, 11.5, 11.5),
+    projector=Pinhole(64, 48, 90.0, 90.0, 31.5, 23.5),
+    rotation=np.eye(3),
+    translation_m=(0.12, -0.1, 0.0),
+    pitch_horizontal_px=8.0,
+    pitch_vertical_px=12.8,
+    sequence=Sequence(4, 4, 4),
+)
+
+
+@pytest.mark.parametrize("direction, length", [("horizontal", 1140), ("vertical", 912)])
+def test_sinusoids_are_the_paper_formula_within_rounding(direction, length):
+    rig = paper_rig()
+    w = np.arange(length)
+    for n, index in enumerate(rig.sequence.sinusoids(direction)):
+        exact = 127.5 + 127.5 * np.cos(2 * np.pi * w / 18 + 2 * np.pi * n / 18)
+        profile = pattern_profile(rig, index)
+        assert profile.dtype == np.uint8 and np.abs(profile - exact).max() <= 0.5 + 1e-9
+
+
+def test_steps_are_shifted_copies():
+    # A shift by 2 pi / 18 at pitch 18 is a shift by one pixel.
+    rig = paper_rig()
+    first, second = (pattern_profile(rig, i) for i in rig.sequence.sinusoids("vertical")[:2])
+    assert np.array_equal(first[1:], second[:-1])
+
+
+@pytest.mark.parametrize("direction, length", [("horizontal", 1140), ("vertical", 912)])
+def test_gray_frames_are_opencvs_gray_code_of_the_half_periods(direction, length):
+    rig = paper_rig()
+    cells = cell_count(length, 18)
+    assert cells == {"horizontal": 127, "vertical": 102}[direction]
+    code = cv2.structured_light.GrayCodePattern.create(cells, 1)
+    _, images = code.generate()  # bit, inverse, bit, inverse ... of the columns, most significant first
+    for bit, index in enumerate(rig.sequence.gray(direction)):
+        assert np.array_equal(pattern_profile(rig, index), np.repeat(images[2 * bit][0], 9)[:length])
+
+
+def test_neighbouring_pixels_differ_in_one_bit_at_most():
+    for rig in (paper_rig(), SMALL):
+        for direction in ("horizontal", "vertical"):
+            bits = np.stack([pattern_profile(rig, i) > 0 for i in rig.sequence.gray(direction)])
+            assert (bits[:, 1:] != bits[:, :-1]).sum(axis=0).max() == 1
+
+
+def test_images_vary_along_the_right_axis_and_agree_with_the_profiles():
+    table = pattern_profiles(SMALL)
+    assert table.shape == (18, 64) and table.dtype == np.uint8
+    for frame in SMALL.sequence:
+        image, profile = pattern_image(SMALL, frame.index), pattern_profile(SMALL, frame.index)
+        assert image.shape == (48, 64) and image.dtype == np.uint8
+        lines = image.T if frame.direction == "horizontal" else image
+        assert (lines == lines[0]).all() and np.array_equal(lines[0], np.broadcast_to(profile, lines[0].shape))
+        assert np.array_equal(table[frame.index, : len(profile)], profile)
+        assert (table[frame.index, len(profile) :] == profile[-1]).all()
+    assert pattern_image(SMALL, SMALL.sequence.black).max() == 0
+    assert pattern_image(SMALL, SMALL.sequence.white).min() == 255
+
+
+@pytest.mark.parametrize("index", [-1, 18, 1.0, True, None])
+def test_frames_outside_the_sequence_are_refused(index):
+    with pytest.raises(RigError, match="frames 0 to 17"):
+        pattern_image(SMALL, index)
+
+
+def test_export_is_lossless_and_in_order(tmp_path):
+    paths = export_patterns(SMALL, tmp_path / "patterns")
+    assert [path.name for path in paths] == [f"A_{i}.png" for i in range(18)]
+    for index, path in enumerate(paths):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image.ndim == 2 and np.array_equal(image, pattern_image(SMALL, index))
+
+
+def test_export_to_an_impossible_place_is_an_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FppBenchError, match="can't be written"):
+        export_patterns(SMALL, tmp_path / "file" / "patterns")

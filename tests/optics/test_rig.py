@@ -1,0 +1,237 @@
+"""The rig: compared with OpenCV's camera model, its files, and values that must be refused."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.optics.lens import distort, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig import Pinhole, Rig, paper_rig
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, rig_to_dict, rotation_matrix, save_rig
+from fpp_ml_bench.optics.sequence import Sequence
+
+DISTORTION = (-0.21, 0.11, 0.0013, -0.0021, -0.02)
+CAMERA = Pinhole(60, 45, 80.0, 82.0, 28.3, 23.1, DISTORTION)
+
+
+def test_paper_rig_has_the_papers_numbers():
+    rig = paper_rig()
+    assert rig.camera.fx == pytest.approx(2285.77, abs=0.01) == rig.camera.fy
+    assert (rig.projector.width, rig.projector.height, rig.projector.fx) == (912, 1140, 1824.0)
+    assert rig.baseline_m == pytest.approx(0.160, abs=1e-3)
+    assert (-rig.R.T @ rig.t).tolist() == [-0.125, 0.1, 0.0]  # 0.125 m to the camera's left, 0.1 m below (y is down)
+    # Fringe periods in the working range and image px a period, worked out by hand from the geometry.
+    assert rig.periods_in_range("vertical") == pytest.approx(1824 * 0.125 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12)
+    assert rig.periods_in_range("horizontal") == pytest.approx(1824 * 0.1 * (1 / 1.5 - 1 / 2.1) / 18, rel=1e-12)
+    assert rig.image_px_per_period("vertical") == pytest.approx(18 * rig.camera.fx / 1824, rel=1e-9)
+
+
+def test_projection_of_the_paper_rig_is_the_written_formula():
+    rig = paper_rig()
+    x, y, z = 0.03, -0.05, 1.83
+    u, v = rig.project([x * z, y * z, z])
+    assert u == pytest.approx(1824 * (x + 0.125 / z) + 455.5, abs=1e-9)
+    assert v == pytest.approx(1824 * (y - 0.100 / z) + 569.5, abs=1e-9)
+
+
+def test_scaling_keeps_the_field_and_the_projector():
+    rig = paper_rig(960)
+    small = rig.scaled(240)
+    assert small == paper_rig(240) and small.projector == rig.projector and small.camera.height == 240
+    # The image's borders, at -0.5 and W - 0.5, see the same directions at every size.
+    for device in (rig.camera, small.camera):
+        assert device.normalised(-0.5, device.height - 0.5) == pytest.approx((-0.209995, 0.209995), abs=1e-9)
+
+
+@pytest.mark.parametrize("size, refused", [(160, True), (170, True), (171, False), (960, False)])
+def test_sampling_below_four_px_a_period_is_refused_with_a_pitch_that_does(size, refused):
+    rig = paper_rig(size)
+    if not refused:
+        rig.check_sampling()
+        return
+    with pytest.raises(RigError, match="pitch of at least") as caught:
+        rig.check_sampling()
+    pitch = float(str(caught.value).split("pitch of at least ")[1].split(" px")[0])
+    assert 18 < pitch < 20
+    data = rig_to_dict(rig)
+    data["pitch_px"] = {"horizontal": pitch, "vertical": pitch}
+    rig_from_dict(data).check_sampling()
+
+
+def test_projection_matches_opencv():
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-0.4, -0.3, 1.5), (0.4, 0.3, 2.1), (200, 3))
+    turn, shift = np.array([0.1, -0.2, 0.05]), np.array([0.12, -0.1, 0.03])
+    rig = Rig(paper_rig(240).camera, CAMERA, rotation_matrix(tuple(turn)), shift, 4.0, 4.0, Sequence(4, 5, 5))
+    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, turn, shift, matrix, np.array(DISTORTION))
+    np.testing.assert_allclose(np.stack(rig.project(points), axis=-1), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(rig.R, cv2.Rodrigues(turn)[0], atol=1e-15)
+
+
+def test_rays_match_opencv_and_project_back():
+    x, y = CAMERA.rays()
+    u, v = np.meshgrid(np.arange(60.0), np.arange(45.0))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    expected = cv2.undistortPoints(pixels, matrix, np.array(DISTORTION), criteria=criteria).reshape(45, 60, 2)
+    np.testing.assert_allclose(np.stack([x, y], axis=-1), expected, atol=1e-9)
+    back = np.stack(CAMERA.pixels(x, y), axis=-1)
+    np.testing.assert_allclose(back, np.stack([u, v], axis=-1), atol=1e-9)
+    assert not x.flags.writeable and CAMERA.rays()[0] is x
+
+
+def test_pixels_beyond_the_lens_fold_have_no_ray():
+    # x (1 - 0.5 x^2) peaks at x^2 = 2/3 with 0.544: no ideal point is imaged farther out.
+    camera = Pinhole(101, 1, 50.0, 50.0, 50.0, 0.0, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    x, _ = camera.rays()
+    distorted = np.abs(np.arange(101) - 50) / 50
+    assert np.array_equal(np.isnan(x[0]), distorted > np.sqrt(2 / 3) * (1 - 1 / 3))
+    assert np.isnan(camera.pixels(0.9, 0.0)[0])  # and a point beyond the fold has no image
+
+
+def test_points_behind_a_device_have_no_image():
+    u, v = paper_rig().project([[0, 0, -1.0], [0, 0, 0.0], [0, 0, 1.8]])
+    assert np.isnan(u).tolist() == np.isnan(v).tolist() == [True, True, False]
+
+
+@given(vector=st.tuples(*[st.floats(-3, 3)] * 3))
+@settings(max_examples=60, deadline=None)
+def test_rotation_vectors_are_opencvs(vector):
+    np.testing.assert_allclose(rotation_matrix(vector), cv2.Rodrigues(np.array(vector))[0], atol=1e-13)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "yml", "json"])
+def test_files_round_trip_to_the_last_bit(tmp_path, suffix):
+    turn = rotation_matrix((0.1, 1e-9, -0.3))
+    rig = Rig(CAMERA, paper_rig().projector, turn, (1 / 3, 1e-17, -0.1), 17.3, 18.1, Sequence(5, 8, 8), (1500, 2100.5))
+    path = tmp_path / f"rig.{suffix}"
+    save_rig(rig, path)
+    assert load_rig(path) == rig and hash(load_rig(path)) == hash(rig)
+    assert np.array_equal(load_rig(path).R, turn)
+
+
+def test_a_rotation_vector_is_taken(tmp_path):
+    data = rig_to_dict(paper_rig())
+    data["rotation"] = [0.0, 0.1, 0.0]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data))
+    np.testing.assert_allclose(load_rig(tmp_path / "rig.yaml").R[0], [np.cos(0.1), 0, np.sin(0.1)], atol=1e-15)
+
+
+def _changed(path: str, value: object) -> dict:
+    data = json.loads(json.dumps(rig_to_dict(paper_rig())))
+    *parents, last_key = path.split(".")
+    entry = data
+    for key in parents:
+        entry = entry[key]
+    if value is _changed:
+        del entry[last_key]
+    else:
+        entry[last_key] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    "path, value, message",
+    [
+        ("camera.fx", 0.0, "camera.fx.*positive"),
+        ("camera.fx", -5.0, "camera.fx.*positive"),
+        ("camera.cx", float("nan"), "camera.cx.*finite"),
+        ("camera.width", 12.5, "camera.width.*whole number"),
+        ("camera.width", True, "camera.width"),
+        ("camera.height", 0, "camera.height"),
+        ("projector.distortion", [0, 0, 0, 0], "projector.distortion.*5 numbers, got 4"),
+        ("projector.distortion", [0, 0, "x", 0, 0], r"projector.distortion\[2\]"),
+        ("projector.fy", "1e3", "projector.fy.*number, got '1e3'"),
+        ("projector", [1, 2], "projector.*mapping"),
+        ("camera.focal", 3.0, "camera.*unknown key focal"),
+        ("camera.cy", _changed, "camera.*missing key cy"),
+        ("baseline", 0.1, "unknown key baseline"),
+        ("rotation", _changed, "missing key rotation"),
+        ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 1.01]], "orthonormal.*0.0201"),
+        ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "determinant is -1"),
+        ("rotation", [[1, 0, 0], [0, 1, 0]], "rotation.*2 rows"),
+        ("rotation", "none", "rotation.*rows"),
+        ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, None]], r"rotation\[2\]\[2\]"),
+        ("translation_m", [0, 0, 0], "baseline is zero"),
+        ("translation_m", [0.1, 0, float("inf")], r"translation_m\[2\].*finite"),
+        ("translation_m", 0.1, "translation_m.*3 numbers"),
+        ("pitch_px.vertical", 3.0, "pitch_px.vertical.*4 to 912"),
+        ("pitch_px.vertical", 913.0, "pitch_px.vertical"),
+        ("pitch_px.horizontal", 17.0, "bits_horizontal.*8 bits, got 7"),
+        ("pitch_px", {"vertical": 18}, "pitch_px.*missing key horizontal"),
+        ("sequence.steps", 2, "at least 3 steps"),
+        ("sequence.steps", 18.0, "sequence.steps.*whole"),
+        ("sequence.bits_vertical", 6, "102 Gray cells.*7 bits, got 6"),
+        ("working_range_mm", [2100, 1500], "working_range_mm.*near < far"),
+        ("working_range_mm", [0, 2100], "working_range_mm"),
+        ("standoff_m", 2.5, "standoff_m.*outside"),
+        ("standoff_m", None, "standoff_m.*number"),
+        ("background_m", 2.0, "background_m.*beyond"),
+    ],
+)
+def test_an_invalid_rig_is_refused_naming_file_and_key(tmp_path, path, value, message):
+    data = _changed(path, value)
+    for name, text in (("rig.yaml", yaml.safe_dump(data)), ("rig.json", json.dumps(data))):
+        file = tmp_path / name
+        file.write_text(text)
+        with pytest.raises(RigError, match=message) as caught:
+            load_rig(file)
+        assert str(caught.value).startswith(str(file))
+
+
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("rig.yaml", b"", "empty"),
+        ("rig.json", b"  \n", "empty"),
+        ("rig.yaml", b"camera: [1, 2", "malformed YAML"),
+        ("rig.yaml", b"camera: !!python/object/apply:os.getcwd []", "malformed YAML"),
+        ("rig.json", b'{"camera": ', "malformed JSON"),
+        ("rig.json", b"[" * 100_000, "malformed JSON"),
+        ("rig.yaml", b"just text", "expected a mapping"),
+        ("rig.yaml", b"1: 2", "text as key"),
+        ("rig.yaml", b"camera: 1\ncamera: 2", "camera is given twice"),
+        ("rig.json", b'{"camera": 1, "camera": 2}', "camera is given twice"),
+        ("rig.yaml", b"\xff\xfe\x00", "can't be read as text"),
+        ("rig.txt", b"camera: 1", "ending in .yaml"),
+    ],
+)
+def test_unreadable_files_are_refused(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RigError, match=message) as caught:
+        load_rig(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
+    with pytest.raises(RigError, match=r"absent.yaml.*can't be read"):
+        load_rig(tmp_path / "absent.yaml")
+    with pytest.raises(RigError, match="can't be written"):
+        save_rig(paper_rig(), tmp_path / "no" / "rig.yaml")
+
+
+def test_a_projector_that_looks_away_is_refused():
+    away = Rig(paper_rig().camera, paper_rig().projector, rotation_matrix((0.0, np.pi, 0.0)), (0.1, 0.0, 0.0))
+    with pytest.raises(RigError, match="does not look at"):
+        away.check_sampling()
+
+
+@pytest.mark.parametrize("intrinsics", [(5e-324, 479.5), (1e-6, 479.5), (1e12, 479.5), (2e3, 1e12)])
+def test_a_nearly_singular_intrinsic_matrix_is_refused(intrinsics):
+    focal, centre = intrinsics
+    with pytest.raises(RigError, match="nearly singular: condition number"):
+        Pinhole(960, 960, focal, focal, centre, centre)
+
+
+def test_a_lens_that_flattens_out_is_inverted_wherever_it_has_an_inverse():
+    coefficients = (0.6, 0.9, 0.0, 0.0, -0.3)  # Newton from the distorted point misses some of these
+    ideal = np.linspace(0.01, 0.98, 400) * np.sqrt(fold_radius_squared(coefficients))
+    distorted = distort(ideal, np.zeros_like(ideal), coefficients)
+    np.testing.assert_allclose(undistort(*distorted, coefficients)[0], ideal, rtol=1e-10)

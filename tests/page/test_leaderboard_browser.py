@@ -1,0 +1,231 @@
+"""The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and hostile rows."""
+
+import pytest
+from board_rows import some_rows, timing, write_result_file
+from chromium import Browser
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.cli import main
+
+HOSTILE = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The page of four rows and a hostile one, opened from disk."""
+    work = tmp_path_factory.mktemp("board")
+    dataset = make_dataset(work / "tiny")
+    files = some_rows(work / "rows", dataset)
+    files.append(write_result_file(work / "rows" / "bad.json", dataset, 16.0, 1.0, name=HOSTILE, timing=timing(4.0)))
+    row = work / "row.json"
+    assert main(["leaderboard", str(files[0]), "--row", str(row), "--provenance", "verified"]) == 0
+    assert main(["leaderboard", str(row), *map(str, files[1:]), "--page", str(work / "page")]) == 0
+    return work / "page" / "index.html"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    started = Browser()
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def opened(browser, page):
+    browser.open(page)
+    yield browser
+    assert browser.complaints() == []
+    assert all(address.startswith("file://") for address in browser.requests())
+
+
+NAMES = """[...document.querySelectorAll('#t0 tbody tr')].filter(row => !row.hidden)
+    .map(row => row.cells[1].querySelector('a').innerText.slice(0, 14))"""
+SORTED = "[...document.querySelectorAll('#t0 th')].map(h => h.getAttribute('aria-sort')).filter(Boolean).join()"
+RANKED = ["Slow and fine", "Fast and rough", "Beaten", HOSTILE[:14]]
+
+
+def test_the_browser_would_tell(browser, tmp_path):
+    """What the other tests rely on: exceptions, console messages and what the policy stops do show up."""
+    policy = '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'">'
+    for odd in ("<script>throw 1</script>", "<script>console.log(1)</script>", f"{policy}<img src='x.png'>"):
+        (tmp_path / "odd.html").write_text(f"<!doctype html>{odd}")
+        browser.open(tmp_path / "odd.html")
+        assert browser.complaints() != []
+    (tmp_path / "odd.html").write_text("<!doctype html><link rel=icon href=data:,><img src='y.png'>")
+    browser.open(tmp_path / "odd.html")
+    assert [address.rsplit("/", 1)[1] for address in browser.requests()] == ["odd.html", "y.png"]
+
+
+def test_one_request_and_no_complaint(opened, page):
+    assert opened.requests() == [page.resolve().as_uri()]
+    assert opened.run(NAMES) == RANKED and opened.run(SORTED) == "ascending"
+
+
+def test_a_click_sorts_and_another_turns_it_round(opened):
+    opened.click("#t0 button[data-key=ms]")
+    assert opened.run(NAMES) == ["Fast and rough", HOSTILE[:14], "Slow and fine", "Beaten"]
+    assert opened.run("document.querySelector('#t0 [data-key=ms]').closest('th').ariaSort") == "ascending"
+    opened.click("#t0 button[data-key=ms]")
+    assert opened.run(NAMES) == ["Beaten", "Slow and fine", HOSTILE[:14], "Fast and rough"]
+    assert opened.run(SORTED) == "descending"
+    assert "t0=ms.descending" in opened.run("location.hash")
+    opened.click("#t0 button[data-key=name]")
+    assert opened.run(NAMES) == [HOSTILE[:14], "Beaten", "Fast and rough", "Slow and fine"]
+    for key in ("rank", "object_mae_mm"):
+        opened.click(f"#t0 button[data-key={key}]")
+        assert opened.run(NAMES) == RANKED
+
+
+def test_keys_alone_reach_everything(opened):
+    opened.key("Tab")
+    assert opened.run("document.activeElement.className") == "skip"
+    assert opened.run("document.activeElement.getBoundingClientRect().left") >= 0  # seen when focused
+    for _ in range(60):
+        opened.key("Tab")
+        if opened.run("document.activeElement.dataset.key") == "frames":
+            break
+    else:
+        pytest.fail("the Tab key never reached the Frames column's button")
+    assert opened.run("getComputedStyle(document.activeElement).outlineStyle") != "none"
+    opened.key("Enter", "\r")
+    assert opened.run(NAMES)[-1] == "Slow and fine" and opened.run(SORTED) == "ascending"
+
+
+def test_filters_hide_rows_marks_and_say_so(opened):
+    marks = "[...document.querySelectorAll('#s0 .wide .point')].filter(p => p.style.display !== 'none').length"
+    assert opened.run(marks) == 4
+    opened.click("#q")
+    opened.type("BEATEN")
+    assert opened.run(NAMES) == ["Beaten"] and opened.run(marks) == 1
+    assert opened.run("document.getElementById('c0').innerText") == "1 of 4 rows shown"
+    assert opened.run("document.getElementById('c0').getAttribute('role')") == "status"
+    opened.click("#filters button[type=reset]")
+    assert opened.run("new Promise(done => setTimeout(done, 20))") is None
+    assert opened.run(NAMES) == RANKED
+    opened.click("input[value=verified]")
+    assert opened.run(NAMES) == [name for name in RANKED if name != "Fast and rough"]
+    assert "hide=verified" in opened.run("location.hash")
+    choose = "(s) => { s.value = '1'; s.dispatchEvent(new Event('input', {bubbles: true})) }"
+    opened.run(f"({choose})(document.getElementById('frames'))")
+    assert opened.run(NAMES) == [HOSTILE[:14]]
+
+
+def test_a_view_can_be_linked_to(browser, page):
+    browser.open(page.resolve().as_uri() + "#t0=frames.descending&q=a&frames=2&hide=verified")
+    assert browser.run(NAMES) == ["Beaten", HOSTILE[:14]]
+    assert browser.run("document.getElementById('q').value") == "a"
+    for odd in ("#t0=__proto__.x&frames=<b>&hide=%00", "#t0=&q=" + "x" * 5000, "#=&=&%"):
+        browser.open(page.resolve().as_uri() + odd)
+        assert browser.run("document.querySelectorAll('#t0 tbody tr').length") == 4
+        assert browser.complaints() == []
+
+
+def test_a_screen_reader_finds_a_table_with_headers(opened):
+    opened.call("Accessibility.enable")
+    nodes = opened.call("Accessibility.getFullAXTree")["nodes"]
+    elements = [
+        (n.get("role", {}).get("value"), n.get("name", {}).get("value", "")) for n in nodes if not n.get("ignored")
+    ]
+    roles = [role for role, _ in elements]
+    assert roles.count("table") >= 2 and roles.count("row") >= 5 and "main" in roles and "navigation" in roles
+    heads = [name for role, name in elements if role == "columnheader"]
+    assert "Object MAE, mm" in heads and "Frames" in heads
+    assert ("rowheader") in roles
+    unnamed = {"button", "link", "textbox", "searchbox", "checkbox", "combobox", "image", "region", "group"}
+    assert [role for role, name in elements if role in unnamed - {"group"} and not name] == []
+
+
+def test_hostile_text_is_shown_and_does_nothing(opened, page):
+    assert HOSTILE[:28] in opened.run("document.body.innerText")
+    assert opened.run("typeof window.hacked") == "undefined"
+    links = "[...document.querySelectorAll('#t0 tbody a')].map(a => a.title)"
+    assert HOSTILE in opened.run(links)
+    for sub in sorted((page.parent / "submissions").glob("*.html")):
+        opened.open(sub)
+        assert opened.run("typeof window.hacked") == "undefined"
+        assert opened.complaints() == [] and opened.requests() == [sub.resolve().as_uri()]
+        assert opened.run("document.querySelectorAll('table').length") >= 3
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [320, 390, 768, 1280])
+def test_every_width_in_both_schemes(browser, page, width, dark):
+    for path in (page, sorted((page.parent / "submissions").glob("*.html"))[0]):
+        browser.open(path, width, 844, dark)
+        assert browser.run("document.documentElement.scrollWidth") <= width  # only tables scroll sideways
+        assert browser.run(_LEAST_CONTRAST) >= 4.5  # WCAG 2.2, level AA
+        assert browser.complaints() == []
+    browser.open(page, width, 844, dark)
+    shown = "[...document.querySelectorAll('#s0 .scatter')].filter(s => s.getBoundingClientRect().width > 0).length"
+    assert browser.run(shown) == 1
+
+
+@pytest.fixture(scope="module")
+def shipped_page(tmp_path_factory):
+    """The page of the rows that ship with the package."""
+    out = tmp_path_factory.mktemp("shipped") / "page"
+    assert main(["leaderboard", "--page", str(out)]) == 0
+    return out / "index.html"
+
+
+@pytest.mark.parametrize("width", [390, 1240])
+def test_the_shipped_page_fits(browser, shipped_page, width):
+    browser.open(shipped_page, width)
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    lines = "e => e.getBoundingClientRect().height / parseFloat(getComputedStyle(e).lineHeight)"
+    assert browser.run(f"Math.max(...[...document.querySelectorAll('.ranking tbody a')].map({lines}))") < 1.5
+    assert browser.run("document.querySelector('.links').getBoundingClientRect().height") < 220
+
+
+@pytest.mark.parametrize("width", [390, 1240])
+def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_page, width):
+    browser.open(shipped_page, width)
+    pictures = browser.run(_LABEL_BOXES)
+    assert len(pictures) >= 7
+    for picture in pictures:
+        left, top, right, bottom = picture["frame"]
+        boxes = picture["labels"]
+        for number, box in enumerate(boxes):
+            assert left <= box[0] and top <= box[1] and box[2] <= right and box[3] <= bottom
+            for placed in boxes[:number]:
+                apart = box[2] <= placed[0] or placed[2] <= box[0] or box[3] <= placed[1] or placed[3] <= box[1]
+                assert apart, (box, placed)
+
+
+# Boxes of the labels of every picture that is shown: across as drawn, and a line's height without its leading.
+_LABEL_BOXES = """
+[...document.querySelectorAll("svg.scatter")].filter(svg => svg.getBoundingClientRect().width > 0).map(svg => ({
+  frame: (b => [b.left, b.top, b.right, b.bottom])(svg.getBoundingClientRect()),
+  labels: [...svg.querySelectorAll("text.name")].map(text => {
+    const b = text.getBoundingClientRect(), cut = 0.15 * b.height;
+    return [b.left, b.top + cut, b.right, b.bottom - cut];
+  }),
+}))
+"""
+_LEAST_CONTRAST = """
+(() => {
+  const context = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
+  const rgba = (colour) => {
+    context.clearRect(0, 0, 1, 1); context.fillStyle = colour; context.fillRect(0, 0, 1, 1);
+    return [...context.getImageData(0, 0, 1, 1).data];
+  };
+  const linear = (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const ground = (element) => {
+    for (let at = element; at; at = at.parentElement) {
+      const colour = rgba(getComputedStyle(at).backgroundColor);
+      if (colour[3] === 255) return colour;
+    }
+    return [255, 255, 255, 255];
+  };
+  let least = 21;
+  const texts = "h1, h2, p, a, th, td, small, caption, label, button, figcaption, summary, dt, dd, .badge";
+  for (const element of document.querySelectorAll(texts)) {
+    const box = element.getBoundingClientRect();
+    if (!box.width || !element.innerText?.trim()) continue;
+    const [text, behind] = [light(rgba(getComputedStyle(element).color)), light(ground(element))];
+    least = Math.min(least, (Math.max(text, behind) + 0.05) / (Math.min(text, behind) + 0.05));
+  }
+  return least;
+})()
+"""

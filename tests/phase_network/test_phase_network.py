@@ -1,0 +1,127 @@
+"""phase-net: what it can't do by construction, and what its weights give on planes, on objects and on other rigs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from flat_planes import plane_depth_m, plane_fringe
+from test_phase_route import OTHER_RIG, photograph
+
+from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
+from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
+from fpp_ml_bench.baselines.phase_network.weights import load_net
+from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Settings
+from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
+from fpp_ml_bench.optics import Rig, paper_rig
+
+RIG = paper_rig(480)
+FIRST = {"horizontal": 0, "vertical": 18}
+
+
+def part_of(rig: Rig, size: int) -> Rig:
+    """The middle ``size`` px of the camera's image, at its full resolution."""
+    camera = rig.camera
+    left, top = (camera.width - size) / 2, (camera.height - size) / 2
+    return replace(rig, camera=replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top))
+
+
+def wild(bound_rad: float) -> PhaseNet:
+    """A network that says anything, loudly."""
+    torch.manual_seed(3)
+    network = PhaseNet((8, 8), 4, 6, (6, 8), bound_rad)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=1.0)
+    return network.eval()
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_random_weights_stay_on_the_candidates(direction: str) -> None:
+    """Every depth is a candidate of the working range, moved by at most the bound, whatever the weights."""
+    bound = 0.5
+    settings = Settings(direction=direction)
+    network_route = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
+    image = photograph("cork", "A60").frames[FIRST[direction]]
+    answered = network_route.observe(image)
+    measurement = network_route.conclude(answered)
+    observation, on_object = answered.observation, measurement.depth_mm[answered.observation.crop] > 0
+    assert on_object.sum() > 3000
+    absolute = observation.layer.absolute_phase(np.where(on_object, measurement.depth_mm[observation.crop], 1000.0))
+    order = np.rint((absolute - observation.phase_rad) / TAU)
+    correction = (absolute - observation.phase_rad - TAU * order)[on_object]
+    assert np.abs(correction).max() < bound + 1e-3
+    assert np.abs(correction).max() > 0.9 * bound  # it did try
+    allowed = (order >= observation.candidates.first) & (
+        order < observation.candidates.first + observation.candidates.count
+    )
+    allowed |= order == answered.base
+    assert allowed[on_object].all()
+    assert len(np.unique((order - answered.base)[on_object])) > 1
+
+
+def test_without_its_levers_it_is_the_measured_route() -> None:
+    image = photograph("cork", "A60").frames[0]
+    no_levers = Levers(order=False, mask=False, phase=False)
+    measured, network_route = (
+        PhaseRoute(RIG, Settings()).measure(image),
+        NetworkRoute(RIG, Settings(), wild(0.5), levers=no_levers),
+    )
+    measurement = network_route.measure(image)
+    assert np.array_equal(measurement.depth_mm, measured.depth_mm)
+    assert np.array_equal(measurement.order, measured.order)
+    assert np.array_equal(measurement.confidence, measured.confidence)
+
+
+def test_an_empty_scene_has_no_depth() -> None:
+    empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
+    assert not NetworkRoute(RIG, Settings(), wild(0.5), threshold=-1e9).measure(empty).depth_mm.any()
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("distance_m", [1.5, 1.8, 2.1])
+def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None:
+    """Where the UNet collapses to background; at the benchmark's resolution, without background in view."""
+    rig = part_of(paper_rig(960), 240)
+    image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
+    measurement = PhaseNetMethod(rig, direction).route.measure(image)
+    assert (measurement.depth_mm > 0).mean() > 0.98
+    assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
+
+
+@pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
+def test_objects_at_unknown_distance_also_on_another_rig(rig: Rig) -> None:
+    row = photograph("cracker_box", "A60", rig)
+    measurement = PhaseNetMethod(rig).route.measure(row.frames[0])
+    target = row.depth_mm > 0
+    error = np.abs(measurement.depth_mm - row.depth_mm)[target]
+    assert np.median(error) < 3
+    assert (error > 100).mean() < 0.02
+    assert (measurement.depth_mm[~target] > 0).mean() < 0.02
+    assert sum(measurement.counts.values()) == target.size
+
+
+def test_method_is_registered_and_reports_itself() -> None:
+    phase_net = method("phase-net", RIG, direction="vertical")
+    assert phase_net.frames_used == (18,) and phase_net.uses_ground_truth_range is False
+    assert "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
+    assert 100_000 < phase_net.parameters < 1_000_000  # type: ignore[attr-defined]
+    frames: list = [None] * 52
+    frames[18] = photograph("cork", "A60").frames[18]
+    depth_mm = phase_net.predict(frames)
+    assert depth_mm.dtype == np.float32 and depth_mm.shape == (480, 480) and (depth_mm > 0).any()
+
+
+def test_refusals_name_what_came() -> None:
+    with pytest.raises(DecodeError, match="frame 0 is missing"):
+        PhaseNetMethod(RIG).predict([None] * 52)
+    with pytest.raises(PredictionError, match=r"fringes of 22\.6 px .* rig's have 7\.\d px"):
+        PhaseNetMethod(paper_rig(320))
+    with pytest.raises(PredictionError, match="both"):
+        PhaseNetMethod(RIG, "both")  # type: ignore[arg-type]
+    with pytest.raises(NetworkError, match="multiples of 16"):
+        PhaseNet().forward(torch.zeros(1, len(CHANNELS), 40, 32))
+    with pytest.raises(NetworkError, match="bound_rad"):
+        PhaseNet(bound_rad=4.0)

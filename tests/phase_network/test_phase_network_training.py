@@ -1,0 +1,198 @@
+"""Training phase-net: windows that are what another scene would show, stopping and going on, weights on disk."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from flat_planes import plane_depth_m, plane_fringe
+
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Rotation
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.recipe import Recipe
+from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sample_of
+from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, train
+from fpp_ml_bench.baselines.phase_network.unions import companions, united
+from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
+from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
+from fpp_ml_bench.baselines.phase_route import Settings
+from fpp_ml_bench.baselines.training import SHIPPED
+from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
+from fpp_ml_bench.optics import paper_rig
+
+RIG = paper_rig(240)
+AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, no_shading=0, mirror=0, brightness=0)
+OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0}
+SMALL = Recipe(
+    steps=4, batch=2, window=48, warm_up=1, widths=(4, 6), fine=4, squeezed=6, order_widths=(4, 6), bound_rad=1.0,
+    validate_every=2, directions=("horizontal",),
+)  # fmt: skip
+CONFIG = NetConfig(
+    name="small", title="Small", options=OPTIONS, threshold=-1.0,
+    period_px={"horizontal": 5.6}, dataset_fingerprint="0" * 64,
+)  # fmt: skip
+
+
+def geometry(direction: str = "horizontal") -> Geometry:
+    return Geometry.of(RIG, Settings(direction=direction))  # type: ignore[arg-type]
+
+
+def plane(distance_m: float, direction: str = "horizontal") -> Sample:
+    """A tilted plane that fills the frame."""
+    tilt = (0.1, -0.1)
+    depth_m = plane_depth_m(RIG, distance_m, tilt)
+    image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3)
+    return sample_of(image, (1000 * depth_m).astype(np.float32), "plane_A0", geometry(direction))
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> None:
+    """Against the benchmark's own light and sensor on a plane at the other distance: fringe, brightness, candidates."""
+    own_geometry = geometry(direction)
+    moved = replace(AS_CAPTURED, shift=1.0, margin_mm=300.0)  # the range's middle: 1.8 m
+    random = [np.random.default_rng(1) for _ in range(2)]
+    moved_window = draw([plane(1.7, direction)], {direction: own_geometry}, 240, moved, random[0])
+    captured_window = draw([plane(1.8, direction)], {direction: own_geometry}, 240, AS_CAPTURED, random[1])
+    lit = moved_window.fitted & captured_window.fitted & (moved_window.x[CHANNELS.index("window share")] > 0.9)
+    lit &= moved_window.x[CHANNELS.index("brightness")] > -0.5  # the projector's field ends before the camera's
+    assert lit.mean() > 0.5
+    for name, tolerance in (("brightness", 0.03), ("base: brightness misfit", 0.05), ("slope along", 0.02)):
+        channel = CHANNELS.index(name)
+        assert np.abs(np.median(moved_window.x[channel][lit] - captured_window.x[channel][lit])) < tolerance, name
+    # Fringe and phase part by what an object keeps and a frame-filling plane does not: its place in the image.
+    assert np.abs(moved_window.x[CHANNELS.index("fit misfit")][lit]).mean() < 0.03
+    assert (moved_window.order[lit] == 1).mean() > 0.99
+    assert np.abs(moved_window.correction_rad[lit]).mean() < 0.05
+
+
+def test_wrong_first_orders_are_labelled_as_such() -> None:
+    vary = replace(AS_CAPTURED, wrong_window=1.0)
+    samples, geometries = [plane(1.8)], {"horizontal": geometry()}
+    orders = []
+    for seed in range(4):
+        window = draw(samples, geometries, 96, vary, np.random.default_rng(seed))
+        assert np.take_along_axis(window.exists, np.maximum(window.order, 0)[None], 0)[0][window.fitted].all()
+        orders += [window.order[window.fitted]]
+    labels = np.unique(np.concatenate(orders))
+    assert {0, 2} & set(labels.tolist())
+    captured = draw(samples, geometries, 96, AS_CAPTURED, np.random.default_rng(0))
+    assert (captured.order[captured.fitted] == 1).mean() > 0.95
+
+
+def test_a_union_is_what_the_rig_captures_of_both() -> None:
+    """Two tilted surfaces through each other before a plane, all in the benchmark's own light."""
+    rows, columns = np.indices((RIG.camera.height, RIG.camera.width))
+    behind, tilts = 2.1, [(0.1, -0.1), (-0.3, 0.2)]
+    depths = [
+        np.where(rows < 160, plane_depth_m(RIG, 1.7, tilts[0]), 0),
+        np.where(columns > 90, plane_depth_m(RIG, 1.72, tilts[1]), 0),
+    ]
+    empty = plane_fringe(RIG, 0, np.full(rows.shape, behind), (0.0, 0.0), noise=0)
+    images = [
+        np.where(depth > 0, plane_fringe(RIG, 0, np.where(depth > 0, depth, behind), tilt, noise=0), empty)
+        for depth, tilt in zip(depths, tilts, strict=True)
+    ]
+    images[1][-1, 0] = 0  # a shadow on the plane stays
+    image, depth_mm = united(images, [1000 * depth_m for depth_m in depths])
+    first = (depths[0] > 0) & ((depths[1] == 0) | (depths[0] <= depths[1]))
+    second = (depths[1] > 0) & ~first
+    assert (first & (depths[1] > 0)).mean() > 0.05 and (second & (depths[0] > 0)).mean() > 0.05
+    expected = np.where(first, images[0], np.where(second, images[1], empty))
+    expected[-1, 0] = 0
+    assert np.array_equal(image, expected)
+    # float32 numbers from 1024 to 2048 mm are 2**-13 mm apart.
+    np.testing.assert_allclose(depth_mm, 1000 * np.where(first, depths[0], depths[1]), rtol=0, atol=2**-14)
+    assert image.dtype == np.uint8 and depth_mm.dtype == np.float32
+
+
+def test_companions_are_other_objects() -> None:
+    objects = {f"{view}_{name}": name for name in ("mug", "large_clamp", "pen") for view in (0, 60)}
+    counts = set()
+    for seed in range(40):
+        names = companions(objects, "60_mug", np.random.default_rng(seed))
+        shown = [objects[name] for name in names]
+        assert "mug" not in shown and len(set(shown)) == len(shown)
+        counts.add(len(names))
+    assert counts == {1, 2}
+    assert companions({"0_mug": "mug", "60_mug": "mug"}, "0_mug", np.random.default_rng(0)) == []
+
+
+def test_turning_for_the_network_and_back() -> None:
+    image = np.arange(24.0).reshape(2, 3, 4)
+    for transposed in (False, True):
+        for reverse in (False, True):
+            turn = Rotation(transposed, reverse, 1.0)
+            assert np.array_equal(turn.back(turn.turn(image)), image)
+            assert turn.turn(image).shape == ((2, 4, 3) if transposed else (2, 3, 4))
+
+
+def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
+    samples, geometries = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    at_once = train(SMALL, samples, samples[:1], geometries, tmp_path / "a")
+    first = train(SMALL, samples, samples[:1], geometries, tmp_path / "b", minutes=0.0)
+    assert (first.steps, at_once.steps) == (2, 4)
+    second = train(SMALL, samples, samples[:1], geometries, tmp_path / "b")
+    assert [record["step"] for record in second.history] == [2, 4]
+    for name, value in at_once.network.state_dict().items():
+        assert torch.equal(value, second.network.state_dict()[name]), name
+    assert at_once.history[-1]["loss_phase"] == second.history[-1]["loss_phase"]
+    with pytest.raises(TrainingError, match="another recipe"):
+        train(replace(SMALL, seed=1), samples, samples[:1], geometries, tmp_path / "b")
+    assert (tmp_path / "b" / CHECKPOINT_FILE).exists()
+
+
+def test_recipes_that_train_nothing_are_refused() -> None:
+    for wrong in ({"steps": 0}, {"unions": -1}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0}):
+        with pytest.raises(RecipeError):
+            replace(SMALL, **wrong)  # type: ignore[arg-type]
+    assert SMALL.digest != replace(SMALL, rate=1e-3).digest
+    assert SMALL.rate_at(0) > SMALL.rate_at(3) > 0
+
+
+def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = PhaseNet(**OPTIONS)
+    torch.nn.init.normal_(network.answer.weight)
+    network(torch.rand(2, len(CHANNELS), 24, 24))  # the normalisation has seen something
+    path = tmp_path / "small.safetensors"
+    digest = save_net(path, network, CONFIG)
+    assert save_net(tmp_path / "again.safetensors", network, CONFIG) == digest
+    file = load_net(path)
+    assert (file.sha256, file.config) == (digest, CONFIG)
+    x = torch.rand(1, len(CHANNELS), 24, 24)
+    with torch.inference_mode():
+        for answer, loaded in zip(network.eval()(x), file.network(x), strict=True):
+            # Every weight is rounded to half precision, by 2**-12 of it at most; float32 rounding is far below that.
+            tolerance = 2**-9 * float(answer.abs().max())
+            torch.testing.assert_close(loaded, answer, rtol=0, atol=tolerance)
+            assert answer.std() > 10 * tolerance
+
+
+def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "small.safetensors"
+    save_net(path, PhaseNet(**OPTIONS), CONFIG)
+    data = path.read_bytes()
+    cut, junk, wider = tmp_path / "cut.safetensors", tmp_path / "junk.safetensors", tmp_path / "wider.safetensors"
+    cut.write_bytes(data[:-100])
+    junk.write_bytes(b"not weights at all")
+    save_net(wider, PhaseNet(**OPTIONS), replace(CONFIG, options=OPTIONS | {"widths": [4, 8]}))
+    unet = next(SHIPPED.glob("*.safetensors"))
+    for file, message in (
+        (tmp_path / "none.safetensors", "found nothing"), (cut, "damaged"), (junk, "cut off|damaged"),
+        (unet, "expected fpp-ml-bench phase-net"), (wider, "not those of its network"),
+    ):  # fmt: skip
+        with pytest.raises(WeightsError, match=message):
+            load_net(file)
+    with pytest.raises(WeightsError, match="phase-nut"):
+        load_net("phase-nut")
+    bad = PhaseNet(**OPTIONS)
+    with torch.no_grad():
+        bad.answer.bias[0] = float("nan")
+    with pytest.raises(WeightsError, match="not finite"):
+        save_net(path, bad, CONFIG)
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    assert header["__metadata__"]["format"] == "fpp-ml-bench phase-net"

@@ -1,0 +1,198 @@
+"""The phase route on planes of known depth, on objects, on other rigs, and where it must say no."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from flat_planes import plane_depth_m, plane_fringe
+
+from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.decoding import depth_noise_mm
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.loaders.render import BuildSettings, Lighting, Studio
+from fpp_ml_bench.loaders.storage import Row
+from fpp_ml_bench.optics import Rig, paper_rig
+
+SIZE = 480
+RIG = paper_rig(SIZE)
+FIRST = {"horizontal": 0, "vertical": 18}
+OTHER_RIG = replace(
+    RIG,
+    translation_m=(0.22, -0.16, 0.0),
+    pitch_horizontal_px=24.0,
+    pitch_vertical_px=27.0,
+    working_range_mm=(1400.0, 2200.0),
+    background_m=2.9,
+)
+
+
+ANGLE = np.deg2rad(5.0)
+TURNED_RIG = replace(
+    RIG,
+    rotation=((np.cos(ANGLE), 0.0, np.sin(ANGLE)), (0.0, 1.0, 0.0), (-np.sin(ANGLE), 0.0, np.cos(ANGLE))),
+    translation_m=(-0.02, -0.14, 0.03),
+)
+
+
+@cache
+def route(direction: str, rig: Rig = RIG, **options: object) -> PhaseRoute:
+    return PhaseRoute(rig, Settings(direction=direction, **options))  # type: ignore[arg-type]
+
+
+@cache
+def photograph(name: str, view: str, rig: Rig = RIG) -> Row:
+    from fpp_ml_bench.loaders.render import solid_mesh
+
+    studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied"))
+    row = studio.photograph(solid_mesh(name), view)
+    return replace(row, frames={index: frame.copy() for index, frame in row.frames.items()})
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("distance_m", [1.5, 1.8, 2.1])
+@pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
+def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: str) -> None:
+    tilt = (0.1, -0.06)
+    depth_m = plane_depth_m(rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt)
+    for exact_m, slope in ((plane_depth_m(rig, distance_m), (0.0, 0.0)), (depth_m, tilt)):
+        measurement = route(direction, rig).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
+        lit = measurement.modulation > 5
+        assert lit.mean() > 0.7  # the projector's field ends before the camera's
+        error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
+        assert error.mean() < 1.0
+        assert (measurement.depth_mm[lit] > 0).all()
+
+
+def test_a_projector_that_is_turned_and_ahead() -> None:
+    exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
+    measurement = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
+    lit = measurement.modulation > 5
+    assert lit.mean() > 0.7
+    assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
+
+
+def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
+    exact_m = plane_depth_m(RIG, 1.8)
+    middle = (slice(180, 300), slice(180, 300))
+    spread = {}
+    for noise in (1.0, 3.0):
+        measurement = route("vertical").measure(plane_fringe(RIG, 18, exact_m, noise=noise))
+        error = (measurement.depth_mm - exact_m * 1000)[middle]
+        spread[noise] = error.std()
+        sigma_px = Settings().second_window * RIG.image_px_per_period("vertical")
+        averaged = int(4 * np.pi * sigma_px**2)
+        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation[middle].mean(), noise)
+        # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice the even spread.
+        assert 0.6 * predicted < spread[noise] < 2.5 * predicted
+    assert 2.2 < spread[3.0] / spread[1.0] < 4
+
+
+@pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
+@pytest.mark.parametrize("name", ["cork", "cracker_box"])
+def test_objects_at_unknown_distance(name: str, rig: Rig) -> None:
+    row = photograph(name, "A60", rig)
+    measurement = route("horizontal", rig).measure(row.frames[0])
+    target = row.depth_mm > 0
+    error = np.abs(measurement.depth_mm - row.depth_mm)[target]
+    assert np.median(error) < 3
+    assert (error > 100).mean() < 0.02  # wrong orders, and object pixels taken for background
+    assert (measurement.depth_mm[~target] > 0).mean() < 0.02
+    assert measurement.background_share > 0.2
+    assert sum(measurement.counts.values()) == target.size
+
+
+def test_confidence_orders_errors_and_the_strict_mode_uses_it() -> None:
+    row = photograph("mug", "A60")
+    dense = route("horizontal").measure(row.frames[0])
+    strict = route("horizontal", min_confidence=0.6).measure(row.frames[0])
+    both = (row.depth_mm > 0) & (dense.depth_mm > 0)
+    error, sure = np.abs(dense.depth_mm - row.depth_mm)[both], dense.confidence[both]
+    halves = sure > np.median(sure)
+    assert error[halves].mean() < 0.5 * error[~halves].mean()
+    confident = strict.depth_mm > 0
+    assert 0.3 < confident.sum() / both.sum() < 1
+    assert np.array_equal(strict.depth_mm[confident], dense.depth_mm[confident])
+    assert (strict.confidence[confident] >= 0.6).all()
+    assert strict.counts["unsure"] > 0
+
+
+def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
+    random = np.random.default_rng(0)
+
+    def guess(question, rig, settings):  # type: ignore[no-untyped-def]
+        places = random.integers(0, len(question.exists), question.inside.shape).astype(np.int32)
+        return places, np.zeros(places.shape, np.float32)
+
+    random_route = PhaseRoute(RIG, Settings(), guess)
+    measurement = random_route.measure(photograph("cork", "A60").frames[0])
+    on_object = measurement.depth_mm > 0
+    layer = random_route.layer.at(on_object)
+    again = layer.depth_mm(measurement.wrapped_phase[on_object].astype(np.float64), measurement.order[on_object])
+    assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
+
+
+def test_nothing_is_measured_where_nothing_is() -> None:
+    empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
+    measurement = route("horizontal").measure(empty)
+    assert not measurement.depth_mm.any()
+    assert measurement.counts["background"] == empty.size
+    dark = np.full((SIZE, SIZE), round(Lighting().ambient_grey), np.uint8)
+    assert not route("horizontal").measure(dark).depth_mm.any()
+
+
+def test_saturated_ambiguous_and_thin_are_said() -> None:
+    exact_m = plane_depth_m(RIG, 1.8)
+    image = plane_fringe(RIG, 0, exact_m)
+    bright = np.clip(image.astype(int) * 2, 0, 255).astype(np.uint8)
+    assert route("horizontal").measure(bright).counts["saturated"] > 0.2 * image.size
+    # Without brightness and without a prior a plane can't be told from one a period away: no margin, and it says so.
+    blind = route("horizontal", shading=False).measure(image)
+    assert blind.counts["ambiguous"] > 0.5 * image.size
+    assert blind.confidence.max() < 0.2
+    near = route("horizontal", shading=False, prior="standoff").measure(image)
+    lit = near.modulation > 5
+    assert np.abs(near.depth_mm - 1800)[lit].mean() < 1
+    pole = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m)).copy()
+    pole[100:380, 240:244] = image[100:380, 240:244]
+    thin = route("horizontal").measure(pole)
+    assert thin.counts["thin"] > 500
+    assert thin.counts["measured"] < 200
+
+
+@pytest.mark.parametrize("span", [(1700.0, 1900.0), (1100.0, 2600.0)], ids=["one period or none", "ten periods"])
+def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
+    pitch = 18.0 if span[0] > 1500 else 12.0
+    sequence = replace(RIG.sequence, bits_vertical=8)
+    rig = replace(RIG, working_range_mm=span, pitch_vertical_px=pitch, sequence=sequence)
+    image = plane_fringe(rig, 18, plane_depth_m(rig, 1.8))
+    measurement = route("vertical", rig).measure(image)
+    lit = measurement.modulation > 5
+    assert measurement.candidates.most in ((1, 2) if pitch == 18 else (10, 11))
+    assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1
+
+
+def test_method_is_registered_and_reports_itself() -> None:
+    phase_method = method("phase", RIG, direction="vertical", prior="standoff")
+    assert phase_method.frames_used == (18,)
+    assert phase_method.uses_ground_truth_range is False
+    assert phase_method.settings["prior"] == "standoff" and "standoff" in phase_method.title
+    frames: list = [None] * 52
+    frames[18] = photograph("cork", "A60").frames[18]
+    depth_mm = phase_method.predict(frames)
+    assert depth_mm.dtype == np.float32 and depth_mm.shape == (SIZE, SIZE)
+
+
+def test_refusals_name_what_came() -> None:
+    with pytest.raises(DecodeError, match="frame 0 is missing"):
+        PhaseMethod(RIG).predict([None] * 52)
+    with pytest.raises(DecodeError, match="uint8"):
+        route("horizontal").measure(np.zeros((SIZE, SIZE)))
+    with pytest.raises(DecodeError, match=r"\(100, 480\)"):
+        route("horizontal").measure(np.zeros((100, SIZE), np.uint8))
+    for wrong in ({"direction": "both"}, {"prior": "shape"}, {"min_confidence": 1.0}, {"jump_rad": 0.0}, {"pitch": 3}):
+        with pytest.raises(PredictionError, match=next(iter(wrong))):
+            PhaseMethod(RIG, **wrong)

@@ -1,0 +1,235 @@
+"""Building: the same bytes for any order of objects and number of workers, and settings that are refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
+
+from fpp_ml_bench.constants import MINI_OBJECTS, OBJECTS, SPLITS, TEST_OBJECTS, VALIDATION_OBJECTS, VIEWS, split_of
+from fpp_ml_bench.errors import BuildError, MeshError
+from fpp_ml_bench.loaders.render.builder import assembly_of, build, plan_build
+from fpp_ml_bench.loaders.render.meshes import single_mesh
+from fpp_ml_bench.loaders.render.settings import PRESETS, BuildSettings
+from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
+from fpp_ml_bench.loaders.storage import DatasetFolder, Row, ShardWriter, plan_shards
+from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
+
+
+def differing_files(files, other_files):
+    names = sorted(set(files) | set(other_files))
+    return [name for name in names if files.get(name) != other_files.get(name)]
+
+
+def test_two_workers_and_another_order_of_objects_give_the_same_bytes_in_every_file(tiny, tmp_path):
+    settings = tiny_settings(objects=tuple(reversed(TINY_OBJECTS)))
+    reported = []
+    build(tmp_path / "again", settings, workers=2, progress=reported.append)
+    assert differing_files(file_bytes(tiny), file_bytes(tmp_path / "again")) == []
+    assert sum(reported) == 24 and min(reported) >= 0
+
+
+def test_storing_one_frame_keeps_the_bytes_of_frame_and_depth(opened, tmp_path):
+    build(tmp_path / "one", tiny_settings(objects=("cork",), stored="single_shot"), workers=1)
+    dataset = DatasetFolder(tmp_path / "one")
+    assert dataset.configs == ("single_shot",)
+    for sample in dataset.samples("train"):
+        np.testing.assert_array_equal(dataset.frame(sample, 0), opened.frame(sample, 0))
+        np.testing.assert_array_equal(dataset.depth_mm(sample), opened.depth_mm(sample))
+        np.testing.assert_array_equal(dataset.depth_mm(sample, "depth_exact"), opened.depth_mm(sample, "depth_exact"))
+        assert dataset.measured(sample) == opened.measured(sample)
+
+
+@pytest.mark.parametrize("change", [{"seed": 43}, {"noise_sigma_grey": 2.0}, {"placement": "varied"}])
+def test_what_decides_the_bytes_changes_them(opened, tmp_path, change):
+    build(tmp_path / "other", tiny_settings(objects=("cork",), stored="single_shot", **change), workers=1)
+    dataset = DatasetFolder(tmp_path / "other")
+    assert dataset.fingerprint != opened.fingerprint
+    for sample in dataset.samples("train"):
+        differing = (dataset.frame(sample, 0) != opened.frame(sample, 0)).mean()
+        assert differing > (0.02 if "placement" in change else 0.2)  # elsewhere background and noise are the same
+        moved = (dataset.depth_mm(sample, "depth_exact") != opened.depth_mm(sample, "depth_exact")).any()
+        assert moved == ("placement" in change)
+
+
+def test_what_is_in_the_folder(tiny, opened):
+    assert opened.splits == {
+        "train": [f"{name}_{view}" for name in ("bowl", "cork") for view in VIEWS],
+        "validation": [f"mug_{view}" for view in VIEWS],
+        "test": [f"power_drill_{view}" for view in VIEWS],
+    }
+    assert opened.size == (TINY_SIZE, TINY_SIZE) and opened.configs == CONFIGS
+    assert not list(tiny.rglob("*.tmp")) and not (tiny / ".build").exists()
+    for name in TINY_OBJECTS:
+        mesh = trimesh.load(tiny / "meshes" / f"{name}.ply")
+        assert mesh.is_watertight
+    content = (tiny / "manifest.json").read_text()
+    assert str(tiny) not in content and "/" not in json.loads(content)["settings"]["frames"]
+
+
+def test_every_view_has_its_object_in_range(opened):
+    for sample in opened.samples("all"):
+        exact, depth = opened.depth_mm(sample, "depth_exact"), opened.depth_mm(sample)
+        inside = exact[exact > 0]
+        assert inside.min() >= 1500 and inside.max() <= 2100
+        assert 0.005 < (exact > 0).mean() < 0.4
+        row = opened.measured(sample)
+        assert (row["depth_min_mm"], row["depth_max_mm"]) == (depth[depth > 0].min(), depth[depth > 0].max())
+        assert row["object_px"] == (depth > 0).sum()
+        assert row["undecoded_px"] == ((exact > 0) & (depth == 0)).sum() < 0.1 * row["exact_px"]
+        assert row["distance_mm"] == 1800
+        assert not (depth > 0)[exact == 0].any()
+
+
+def test_users_mesh_goes_the_same_way(tmp_path):
+    path = tmp_path / "My Part.stl"
+    trimesh.creation.icosphere(3, 0.1).export(path)
+    mesh = single_mesh(path)
+    settings = BuildSettings(paper_rig(TINY_SIZE), (mesh.name,), stored="single_shot", user_meshes=(mesh,))
+    build(tmp_path / "set", settings, workers=1)
+    dataset = DatasetFolder(tmp_path / "set")
+    assert dataset.splits == {"test": [f"my_part_{view}" for view in VIEWS]}
+    for sample in dataset.samples("all"):
+        exact = dataset.depth_mm(sample, "depth_exact")
+        assert exact[exact > 0].min() == pytest.approx(1700, abs=0.5)
+    # No path of the machine gets into the dataset, and a changed mesh makes another dataset.
+    assert str(tmp_path) not in (tmp_path / "set" / "manifest.json").read_text()
+    trimesh.creation.icosphere(3, 0.11).export(path)
+    with pytest.raises(BuildError, match="user_meshes"):
+        build(tmp_path / "set", replace(settings, user_meshes=(single_mesh(path),)), workers=1)
+
+
+def test_object_that_does_not_fit_ends_the_build_by_name(tmp_path):
+    path = tmp_path / "huge.stl"
+    trimesh.creation.box((2, 2, 2)).export(path)
+    mesh = single_mesh(path)
+    settings = BuildSettings(paper_rig(TINY_SIZE), ("cork", "huge"), user_meshes=(mesh,), stored="single_shot")
+    with pytest.raises(MeshError, match=r"'huge'.*scale it"):
+        build(tmp_path / "set", settings, workers=2)  # through a worker process, with the whole message
+
+
+# ---- plans and presets
+
+
+def test_split_is_forty_five_five_by_object():
+    parts = {split: [name for name in OBJECTS if split_of(name) == split] for split in SPLITS}
+    assert [len(parts[split]) for split in SPLITS] == [40, 5, 5]
+    assert {"power_drill", "magazine_stack", "container_bottle", "wooden_boards"} <= set(parts["test"])
+    assert set(VALIDATION_OBJECTS) <= set(OBJECTS) and set(TEST_OBJECTS) <= set(OBJECTS)
+    assert len(set(OBJECTS)) == 50
+
+
+def test_full_preset_is_the_papers_set():
+    objects, size = PRESETS["full"]
+    assembly = assembly_of(BuildSettings(paper_rig(size), objects))
+    rows = {split: sum(len(p.samples) for p in assembly.plans if p.split == split) for split in SPLITS}
+    assert rows == {"train": 240, "validation": 30, "test": 30}
+    frames = stored_frames(PAPER_SEQUENCE, "all")
+    assert len(frames) * sum(rows.values()) == 15_600
+    assert assembly.bytes_per_row == 960 * 960 * (52 + 8)
+    for split in SPLITS:
+        shards = [(p.first_row, len(p.samples)) for p in assembly.plans if p.split == split]
+        assert [first_row for first_row, _ in shards] == list(np.cumsum([0, *(count for _, count in shards)])[:-1])
+    assert min(len(p.samples) for p in assembly.plans) >= 24  # rows of a record batch: hub.md
+
+
+def test_mini_preset_has_every_split():
+    objects, size = PRESETS["mini"]
+    assert objects == MINI_OBJECTS and len(objects) >= 4
+    assert {plan.split for plan in plan_build(BuildSettings(paper_rig(size), objects))} == set(SPLITS)
+
+
+@pytest.mark.parametrize(
+    ("stored", "count", "configs"),
+    [
+        ("single_shot", 1, {"single_shot"}),
+        ("horizontal", 18, {"single_shot", "horizontal"}),
+        ("vertical", 19, {"single_shot", "vertical"}),
+        ("sinusoidal", 36, {"single_shot", "horizontal", "vertical", "sinusoidal"}),
+        ("all", 52, set(CONFIGS)),
+    ],
+)
+def test_groups_hold_every_frame_once(stored, count, configs):
+    groups = stored_groups(PAPER_SEQUENCE, stored)
+    stored_indices = [frame for frames in groups.values() for frame in frames]
+    assert len(stored_indices) == len(set(stored_indices)) == count and 0 in stored_indices
+    assert set(available_configs(PAPER_SEQUENCE, stored)) == configs
+
+
+# ---- settings
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objects": ()}, "no object"),
+        ({"objects": ("mugg",)}, "did you mean mug"),
+        ({"objects": ("mug", "bowl", "mug")}, "'mug' is named twice"),
+        ({"placement": "random"}, "fixed or varied"),
+        ({"stored": "both"}, "single_shot"),
+        ({"seed": -1}, "0 to 2"),
+        ({"seed": 2**63}, "0 to 2"),
+        ({"noise_sigma_grey": -0.1}, "0 to 50"),
+        ({"noise_sigma_grey": float("nan")}, "0 to 50"),
+        ({"noise_sigma_grey": 51}, "0 to 50"),
+    ],
+)
+def test_bad_settings(change, message):
+    with pytest.raises(BuildError, match=message):
+        tiny_settings(**change)
+
+
+def test_settings_are_in_one_order_whatever_was_given(tmp_path):
+    meshes = []
+    for name in ("zeta", "alpha"):
+        path = tmp_path / f"{name}.stl"
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
+        meshes.append(single_mesh(path))
+    objects = ("zeta", "mug", "alpha", "bowl")
+    settings = tiny_settings(objects=objects, user_meshes=tuple(meshes))
+    reversed_settings = tiny_settings(objects=objects[::-1], user_meshes=tuple(meshes[::-1]))
+    assert settings == reversed_settings and settings.describe() == reversed_settings.describe()
+    assert settings.objects == ("bowl", "mug", "alpha", "zeta")
+
+
+# ---- the writer
+
+
+def row(sample="bowl_A0", depth=None, frames=None):
+    depth = np.full((8, 6), 1800, np.float32) if depth is None else depth
+    return Row(sample, "bowl", "A0", frames or {0: np.zeros((8, 6), np.uint8)}, depth, depth)
+
+
+def write(tmp_path, rows):
+    (plan,) = plan_shards("train", {"bowl": [("bowl_A0", "bowl", "A0")]})
+    return ShardWriter(tmp_path, tmp_path, plan, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(rows)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(np.nan, "not finite"), (np.inf, "not finite"), (-1.0, "negative"), (0.0, "no pixel above 0")],
+)
+def test_writer_takes_no_bad_depth(tmp_path, value, message):
+    depth = np.full((8, 6), 1800 if value else 0, np.float32)
+    depth[3, 3] = value
+    with pytest.raises(BuildError, match=rf"bowl_A0.*{message}"):
+        write(tmp_path, [row(depth=depth)])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "expected sample 'bowl_A0', got nothing"),
+        ([row("bowl_A60")], "expected sample 'bowl_A0', got sample 'bowl_A60'"),
+        ([row(frames={0: np.zeros((6, 8), np.uint8)})], r"frame_00: expected uint8 \(8, 6\), got uint8 \(6, 8\)"),
+        ([row(frames={0: np.zeros((8, 6))})], r"frame_00: expected uint8 \(8, 6\), got float64"),
+        ([row(depth=np.full((8, 6), 1800.0))], r"depth: expected float32 \(8, 6\), got float64"),
+    ],
+)
+def test_writer_takes_no_other_rows(tmp_path, rows, message):
+    with pytest.raises(BuildError, match=message):
+        write(tmp_path, rows)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

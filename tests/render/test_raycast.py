@@ -1,0 +1,299 @@
+"""Ray casting against closed forms and against a second ray caster, Moeller-Trumbore over every ray and triangle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.optics import paper_rig
+
+RIG = paper_rig(176)
+RAYS = PixelRays.of(RIG.camera)
+X, Y = RAYS.x, RAYS.y
+
+
+def traced(vertices_m, faces):
+    vertices_m = np.asarray(vertices_m, dtype=float)
+    faces = np.asarray(faces, dtype=np.int32)
+    return TracedObject(SolidMesh("thing", vertices_m, faces), vertices_m)
+
+
+def traced_mesh(mesh, distance_m=1.8):
+    return traced(np.add(mesh.vertices, [0, 0, distance_m]), mesh.faces)
+
+
+def depth_image(hits):
+    image = np.zeros(X.shape)
+    image.ravel()[hits.pixels] = hits.depth_m
+    return image
+
+
+def brute_force(mesh_vertices, faces, rays=RAYS):
+    """Depth image by Moeller-Trumbore over every ray and triangle in double precision; 0 = nothing."""
+    directions = np.column_stack([rays.x.ravel(), rays.y.ravel(), np.ones(rays.x.size)])
+    best = np.full(rays.x.size, np.inf)
+    for a, b, c in np.asarray(mesh_vertices, dtype=float)[faces]:
+        e1, e2 = b - a, c - a
+        p = np.cross(directions, e2)
+        det = p @ e1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = (p @ -a) / det
+            q = np.cross(-a, e1)
+            v = (directions @ q) / det
+            t = (e2 @ q) / det
+        hair = 1e-13  # this form has holes between neighbours
+        hit = (u >= -hair) & (v >= -hair) & (u + v <= 1 + hair) & (t > 0)
+        best[hit & (t < best)] = t[hit & (t < best)]
+    return np.where(np.isfinite(best), best, 0).reshape(rays.x.shape)
+
+
+SHAPES = {
+    "icosphere": trimesh.creation.icosphere(2, 0.15),
+    "torus": trimesh.creation.torus(0.1, 0.04, 16, 10),
+    "box turned": trimesh.creation.box(
+        (0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)
+    ),
+    "two bodies": trimesh.util.concatenate(
+        [trimesh.creation.box((0.1, 0.1, 0.1)),
+         trimesh.creation.icosphere(1, 0.06).apply_translation([0.05, 0.03, -0.1])]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_depth_is_that_of_the_facets(name):
+    mesh = SHAPES[name]
+    vertices_m = np.add(mesh.vertices, [0, 0, 1.8])
+    depth_m, expected = depth_image(traced_mesh(mesh).primary(RAYS)), brute_force(vertices_m, mesh.faces)
+    np.testing.assert_array_equal(depth_m > 0, expected > 0)
+    assert (expected > 0).sum() > 500
+    np.testing.assert_allclose(depth_m, expected, atol=1e-12)
+
+
+def test_rays_of_a_camera_with_lens_distortion():
+    for distortion in ((-0.3, 0.1, 0.002, -0.001, 0.0), (0.4, -0.1, -0.003, 0.002, 0.0)):
+        rays = PixelRays.of(replace(RIG.camera, distortion=distortion))
+        for mesh in SHAPES.values():
+            vertices_m = np.add(mesh.vertices, [0.15, -0.1, 1.8])
+            depth_m = np.zeros(rays.x.shape)
+            hits = traced(vertices_m, mesh.faces).primary(rays)
+            depth_m.ravel()[hits.pixels] = hits.depth_m
+            expected = brute_force(vertices_m, mesh.faces, rays)
+            np.testing.assert_array_equal(depth_m > 0, expected > 0)
+            np.testing.assert_allclose(depth_m, expected, atol=1e-12)
+
+
+def test_rays_in_any_order():
+    """The bounds of rows and columns only save work: rays in no order at all give the same answer."""
+    order = np.random.default_rng(3).permutation(X.size)
+    mesh = SHAPES["box turned"]
+    plain = depth_image(traced_mesh(mesh).primary(RAYS)).ravel()[order]
+    hits = traced_mesh(mesh).primary(PixelRays(X.ravel()[order].reshape(X.shape), Y.ravel()[order].reshape(X.shape)))
+    np.testing.assert_array_equal(depth_image(hits).ravel(), plain)
+
+
+def test_slivers_and_large_triangles():
+    """Long thin triangles at every angle: the columns of a row that they cover are computed, and none is missed."""
+    rng = np.random.default_rng(4)
+    start = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(1.5, 2.1, 200)])
+    end = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(1.5, 2.1, 200)])
+    aside = start + rng.normal(0, 1, (200, 3)) * 10.0 ** rng.uniform(-5, -1, (200, 1))
+    vertices_m = np.concatenate([start, end, aside])
+    faces = np.column_stack([np.arange(200), np.arange(200) + 200, np.arange(200) + 400])
+    depth_m, expected = depth_image(traced(vertices_m, faces).primary(RAYS)), brute_force(vertices_m, faces)
+    np.testing.assert_array_equal(depth_m > 0, expected > 0)
+    np.testing.assert_allclose(depth_m, expected, atol=1e-9)
+
+
+def test_no_ray_passes_between_neighbours():
+    """Triangles whose shared edges and corners lie exactly on the rays' grid: no hole."""
+    lines = np.arange(-5, 6) * (X[0, 1] - X[0, 0]) * 8 + X[0, 88]
+    x, y = np.meshgrid(lines, lines)
+    depth_m = 1.8 + 0.05 * np.random.default_rng(5).random(x.shape)
+    vertices_m = np.stack([x * depth_m, y * depth_m, depth_m], axis=-1).reshape(-1, 3)
+    corner = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 12], corner[:, None] + [0, 12, 11]])
+    seen = depth_image(traced(vertices_m, faces).primary(RAYS)) > 0
+    inside = (np.abs(X - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9) & (np.abs(Y - X[0, 88]) < lines[-1] - X[0, 88] - 1e-9)
+    assert inside.sum() > 70 * 70
+    assert seen[inside].all()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_normals_are_unit_and_face_the_camera(name):
+    hits = traced_mesh(SHAPES[name]).primary(RAYS)
+    directions = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])[hits.pixels]
+    np.testing.assert_allclose(np.linalg.norm(hits.normals, axis=1), 1, atol=1e-12)
+    assert (np.einsum("ij,ij->i", hits.normals, directions) <= 0).all()
+    assert (np.diff(hits.pixels) > 0).all()
+
+
+def test_fine_sphere_to_its_chord_error():
+    radius, centre = 0.15, np.array([0.02, -0.03, 1.8])
+    sphere = trimesh.creation.icosphere(5, radius)
+    hits = traced(sphere.vertices + centre, sphere.faces).primary(RAYS)
+    directions = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])
+    a = np.einsum("ij,ij->i", directions, directions)
+    b = directions @ centre
+    root = b**2 - a * (centre @ centre - radius**2)
+    exact = (b - np.sqrt(np.where(root > 0, root, np.nan))) / a
+    longest = np.linalg.norm(sphere.vertices[sphere.edges[:, 0]] - sphere.vertices[sphere.edges[:, 1]], axis=1).max()
+    # The farthest point of a facet from its sphere lies R - sqrt(R^2 - rho^2) inside, rho <= edge / sqrt(3).
+    chord_m = radius - np.sqrt(radius**2 - longest**2 / 3)
+    normal = (directions[hits.pixels] * hits.depth_m[:, None] - centre) / radius
+    slope = np.abs(np.einsum("ij,ij->i", normal, directions[hits.pixels])) / np.sqrt(a[hits.pixels])
+    steep = slope < 0.1
+    error = hits.depth_m - exact[hits.pixels]
+    assert (error[~steep] > -1e-9).all()  # facets lie inside the sphere
+    assert (error[~steep] < 1.05 * chord_m / slope[~steep]).all()
+    assert chord_m < 1e-4 and (~steep).mean() > 0.95
+    outline = np.nansum(root > 0)
+    assert abs(hits.pixels.size - outline) < 0.02 * outline
+
+
+def test_facing_and_tilted_planes():
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
+    faces = [[0, 1, 2], [0, 2, 3]]
+    hits = traced(np.add(square, [0, 0, 2.0]), faces).primary(RAYS)
+    assert hits.pixels.size == X.size
+    np.testing.assert_allclose(hits.depth_m, 2.0, atol=1e-12)
+    np.testing.assert_allclose(hits.normals, [[0, 0, -1]] * X.size, atol=1e-12)
+    normal = np.array([0.3, -0.2, -1.0])
+    tilted = np.add(square, [0, 0, 2.0])
+    tilted[:, 2] = 2.0 + 0.3 * tilted[:, 0] - 0.2 * tilted[:, 1]
+    hits = traced(tilted, faces).primary(RAYS)
+    expected = 2.0 / (1 - 0.3 * X + 0.2 * Y)  # z = 2 + 0.3 x z - 0.2 y z
+    np.testing.assert_allclose(depth_image(hits), expected, atol=1e-9)
+    np.testing.assert_allclose(hits.normals, [normal / np.linalg.norm(normal)] * X.size, atol=1e-9)
+
+
+def test_box_front_face():
+    hits = traced_mesh(trimesh.creation.box((0.2, 0.2, 0.2))).primary(RAYS)
+    image = depth_image(hits)
+    front = (np.abs(X) < 0.099 / 1.7) & (np.abs(Y) < 0.099 / 1.7)
+    np.testing.assert_allclose(image[front], 1.7, atol=1e-9)
+    assert (image[(np.abs(X) > 0.101 / 1.7) | (np.abs(Y) > 0.101 / 1.7)] == 0).all()
+
+
+def test_flipped_winding_changes_nothing():
+    mesh = SHAPES["torus"]
+    vertices_m = np.add(mesh.vertices, [0.0013, 0.0007, 1.8])  # no ray runs exactly along an edge
+    plain = traced(vertices_m, mesh.faces).primary(RAYS)
+    rng = np.random.default_rng(0)
+    flipped = mesh.faces.copy()
+    some = rng.random(len(flipped)) < 0.5
+    flipped[some] = flipped[some][:, ::-1]
+    other = traced(vertices_m, flipped).primary(RAYS)
+    np.testing.assert_array_equal(plain.pixels, other.pixels)
+    np.testing.assert_allclose(plain.depth_m, other.depth_m, atol=1e-12)
+    np.testing.assert_allclose(plain.normals, other.normals, atol=1e-9)
+
+
+def test_edge_on_and_degenerate_triangles():
+    """A sheet seen exactly edge-on gives finite depths of its own, and triangles without area are not there."""
+    size = RIG.camera.width
+    assert size % 2 == 0
+    x0 = X[0, size // 2]  # a plane through the camera that holds a whole column of rays
+    sheet = np.array([[1.7 * x0, -0.1, 1.7], [1.9 * x0, -0.1, 1.9], [1.9 * x0, 0.1, 1.9], [1.7 * x0, 0.1, 1.7]])
+    hits = traced(sheet, [[0, 1, 2], [0, 2, 3]]).primary(RAYS)
+    assert np.isfinite(hits.depth_m).all() and np.isfinite(hits.normals).all()
+    assert ((hits.depth_m >= 1.7 - 1e-9) & (hits.depth_m <= 1.9 + 1e-9)).all()
+    mesh = SHAPES["icosphere"]
+    vertices = np.vstack([np.add(mesh.vertices, [0, 0, 1.8]), [[0, 0, 1.55], [0, 0, 1.55], [0, 0, 1.6]]])
+    n = len(mesh.vertices)
+    degenerate = np.vstack([[[n, n + 1, n + 2], [n, n, n], [0, 0, 1]], mesh.faces])
+    plain = traced_mesh(mesh).primary(RAYS)
+    other = traced(vertices, degenerate).primary(RAYS)
+    np.testing.assert_array_equal(plain.pixels, other.pixels)
+    np.testing.assert_allclose(plain.depth_m, other.depth_m, atol=1e-12)
+    with pytest.raises(MeshError, match="no triangle with an area"):
+        traced(vertices, [[n, n + 1, n + 2]])
+
+
+def test_non_manifold_mesh():
+    """Three sheets that share one edge, one of them given twice: the nearest surface wins, without a hole."""
+    top, bottom = [0, -0.1, 1.8], [0, 0.1, 1.8]
+    wings = [[-0.1, 0, 1.9], [0.1, 0, 1.9], [0.02, 0, 2.0]]
+    faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 0, 2]]
+    vertices = np.array([top, bottom, *wings])
+    depth_m, expected = depth_image(traced(vertices, faces).primary(RAYS)), brute_force(vertices, faces)
+    np.testing.assert_array_equal(depth_m > 0, expected > 0)
+    assert (expected > 0).sum() > 100
+    np.testing.assert_allclose(depth_m, expected, atol=1e-12)
+
+
+def test_camera_inside_the_object():
+    shell = trimesh.creation.icosphere(4, 2.0)
+    hits = traced(shell.vertices, shell.faces).primary(RAYS)
+    assert hits.pixels.size == X.size
+    length = hits.depth_m * np.sqrt(X.ravel() ** 2 + Y.ravel() ** 2 + 1)
+    np.testing.assert_allclose(length, 2.0, rtol=2e-3)
+
+
+def test_rays_without_a_direction_see_nothing():
+    x = X.copy()
+    x[:88] = np.nan
+    hits = traced_mesh(trimesh.creation.icosphere(2, 0.2)).primary(PixelRays(x, Y))
+    assert hits.pixels.size and hits.pixels.min() >= 88 * 176
+
+
+def test_object_beside_the_image_is_not_hit():
+    mesh = trimesh.creation.icosphere(2, 0.1)
+    hits = traced(np.add(mesh.vertices, [3.0, 0, 1.8]), mesh.faces).primary(RAYS)
+    assert hits.pixels.size == 0
+
+
+def test_shadow_of_a_known_occluder():
+    """A square between light and plane: a point is in shadow where the line to the light crosses the square."""
+    square = np.array([[-0.1, -0.1, 1.5], [0.1, -0.1, 1.5], [0.1, 0.1, 1.5], [-0.1, 0.1, 1.5]])
+    occluder = traced(square, [[0, 1, 2], [0, 2, 3]])
+    light = np.array([-0.125, 0.1, 0.0])
+    points = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)]) * 2.0
+    crossing = light + (points - light) * (1.5 / 2.0)
+    inside = np.abs(crossing[:, :2]).max(axis=1)
+    dark = occluder.shadowed(points, light)
+    np.testing.assert_array_equal(dark, inside < 0.1)
+    assert 1000 < dark.sum() < 5000
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_what_lies_between_two_points(name):
+    """Segments in any direction against every triangle in turn; the box tree may change nothing."""
+    mesh, rng = SHAPES[name], np.random.default_rng(6)
+    vertices_m = np.add(mesh.vertices, [0.0, 0.0, 1.8])
+    starts, ends = rng.normal([0, 0, 1.8], 0.12, (2, 4000, 3))
+    ends[:500, 0] = starts[:500, 0]  # in the plane of the boxes' sides
+    ends[500:800, :2] = starts[500:800, :2]
+    direction, blocked = ends - starts, np.zeros(len(starts), dtype=bool)
+    for a, b, c in vertices_m[mesh.faces]:
+        normal = np.cross(b - a, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (a - starts) @ normal / (direction @ normal)
+            point = starts + along[:, None] * direction
+            inside = [np.cross(q - p, point - p) @ normal >= 0 for p, q in ((a, b), (b, c), (c, a))]
+        blocked |= (along > 0) & (along < 1) & inside[0] & inside[1] & inside[2]
+    assert 0.2 < blocked.mean() < 0.95
+    np.testing.assert_array_equal(traced(vertices_m, mesh.faces).blocked(starts, ends), blocked)
+
+
+def test_nothing_beyond_the_light_casts_a_shadow():
+    behind = traced([[-1, -1, -0.5], [1, -1, -0.5], [0, 1, -0.5]], [[0, 1, 2]])
+    assert not behind.shadowed(np.array([[0.0, 0.0, 1.8]]), np.array([0.0, 0.0, 0.0])).any()
+
+
+def test_a_surface_does_not_shadow_itself():
+    mesh = trimesh.creation.icosphere(4, 0.15)
+    sphere = traced_mesh(mesh)
+    hits = sphere.primary(RAYS)
+    points = np.column_stack([X.ravel(), Y.ravel(), np.ones(X.size)])[hits.pixels] * hits.depth_m[:, None]
+    light = np.array([-0.125, 0.1, 0.0])
+    toward = light - points
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    cosine = np.einsum("ij,ij->i", hits.normals, toward)
+    dark = sphere.shadowed(points, light)
+    assert not dark[cosine > 0.05].any()
+    assert dark[cosine < -0.05].all()

@@ -1,0 +1,202 @@
+"""The report: which samples it shows, that its pictures hold the numbers they claim, and that text stays text."""
+
+import base64
+import re
+import statistics
+from dataclasses import dataclass, field
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+from chromium import Browser
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_dataset import make_dataset, write_description, write_predictions
+
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
+from fpp_ml_bench.evaluation.report.figures import CLIP_PERCENTILE, bins, nice_step, sample_panels
+from fpp_ml_bench.evaluation.report.html import palette_png
+from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report
+from fpp_ml_bench.evaluation.report.sheet import TILE_PX, write_sheet
+from fpp_ml_bench.evaluation.score import evaluate
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture(scope="module")
+def scored(dataset, tmp_path_factory):
+    """Predictions of the whole set, the error growing from sample to sample, and their result."""
+    folder = tmp_path_factory.mktemp("predictions")
+    for number, sample in enumerate(dataset.samples("all")):
+        depth = dataset.depth_mm(sample)
+        np.save(folder / f"{sample}.npy", np.where(depth > 0, depth + 1 + number, 0).astype(np.float32))
+    write_description(folder, name="A <b>method</b>")
+    return folder, evaluate(folder, dataset, "all")
+
+
+def decoded(png: bytes) -> np.ndarray:
+    """RGBA (H, W, 4) by OpenCV, which had no part in writing it."""
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
+
+
+def test_page_shows_the_best_the_median_and_the_worst(dataset, scored, tmp_path):
+    folder, result = scored
+    path = write_report(result, dataset, folder, tmp_path / "out")
+    assert path == tmp_path / "out" / "index.html"
+    text = path.read_text()
+    samples = dataset.samples("all")
+    headings = re.findall(r"<h3>(.*?): (.*?)</h3>", text)
+    assert headings[0] == ("Best", samples[0]) and headings[-1] == ("Worst", samples[-1])
+    assert ("Median", samples[round(0.5 * 7)]) in headings and len(headings) == 5
+    assert len(re.findall(r'<img src="data:image/png;base64,[^"]+" alt="[^"]{20,}"', text)) == 5 * 5
+    assert "A &lt;b&gt;method&lt;/b&gt;" in text and "<b>" not in text
+    assert f"mean {statistics.fmean(range(1, 9)):.3f} mm" in text
+    outside = [
+        address for address in re.findall(r'(?:src|href)="([^"]*)"', text) if not address.startswith(("data:", "#"))
+    ]
+    assert outside == [] and path.read_bytes() == write_report(result, dataset, folder, tmp_path / "two").read_bytes()
+
+
+def test_few_samples_are_shown_once_each(scored):
+    rows = scored[1].per_sample
+    for count in range(1, 8):
+        chosen = chosen_samples(rows[:count])
+        names = [row.sample for _, row in chosen]
+        assert len(set(names)) == len(names) == min(count, 5)
+        assert names[0] == rows[0].sample and names[-1] == rows[count - 1].sample
+    assert chosen_samples([]) == []
+
+
+def test_panels_show_the_errors_they_claim():
+    target = np.zeros((40, 40), np.float32)
+    target[10:30, 10:30] = 1800
+    rng = np.random.default_rng(0)
+    error = np.zeros_like(target)
+    error[10:30, 10:30] = rng.normal(0, 2, (20, 20))
+    prediction = target + error
+    prediction[0, 0] = 1799
+    fringe = rng.integers(0, 255, target.shape).astype(np.uint8)
+    panels = {panel.title: panel for panel in sample_panels(fringe, target, prediction, "a sample")}
+    assert list(panels) == ["Fringe", "Truth", "Prediction", "Absolute error", "Signed error"]
+    clip = np.percentile(np.abs(error[10:30, 10:30]), CLIP_PERCENTILE)
+    assert panels["Absolute error"].high == f"{clip:.3f} mm" and panels["Signed error"].low == f"-{clip:.3f} mm"
+    for title, colours, value in (
+        ("Absolute error", "magma", np.abs(prediction - target) / clip),
+        ("Signed error", "coolwarm", ((prediction - target) / clip + 1) / 2),
+    ):
+        image = decoded(panels[title].png)
+        visible = (target > 0) | (prediction > 0)
+        np.testing.assert_array_equal(image[..., 3] > 0, visible)  # a pixel predicted in the background is visible too
+        expected = 255 * matplotlib.colormaps[colours](np.clip(value, 0, 1))[..., :3]
+        assert np.abs(image[..., :3].astype(float) - expected)[visible].max() <= 6  # one level of the map
+    np.testing.assert_array_equal(decoded(panels["Truth"].png)[..., 3] > 0, target > 0)
+    assert np.abs(decoded(panels["Fringe"].png)[..., 0].astype(int) - np.maximum(fringe, 1)).max() <= 2
+
+
+def test_large_images_are_subsampled_not_averaged():
+    target = np.zeros((960, 960), np.float32)
+    target[::2] = 1500
+    target[1::2] = 2000
+    panel = sample_panels(np.zeros((960, 960), np.uint8), target, target, "s")[1]
+    assert panel.indices.shape == (320, 320) and set(np.unique(panel.indices)) == {1, 255}
+
+
+@pytest.mark.parametrize("value", [0.0, 1800.0])
+def test_flat_and_empty_samples_have_panels(value):
+    target = np.full((8, 8), value, np.float32)
+    for panel in sample_panels(np.zeros((8, 8), np.uint8), target, target, "flat"):
+        assert decoded(panel.png).shape == (8, 8, 4) and "nan" not in panel.high + panel.low + panel.description
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=60))
+@settings(max_examples=200, deadline=None)
+def test_histogram_counts_every_sample_once(values):
+    edges, counts = bins(values)
+    assert sum(counts) == len(values) and len(edges) == len(counts) + 1
+    assert edges[0] <= min(values) and max(values) <= edges[-1] * (1 + 1e-12)
+    assert np.allclose(np.diff(edges), edges[1] - edges[0]) and len(counts) <= 40
+
+
+def test_steps_are_round():
+    assert [nice_step(span, 5) for span in (5, 6, 11, 14, 0.03)] == [1, 2, 2.5, 5, 0.01]
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 99))
+@settings(max_examples=50, deadline=None)
+def test_png_is_read_back_by_another_decoder(height, width, seed):
+    rng = np.random.default_rng(seed)
+    indices = rng.integers(0, 256, (height, width)).astype(np.uint8)
+    colours = rng.integers(0, 256, (256, 3)).astype(np.uint8)
+    image = decoded(palette_png(indices, colours))
+    np.testing.assert_array_equal(image[..., 3], np.where(indices == 0, 0, 255))
+    np.testing.assert_array_equal(image[..., :3][indices > 0], colours[indices][indices > 0])
+
+
+@dataclass
+class Counting:
+    """A dataset that counts which samples are read."""
+
+    inner: object
+    read: list[str] = field(default_factory=list)
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def target_mm(self, sample, column="depth"):
+        self.read.append(sample)
+        return self.inner.target_mm(sample, column)
+
+
+def test_only_shown_samples_are_read(dataset, scored, tmp_path):
+    counting = Counting(dataset)
+    write_report(scored[1], counting, scored[0], tmp_path)
+    assert len(counting.read) == 5 == len(set(counting.read))
+
+
+def test_what_was_not_scored_is_not_reported(dataset, scored, tmp_path):
+    folder, result = scored
+    other_dataset = make_dataset(tmp_path / "other", size=(40, 40))
+    with pytest.raises(DatasetError, match="which was scored"):
+        write_report(result, other_dataset, folder, tmp_path / "out")
+    copy = write_predictions(tmp_path / "changed", dataset, "all", offset_mm=3.0)
+    with pytest.raises(PredictionError, match="is not the file that was scored"):
+        write_report(result, dataset, copy, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SubmissionError, match="can't be written"):
+        write_report(result, dataset, folder, tmp_path / "file")
+
+
+def test_sheet_is_one_png_of_three_samples(dataset, scored, tmp_path):
+    write_sheet(scored[1], dataset, scored[0], tmp_path / "sheet.png")
+    image = decoded((tmp_path / "sheet.png").read_bytes())
+    assert image.shape == (3 * TILE_PX + 16, 5 * TILE_PX + 32, 4)
+    truth = image[:TILE_PX, TILE_PX + 8 : 2 * TILE_PX + 8]
+    assert 0.01 < (truth[..., 3] > 0).mean() < 0.5
+
+
+def test_command_and_browser(dataset, tmp_path):
+    folder = write_predictions(
+        tmp_path / "p", dataset, offset_mm=1.0, noise_mm=2.0, name="</title><script>hacked = 1</script>"
+    )
+    assert fpp_eval([str(folder), "--dataset", str(dataset.path), "--report", str(tmp_path / "out")]) == 0
+    page = tmp_path / "out" / "index.html"
+    browser = Browser()
+    try:
+        for width, dark in ((1280, False), (390, True)):
+            browser.open(page, width, 844, dark)
+            assert browser.complaints() == [] and browser.requests() == [page.resolve().as_uri()]
+            assert browser.run("document.documentElement.scrollWidth") <= width
+            assert browser.run("typeof hacked") == "undefined"
+            assert browser.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)") is True
+            assert browser.run("document.images.length") == 4 * (5 + 4)
+    finally:
+        browser.close()
+    text = page.read_text()
+    assert base64.b64decode(re.search(r"base64,([^\"]+)", text)[1])[:4] == b"\x89PNG"

@@ -1,0 +1,331 @@
+"""`fpp-bench reproduce` from trainings to tables, with trainings that take no time: what is made, kept and refused."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.timing import time_method
+from fpp_ml_bench.baselines.training import engine, load_recipe, model_config, save_weights
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.reproduce import plan as reproduce_plan
+from fpp_ml_bench.leaderboard.reproduce import row as reproduce_row
+from fpp_ml_bench.leaderboard.reproduce import run_tables as reproduce
+from fpp_ml_bench.leaderboard.reproduce import train_row as reproduce_training
+from fpp_ml_bench.leaderboard.reproduce.frames import (
+    all_frames_that_hold,
+    read_all_frames,
+    score_all_frames,
+    write_all_frames,
+)
+from fpp_ml_bench.leaderboard.rows import picture_of, read_entry
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+TABLE = "normalization"
+NAMES = ("cpu-unet-raw-rmse", "cpu-unet-global-rmse", "cpu-unet-individual-rmse")
+TWINS = tuple(f"cpu-unet-individual-rmse-range-{source}" for source in ("predicted", "mean"))
+
+
+@cache
+def _timing(folder):
+    opened = DatasetFolder(folder)
+    return time_method(opened, ClassicalMethod(opened.rig, steps=3), repeats=1)
+
+
+def reused_timing(opened, method, split, repeats):
+    """A timing of something else, for tests that are not about time."""
+    return _timing(opened.path).model_copy(update={"frames": len(method.frames_used)})
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch, opened, request):
+    """Recipes at the tiny dataset's size, networks of width 1, 2 timed runs a method, heads of few pairs."""
+
+    def tiny_recipe(name, preset="cpu"):
+        recipe = load_recipe(name, preset)
+        return recipe.model_copy(update={"size": opened.size[0], "width": 1})
+
+    monkeypatch.setattr(reproduce_plan, "load_recipe", tiny_recipe)
+    monkeypatch.setattr("fpp_ml_bench.leaderboard.reproduce.row.REPEATS", 2)
+    for constant in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
+        monkeypatch.setattr(f"fpp_ml_bench.baselines.networks.range_heads.{constant}", 4)
+    if "from_trainings" not in request.node.name:  # there the time is really measured
+        monkeypatch.setattr(reproduce_row, "time_method", reused_timing)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+
+
+class Trainer:
+    """Stands in for the engine: weights drawn from a seed, in the engine's own files. ``says`` maps a recipe's name to
+    what happens instead of finishing."""
+
+    def __init__(self) -> None:
+        self.trained, self.says, self.seed = [], {}, 0
+
+    def __call__(self, recipe, dataset, out, *, minutes=None, show=True):
+        opened = DatasetFolder(dataset)
+        engine._claim(out, recipe, engine.open_data(recipe, dataset)[0])
+        finished = engine._finished(out)
+        if finished is not None:
+            return finished
+        outcome = self.says.get(recipe.name)
+        if isinstance(outcome, BaseException):
+            raise outcome
+        if outcome == "out of time":
+            return engine.TrainingRun(out / engine.WEIGHTS, 1, 1, 1.0, False, out / "log.jsonl", out / "curve.png")
+        self.trained.append(recipe.name)
+        torch.manual_seed(self.seed)
+        network = build(recipe.network, width=recipe.width)
+        # Untrained, its output would be refused for its unit: a little around a depth that can be.
+        with torch.no_grad():
+            network.head.weight.mul_(0.01)
+            network.head.bias.fill_({"raw": 1500.0, "global": 1.5, "individual": 0.4}[recipe.normalisation])
+        save_weights(out / engine.WEIGHTS, network, model_config(recipe, network, opened.fingerprint, 3, {}))
+        (out / engine.DONE).write_text(json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4}))
+        return engine._finished(out)
+
+
+@pytest.fixture
+def trainer(monkeypatch):
+    stand_in = Trainer()
+    monkeypatch.setattr(reproduce, "train", stand_in)
+    return stand_in
+
+
+@pytest.fixture
+def unscored(monkeypatch):
+    """Trainings only: nothing is predicted or scored."""
+    monkeypatch.setattr(reproduce, "_score", lambda *arguments: None)
+
+
+@pytest.fixture
+def run(tiny, tmp_path, trainer):
+    """Run the command on the tiny dataset below ``tmp_path``."""
+    return lambda *words: main(["reproduce", *map(str, words), "--data", str(tiny), "--runs", str(tmp_path / "runs")])
+
+
+def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
+    assert run(TABLE) == 0
+    below = tmp_path / "runs" / "cpu"
+    assert trainer.trained == [name.removeprefix("cpu-") for name in NAMES]
+    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *TWINS))
+    entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
+    assert {entry.provenance for entry in entries.values()} == {"measured here"}
+    tracks = {name: (entry.result.track, entry.result.mode, entry.result.target) for name, entry in entries.items()}
+    assert tracks[NAMES[2]] == ("oracle range", "paper-individual", "depth")
+    assert {tracks[name] for name in (*NAMES[:2], *TWINS)} == {("metric", "standard", "depth")}
+    assert all(entry.name.endswith("(cpu preset)") for entry in entries.values())
+    assert [len(group.rows) for group in rank(entries.values())] == [4, 1]
+    for name, entry in entries.items():
+        assert len(picture_of(entry)) < 100_000
+        assert entry.result.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
+        folders = str(below / "results" / f"{name}.json"), str(below / "predictions" / name)
+        assert fpp_eval(["verify", *folders, "--dataset", str(tiny)]) == 0
+    text = (below / f"{TABLE}.md").read_text()
+    lines = {
+        line.split(" | ")[0].strip("| "): line for line in text.split("## ")[0].splitlines() if line.startswith("| ")
+    }
+    mae = entries[NAMES[2]].result.metrics.object_mae_mm
+    assert f"| oracle range | {mae:.2f} / " in lines["individual"] and "| 16.20 / 21.19 |" in lines["individual"]
+    assert f" {entries[TWINS[0]].result.metrics.object_mae_mm:.2f} / " in lines["individual"]
+    assert "| 5 | 61 |" in lines["raw (mm)"]
+    assert "3 among the rows measured here" in text and "of different tracks" in text
+    assert "paper: reported by the paper" in capsys.readouterr().out
+
+
+def stamps(folder):
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("*.json")}
+
+
+def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
+    assert run(TABLE) == 0
+    rows = tmp_path / "runs" / "cpu" / "rows"
+    first = stamps(rows)
+    assert run(TABLE, "--only-missing") == 0 and stamps(rows) == first
+    assert len(trainer.trained) == 3
+    (rows / f"{NAMES[1]}.json").unlink()
+    (rows / f"{TWINS[0]}.json").write_text("{")
+    assert run(TABLE, "--only-missing") == 0
+    changed = {name.removesuffix(".json") for name, stamp in stamps(rows).items() if first[name] != stamp}
+    assert changed == {NAMES[1], TWINS[0]}
+    assert run(TABLE) == 0 and len(trainer.trained) == 3
+    assert not set(stamps(rows).items()) & set(first.items())
+
+
+def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
+    assert run(TABLE) == 0
+    below = tmp_path / "runs" / "cpu"
+    weights_before = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    training = below / "unet-individual-rmse"
+    for path in training.iterdir():
+        path.unlink()
+    trainer.says["unet-individual-rmse"] = "out of time"
+    trainer.seed = 1
+    assert run(TABLE, "--only-missing", "--minutes", "5") == 1
+    assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
+    trainer.says.clear()
+    assert run(TABLE, "--only-missing") == 0
+    weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    assert weights_before != weights_after and len(trainer.trained) == 4
+
+
+def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, tmp_path, capsys):
+    trainer.says["unet-global-rmse"] = "out of time"
+    assert run(TABLE, "--minutes", "5") == 1
+    out = capsys.readouterr().out
+    assert "Stopped at unet-global-rmse after 5 minutes. Continue with: fpp-bench reproduce normalization" in out
+    assert "--only-missing --minutes 5" in out
+    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    assert "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization" in text
+    trainer.says.clear()
+    assert run(TABLE, "--only-missing", "--minutes", "5") == 0
+
+
+def test_a_training_that_fails_does_not_stop_the_others(run, trainer, unscored, tmp_path, capsys):
+    trainer.says["unet-global-rmse"] = TrainingError("training diverged: loss is not finite in batch 3")
+    assert run(TABLE) == 2
+    assert "1 of 3 rows could not be made:\n  unet-global-rmse: training diverged" in capsys.readouterr().err
+    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    assert "- global: training diverged" in text
+    assert len(trainer.trained) == 2
+
+
+def test_ctrl_c_leaves_what_is_done_and_a_table(run, trainer, unscored, tmp_path):
+    trainer.says["unet-global-rmse"] = KeyboardInterrupt()
+    assert run(TABLE) == 130
+    assert (tmp_path / "runs" / "cpu" / f"{TABLE}.md").is_file()
+    trainer.says.clear()
+    assert run(TABLE, "--only-missing") == 0
+    assert trainer.trained.count("unet-raw-rmse") == 1
+
+
+def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, tmp_path, capsys):
+    out = tmp_path / "runs" / "cpu" / "unet-individual-rmse"
+    out.mkdir(parents=True)
+    recipe = reproduce_plan.load_recipe("normalization/individual", "cpu")
+    other = {**recipe.to_dict(), "batch": 8, "seed": 1}
+    (out / engine.RECIPE).write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
+    assert run(TABLE) == 2
+    error = capsys.readouterr().err
+    assert "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in error and f"mv {out}" in error
+    assert trainer.trained == []
+    (out / engine.RECIPE).write_text("[]")
+    assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
+
+
+def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
+    monkeypatch.setattr(reproduce_training, "_gpu", lambda: False)
+    assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2
+    error = capsys.readouterr().err
+    assert (
+        "no CUDA GPU" in error and "fpp-bench reproduce normalization --preset paper" in error and "--anyway" in error
+    )
+    assert trainer.trained == []
+    assert run(TABLE, "--preset", "paper", "--anyway") == 0 and len(trainer.trained) == 3
+    assert run(TABLE, "--preset", "paper") == 0  # nothing is left to train
+
+
+def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path, opened):
+    unscored_configs = ("horizontal", "sinusoidal", "all")
+    trainer.says |= {f"unet-individual-rmse-{name}": TrainingError("left out") for name in unscored_configs}
+    assert run("multi_frame") == 2
+    below = tmp_path / "runs" / "cpu"
+    scores = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-vertical-all-frames.json")
+    assert scores.frames == list(range(18, 36)) and scores.pairs == 18 * len(opened.samples("test"))
+    row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").result
+    assert row.submission.frames_used == [18]
+    first = next(part.metrics for part in scores.per_frame if part.frame == 18)
+    for key in ("object_mae_mm", "overall_rmse_mm", "background_mae_mm"):
+        assert getattr(first, key) == pytest.approx(getattr(row.metrics, key), rel=1e-9)
+        per_frame = [getattr(part.metrics, key) for part in scores.per_frame]
+        assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_frame), rel=1e-9)
+    table = (below / "multi_frame.md").read_text().split("## ")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| 18 vertical")]
+    assert len(lines) == 2 and "its first frame only" in lines[1]
+    assert f"| {scores.metrics.object_mae_mm:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
+    assert f"| {row.metrics.object_mae_mm:.2f} / " in lines[1] and "12.36" not in lines[1]
+    frame0 = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-all-frames.json")
+    alone = read_entry(below / "rows" / "cpu-unet-individual-rmse.json").result
+    assert frame0.metrics.object_mae_mm == pytest.approx(alone.metrics.object_mae_mm, rel=1e-9)
+
+
+def test_all_frames_files_are_read_strictly(opened, tmp_path):
+    def zeros(frame):
+        return np.zeros(frame.shape, np.float32)
+
+    scores = score_all_frames(opened, zeros, [0, 3], "mm", "standard", "r", 64 * "a")
+    path = tmp_path / "all.json"
+    write_all_frames(scores, path)
+    assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
+    assert all_frames_that_hold(path, opened.fingerprint, 64 * "b") is None
+    assert scores.metrics.background_mae_mm == 0 and scores.metrics.object_mae_mm > 1500
+    path.write_text(path.read_text().replace('"pairs"', '"pear"'))
+    with pytest.raises(SubmissionError, match="pear"):
+        read_all_frames(path)
+    assert all_frames_that_hold(path, opened.fingerprint, 64 * "a") is None
+    with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
+        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], "mm", "standard", "r", 64 * "a")
+
+
+def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
+    from fpp_ml_bench.leaderboard.reproduce.row import SPLIT
+
+    rng = np.random.default_rng(0)
+    noise = {sample: rng.uniform(0.0, 1.0, opened.size).astype(np.float32) for sample in opened.samples(SPLIT)}
+    waiting = iter(noise.values())
+    folder = tmp_path / "predictions"
+    folder.mkdir()
+    from scored_dataset import write_description
+
+    write_description(folder, units="normalised", uses_ground_truth_range=True)
+    for sample, values in noise.items():
+        np.save(folder / f"{sample}.npy", values)
+    result = evaluate(folder, opened, mode="paper-individual")
+    scores = score_all_frames(opened, lambda frame: next(waiting), [0], "normalised", "paper-individual", "r", 64 * "a")
+    for key, value in scores.metrics:
+        assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
+
+
+def test_list_and_help_do_not_train(run, trainer, capsys):
+    assert main(["reproduce", "--list"]) == 0
+    assert "23 trainings fill 26 rows" in capsys.readouterr().out
+    assert main(["reproduce"]) == 2
+    assert "expected a table" in capsys.readouterr().err
+    for words in (["nonsense"], [TABLE, "--minutes", "0"], [TABLE, "--minutes", "nan"]):
+        with pytest.raises(SystemExit):
+            main(["reproduce", *words])
+    assert trainer.trained == []
+
+
+def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys, trainer):
+    assert run(TABLE) == 0
+    rows = tmp_path / "runs" / "cpu" / "rows"
+    path = rows / f"{NAMES[0]}.json"
+    content = json.loads(path.read_text())
+    content["result"]["dataset"]["fingerprint"] = 64 * "b"
+    path.write_text(json.dumps(content))
+    assert run(TABLE) == 2
+    assert "is a row on dataset bbbbbbbb" in capsys.readouterr().err
+    assert json.loads(path.read_text())["result"]["dataset"]["fingerprint"] == 64 * "b"
+
+
+def test_names_are_unique_in_every_group(run, trainer, tmp_path):
+    assert run("background_removed") == 0
+    paths = sorted((tmp_path / "runs" / "cpu" / "rows").glob("*.json"))
+    assert [path.stem for path in paths] == [
+        f"cpu-unet-{kind}-rmse-bgremoved" for kind in ("global", "individual", "raw")
+    ]
+    tracks = {entry.result.track for entry in read_entries(paths)}
+    assert tracks == {"oracle mask", "oracle range + mask"}
+    assert "no twins there" in (tmp_path / "runs" / "cpu" / "background_removed.md").read_text()

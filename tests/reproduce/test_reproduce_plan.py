@@ -1,0 +1,191 @@
+"""What `fpp-bench reproduce` plans to do, on which dataset, and how it judges the paper's orderings."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scored_dataset import make_dataset, write_predictions
+
+from fpp_ml_bench.baselines.training import PRESETS, TABLES, load_recipe
+from fpp_ml_bench.cli import reproduce as command
+from fpp_ml_bench.errors import DatasetError, RecipeError
+from fpp_ml_bench.evaluation.report import compare
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
+from fpp_ml_bench.leaderboard.reproduce import plan as reproduce_plan
+from fpp_ml_bench.leaderboard.reproduce.data import default_folder, open_dataset
+from fpp_ml_bench.leaderboard.reproduce.lines import Line, Scored, scored_entry
+from fpp_ml_bench.leaderboard.reproduce.paper_order import Ordering, orderings
+from fpp_ml_bench.leaderboard.reproduce.plan import Folders, places, planned, variants
+from fpp_ml_bench.leaderboard.reproduce.table import orderings_sentence, table_markdown
+from fpp_ml_bench.leaderboard.rows import Entry
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", size=(224, 224))
+
+
+def folders(tmp_path, preset="cpu"):
+    return Folders(preset, tmp_path / "runs" / preset, tmp_path / "rows")
+
+
+def test_the_command_knows_the_recipes_tables_and_presets():
+    assert PAPER_TABLES == TABLES and command.PRESETS == PRESETS
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_rows_of_one_recipe_are_one_training(preset):
+    jobs = planned(PAPER_TABLES, preset)
+    rows = [place.recipe_name for job in jobs for place in job.places]
+    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 5 and len(jobs) == 23
+    shared = [{place.recipe_name for place in job.places} for job in jobs if len(job.places) > 1]
+    assert shared == [
+        {"normalization/individual", "multi_frame/frame0", "loss/rmse"},
+        {"loss/hybrid_l1_0.7", "architecture/unet"},
+    ]
+    names = [job.recipe.name for job in jobs]
+    assert len(set(names)) == len(names)
+    titles = [(job.recipe.title, variant.depth_range) for job in jobs for variant in variants(job.recipe)]
+    assert len(set(titles)) == len(titles)
+
+
+def test_places_hold_the_papers_numbers():
+    for table in PAPER_TABLES:
+        by_row = {place.row: place for place in places(table)}
+        for row in paper_tables()[table].rows:
+            assert (by_row[row.row].errors_mm, by_row[row.row].pairs) == (row.errors_mm, row.test_samples)
+        extra = [name for name, place in by_row.items() if place.errors_mm is None]
+        assert extra == (["hformer"] if table == "architecture" else [])
+
+
+def test_two_recipes_under_one_name_are_refused(monkeypatch):
+    def other_seed(name, preset):
+        recipe = load_recipe(name, preset)
+        return recipe.model_copy(update={"seed": 7}) if name == "loss/rmse" else recipe
+
+    monkeypatch.setattr(reproduce_plan, "load_recipe", other_seed)
+    with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in seed \(42 and 7\)"):
+        planned(["normalization", "loss"], "cpu")
+
+
+def test_variants_of_a_training():
+    def of(name):
+        return [variant.suffix for variant in variants(load_recipe(name))]
+
+    assert of("normalization/raw") == of("background_removed/individual") == [""]
+    assert of("loss/l1") == ["", "-range-predicted", "-range-mean"]
+
+
+def test_default_folders():
+    assert str(default_folder("cpu", 224)) == "data/cpu224" and str(default_folder("paper", 960)) == "data/full"
+
+
+def test_a_dataset_of_another_size_is_refused(tmp_path):
+    small = make_dataset(tmp_path / "other")
+    jobs = planned(["normalization"], "cpu")
+    with pytest.raises(DatasetError, match=r"expected images of 224 x 224 px, which preset cpu .* got 40 x 32.*--size"):
+        open_dataset(small.path, jobs, folders(tmp_path), print)
+
+
+def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
+    with pytest.raises(
+        DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
+    ):
+        open_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
+
+
+def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
+    jobs, run_folders = planned(["normalization"], "cpu"), folders(tmp_path)
+    first = open_dataset(dataset.path, jobs, run_folders, print)
+    assert open_dataset(dataset.path, jobs, run_folders, print).fingerprint == first.fingerprint
+    recorded = json.loads(run_folders.dataset_record.read_text())
+    run_folders.dataset_record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
+    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
+        open_dataset(dataset.path, jobs, run_folders, print)
+    run_folders.dataset_record.write_text("{")
+    with pytest.raises(DatasetError, match="damaged"):
+        open_dataset(dataset.path, jobs, run_folders, print)
+
+
+def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
+    """A line with these object errors, sample ``object_view`` to mm."""
+    place = replace(places("loss")[0], row=label, label=label)
+    paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
+    mean = float(np.mean(list(errors.values())))
+    samples = {sample: (sample.rpartition("_")[0], error) for sample, error in errors.items()}
+    scored = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
+    return Line(place, load_recipe("loss/rmse"), label, scored, entry, paper)
+
+
+def views(base: float, spread: float = 0.1) -> dict[str, float]:
+    return {
+        f"{name}_A{view}": base + spread * ((number + view) % 3)
+        for number, name in enumerate("abcde")
+        for view in (0, 60)
+    }
+
+
+def test_orderings_are_judged_by_number():
+    noise = views(10.0)
+    swapped = {sample: value + (3.0 if sample < "c" else -2.9) for sample, value in noise.items()}
+    lines = [
+        line("best", 1.0, noise),
+        line("worse", 2.0, views(12.0)),
+        line("odd", 3.0, swapped),
+        line("own", None, noise),
+    ]
+    judged = orderings(lines[::-1])
+    assert [(ordering.better, ordering.worse, ordering.verdict) for ordering in judged] == [
+        ("best", "worse", "holds"), ("best", "odd", "within noise"), ("worse", "odd", "within noise"),
+    ]  # fmt: skip
+    assert [ordering.paper_gap_mm for ordering in judged] == [1.0, 2.0, 1.0]
+    assert judged[0].gap_mm == pytest.approx(2.0)
+    turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
+    assert [ordering.verdict for ordering in turned] == ["reversed"]
+    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_sentence(judged)
+    assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
+    assert "none of its orderings" in orderings_sentence([])
+
+
+@pytest.mark.parametrize(
+    ("ends", "verdict"),
+    [((0.1, 2.0), "holds"), ((0.0, 2.0), "within noise"), ((-1.0, 0.0), "within noise"), ((-2.0, -0.1), "reversed"),
+     (None, "within noise")],
+)  # fmt: skip
+def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
+    assert Ordering("a", "b", 1.0, 1.0, ends, True).verdict == verdict
+
+
+def test_the_difference_is_that_of_compare(tmp_path, dataset):
+    results = [
+        evaluate(write_predictions(tmp_path / str(offset), dataset, offset_mm=offset, noise_mm=2.0 * offset), dataset)
+        for offset in (1.0, 3.0)
+    ]
+    entries = [Entry(tmp_path / "x.json", result) for result in results]
+    lines = [
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_entry(entry))
+        for n, entry in enumerate(entries, 1)
+    ]
+    ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
+    assert (ordering.gap_mm, list(ordering.interval_mm)) == (difference.mean_mm, difference.interval_mm)
+    assert ordering.same_track
+    oracle = results[1].model_copy(
+        update={"submission": results[1].submission.model_copy(update={"uses_ground_truth_range": True})}
+    )
+    lines[1] = replace(lines[1], entry=Entry(tmp_path / "x.json", oracle))
+    assert not orderings(lines)[0].same_track
+    text = table_markdown("loss", lines, orderings(lines), "cpu", "fpp-bench reproduce loss", {})
+    assert "of different tracks" in text
+
+
+def test_rows_that_were_not_measured_stay_empty():
+    empty = replace(line("masked | L1", 18.0, {"a_A0": 1.0}), scored=None)
+    text = table_markdown(
+        "loss", [empty], [], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
+    )
+    assert "Not measured here: masked &#124; L1. To fill: `fpp-bench reproduce loss --preset paper`" in text
+    assert "masked &#124; L1: boom" in text
+    cells = next(row for row in text.splitlines() if row.startswith("| masked")).split(" | ")
+    assert cells[2] == cells[3] == "-" and cells[4] == "18.00 / 21.19"

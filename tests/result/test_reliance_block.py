@@ -1,0 +1,150 @@
+"""Phase reliance in result files and on the leaderboard: written, read back, shown, and refused where it can't be."""
+
+import json
+import re
+
+import pytest
+from board_rows import write_result_file
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result.json_schemas import json_schema
+from fpp_ml_bench.evaluation.result.reliance_block import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.result.result_file import read_result, result_json
+from fpp_ml_bench.leaderboard.page import page_files
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.readme_block import readme_block
+from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
+from fpp_ml_bench.leaderboard.rows import read_entry
+
+SHA = "a" * 64
+
+
+def block(**changes):
+    parts = dict.fromkeys(RelianceParts.model_fields) | {"follows_phase": 0.75, "change_outline": 2.5}
+    return {
+        "version": RELIANCE_VERSION, "score": 0.625, "interval": [0.5, 0.75], "order_free_score": 0.875, "parts": parts,
+        "units": "mm", "direction": "horizontal", "samples": 4, "objects": 2, "dataset_fingerprint": "b" * 64,
+        "protocol_version": "1.1.0", "weights_sha256": SHA, **changes,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture
+def file(tmp_path, dataset):
+    return write_result_file(tmp_path / "row.json", dataset, 1.0, settings={"weights_sha256": SHA})
+
+
+def test_a_result_without_it_stays_as_it_was(file):
+    assert "reliance" not in json.loads(file.read_text())
+    assert read_result(file).reliance is None
+    assert result_json(read_result(file)) == file.read_bytes()
+
+
+@pytest.mark.parametrize("row", [False, True], ids=["result", "row"])
+def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
+    if row:
+        made = tmp_path / "made.json"
+        assert main(["leaderboard", str(file), "--row", str(made), "--provenance", "verified"]) == 0
+        file = made
+    entry = read_entry(file)
+    write_reliance(entry, Reliance(**block(score=0.1)))
+    write_reliance(read_entry(file), Reliance(**block()))
+    again = read_entry(file)
+    assert again.provenance == entry.provenance
+    assert again.reliance == Reliance(**block())
+    assert again.result.model_copy(update={"reliance": None}) == entry.result
+    before = file.read_bytes()
+    write_reliance(again, Reliance(**block()))
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"score": 1.5}, "reliance.score"),
+        ({"score": "0.5"}, "reliance.score"),
+        ({"interval": [0.9, 0.1]}, "expected 0 <= low <= high <= 1"),
+        ({"interval": [None, 0.1]}, "two numbers or two nulls"),
+        ({"interval": [0.1]}, "reliance.interval"),
+        ({"version": "0.9.0"}, "reliance.version"),
+        ({"weights_sha256": "c" * 64}, "measured on weights cccc"),
+        ({"weights_sha256": None}, "measured on weights None"),
+        ({"units": "normalised"}, "an answer in normalised, scored was one in mm"),
+        ({"objects": 5}, "objects is above samples"),
+        ({"parts": {"follows_phase": 0.5}}, "is missing"),
+        ({"surprise": 1}, "is not a key of this file"),
+    ],
+)
+def test_what_contradicts_the_result_is_refused_by_name(change, message, file):
+    content = json.loads(file.read_text())
+    content["reliance"] = block(**change)
+    file.write_text(json.dumps(content))
+    with pytest.raises(SubmissionError, match=re.escape(message)) as caught:
+        read_result(file)
+    assert str(file) in str(caught.value)
+
+
+def test_the_schema_knows_it_and_every_part_has_words():
+    schema = json_schema("result")
+    assert "reliance" in schema["properties"] and "reliance" not in schema["required"]
+    assert set(schema["$defs"]["Reliance"]["properties"]) == set(Reliance.model_fields)
+    assert set(PART_TITLES) == set(RelianceParts.model_fields)
+
+
+def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, dataset):
+    other = write_result_file(tmp_path / "other.json", dataset, 2.0, name="Not asked")
+    write_reliance(read_entry(file), Reliance(**block()))
+    groups = rank(read_entries([file, other]))
+    shown = readme_block(groups)
+    assert re.search(r"\| A method \|.*\| 0\.62 \|", shown) and re.search(r"\| Not asked \|.*\| not measured \|", shown)
+    pages = page_files(groups, [])
+    index = pages["index.html"].decode()
+    assert "Phase reliance" in index and "0.50 to 0.75" in index and "not measured" in index
+    details = [text.decode() for name, text in pages.items() if name.startswith("submissions/")]
+    assert sum("What it reads" in text for text in details) == 1
+    rows = json.loads(pages["data.json"])["groups"][0]["rows"]
+    assert [row["phase_reliance"] and row["phase_reliance"]["score"] for row in rows] == [0.625, None]
+
+
+class Method:
+    def __init__(self):
+        self.name, self.frames_used, self.units = "test", (0,), "mm"
+        self.settings = {"weights_sha256": SHA, "threads": 8, "unheard_of": 1}
+
+
+def test_it_belongs_to_the_very_method_that_was_scored(file):
+    entry = read_entry(file)
+    check_same_method(entry, Method())
+    for key, value in (("name", "another"), ("frames_used", (1,)), ("units", "normalised")):
+        other = Method()
+        setattr(other, key, value)
+        with pytest.raises(SubmissionError, match="very method that was scored"):
+            check_same_method(entry, other)
+    other = Method()
+    other.settings = {"weights_sha256": "c" * 64}
+    with pytest.raises(SubmissionError, match=r"settings\.weights_sha256"):
+        check_same_method(entry, other)
+
+
+def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
+    from fpp_ml_bench.loaders.storage import DatasetFolder
+
+    opened = DatasetFolder(tiny)
+    used = [*opened.sequence.sinusoids("horizontal")[::6], *opened.sequence.gray("horizontal")]
+    settings = {"direction": "horizontal", "steps": 3}
+    row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
+    options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
+    assert main(["reliance", "classical", str(tiny), *options, "--into", str(row), "--json", str(tmp_path / "b")]) == 0
+    reliance = read_result(row).reliance
+    assert reliance is not None and reliance.score > 0.9 and reliance.interval == [None, None]  # one test object
+    assert Reliance(**json.loads((tmp_path / "b").read_text())) == reliance
+    assert "phase reliance, 0 to 1" in capsys.readouterr().out
+    assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
+    assert "very method that was scored" in capsys.readouterr().err
+    assert main(["reliance", "classical", str(tiny), "--views", "7"]) == 2

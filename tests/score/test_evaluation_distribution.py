@@ -1,0 +1,154 @@
+"""Every score against an independent float128 reference, and the identity of the three sets."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+from scored_dataset import disk_depth
+
+from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED
+from fpp_ml_bench.evaluation.score.scores import score_sample
+
+LONG = np.longdouble
+
+
+def edges_of(target):
+    """Pixels beside a depth edge, from shifted copies: written anew from PROTOCOL.md."""
+    jump = 10.0 * 960 / target.shape[1]
+    marked = np.zeros(target.shape, bool)
+    for axis, length in enumerate(target.shape):
+        for place in range(length - 1):
+            first, second = (np.take(target, place + step, axis) for step in (0, 1))
+            crossed = ((first > 0) != (second > 0)) | ((first > 0) & (second > 0) & (np.abs(second - first) > jump))
+            for step in (0, 1):
+                index = [slice(None)] * 2
+                index[axis] = place + step
+                marked[tuple(index)] |= crossed
+    return marked
+
+
+def reference(prediction, target, band):
+    """All scores in float128 by sorting and masking; None for an empty set."""
+    error = prediction.astype(LONG) - target.astype(LONG)
+    inside, edges = target > 0, edges_of(target)
+    distance = ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
+    valid = inside & (prediction > 0)
+
+    def mae(pixels):
+        return np.abs(error[pixels]).mean() if pixels.any() else None
+
+    def rmse(pixels):
+        return np.sqrt((error[pixels] ** 2).mean()) if pixels.any() else None
+
+    def share(part, whole):
+        return LONG(np.count_nonzero(part)) / np.count_nonzero(whole) if whole.any() else None
+
+    core, near = inside & (distance >= band), inside & (distance < band)
+    wide, deep = inside & (distance < 8), inside & (distance >= 8)
+    scores = {
+        "overall_mae_mm": mae(np.ones_like(inside)), "overall_rmse_mm": rmse(np.ones_like(inside)),
+        "object_mae_mm": mae(inside), "object_rmse_mm": rmse(inside),
+        "background_mae_mm": mae(~inside), "background_rmse_mm": rmse(~inside),
+        "object_interior_mae_mm": mae(core), "object_interior_rmse_mm": rmse(core),
+        "object_edge_mae_mm": mae(near), "object_edge_rmse_mm": rmse(near),
+        "object_valid_mae_mm": mae(valid), "object_interior_valid_mae_mm": mae(valid & core),
+        "object_edge_share": share(near, inside), "object_missing_share": share(inside & ~valid, inside),
+        "object_interior_missing_share": share(core & ~valid, core),
+        "object_wide_band_mae_mm": mae(wide), "object_wide_interior_mae_mm": mae(deep),
+        "object_wide_band_share": share(wide, inside),
+        "object_bias_mm": error[inside].mean() if inside.any() else None,
+        "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
+    }  # fmt: skip
+    ordered, signed = np.sort(np.abs(error[inside])), np.sort(error[inside])
+
+    def quantile(values, level):
+        place = LONG(level) * (values.size - 1)
+        low = int(np.floor(place))
+        high = min(low + 1, values.size - 1)
+        return values[low] + (values[high] - values[low]) * (place - low)
+
+    some = bool(ordered.size)
+    scores["object_median_mm"] = quantile(ordered, LONG(1) / 2) if some else None
+    scores["object_p95_mm"] = quantile(ordered, LONG(95) / 100) if some else None
+    scores["object_max_mm"] = ordered[-1] if some else None
+    for limit in (1, 2, 5, 10):
+        scores[f"object_within_{limit}mm_share"] = share(ordered <= limit, np.ones(ordered.size, bool))
+    scores["object_shift_free_mae_mm"] = np.abs(signed - quantile(signed, LONG(1) / 2)).mean() if some else None
+    return scores
+
+
+@st.composite
+def cases(draw):
+    """A prediction and target of any small shape, cover, scale from 1e-30 to 1e30, dtype and memory order."""
+    shape = draw(st.tuples(st.integers(1, 36), st.integers(1, 36)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    kind = draw(st.sampled_from([np.float16, np.float32, np.float64]))
+    largest = 4 if kind is np.float16 else 30
+    scale = 10.0 ** draw(st.integers(-largest, largest))
+    cover = draw(st.sampled_from([0.0, 0.03, 0.5, 0.97, 1.0]))
+    target = np.where(ndimage.uniform_filter(rng.random(shape), 3) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
+    noise = (
+        rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
+    )
+    prediction = (target + noise) * (rng.random(shape) < draw(st.sampled_from([1.0, 0.8])))
+    prediction = prediction.astype(kind)
+    target = target.astype(draw(st.sampled_from([kind, np.float64])))
+    return np.asarray(prediction, order=draw(st.sampled_from("CF"))), target, draw(st.sampled_from([0, 1, 3, 8, 50]))
+
+
+@given(cases())
+@settings(max_examples=200, deadline=None)
+def test_every_score_agrees_with_float128_to_1e_minus_10(case):
+    prediction, target, band = case
+    scores = score_sample(prediction, target, band).metrics()
+    expected = reference(prediction, target, band)
+    assert set(scores) == set(expected) == set(METRICS)
+    scale = float(expected["object_mae_mm"] or 0)
+    for key, value in expected.items():
+        if value is None:
+            assert scores[key] is None, key
+            continue
+        # Signed means and the error without an offset are small differences: accurate relative to the object's MAE.
+        rounding = 1e-12 * scale if key in SIGNED or key == "object_shift_free_mae_mm" else 0.0
+        assert scores[key] == pytest.approx(float(value), rel=1e-10, abs=rounding), key
+
+
+@given(cases())
+@settings(max_examples=150, deadline=None)
+def test_identity_of_the_three_sets(case):
+    prediction, target, band = case
+    scores = score_sample(prediction, target, band).metrics()
+    share = np.count_nonzero(target > 0) / target.size
+    composed = share * (scores["object_mae_mm"] or 0.0) + (1 - share) * (scores["background_mae_mm"] or 0.0)
+    assert scores["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
+
+
+def test_closed_forms_of_the_distribution():
+    target = np.full((1, 101), 1800.0)
+    errors = np.arange(101, dtype=np.float64) - 20.0  # -20 .. 80
+    scores = score_sample(target + errors, target).metrics()
+    assert scores["object_bias_mm"] == 30.0
+    assert scores["object_max_mm"] == 80.0
+    assert scores["object_median_mm"] == np.median(np.abs(errors))
+    assert scores["object_p95_mm"] == 75.0
+    assert scores["object_shift_free_mae_mm"] == pytest.approx(np.abs(np.arange(-50, 51)).mean(), rel=1e-15)
+    assert [scores[f"object_within_{k}mm_share"] for k in (1, 2, 5, 10)] == [3 / 101, 5 / 101, 11 / 101, 21 / 101]
+
+
+def test_the_bias_of_measured_pixels_is_reported_beside_the_bias_of_all():
+    target = np.full((10, 10), 1800.0)
+    prediction = target + 2.0
+    prediction[0, :] = 0.0
+    scores = score_sample(prediction, target).metrics()
+    assert scores["object_valid_bias_mm"] == 2.0
+    assert scores["object_bias_mm"] == pytest.approx(0.9 * 2 - 0.1 * 1800)
+
+
+def test_wide_band_is_eight_pixels_whatever_the_edge_band_is():
+    target = disk_depth((120, 120), 3)
+    prediction = target + np.random.default_rng(0).normal(0, 1, target.shape)
+    narrow, wide = (score_sample(prediction, target, band).metrics() for band in (3, 8))
+    for key in ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"):
+        assert narrow[key] == pytest.approx(wide[key], rel=1e-14)
+    assert wide["object_wide_band_mae_mm"] == wide["object_edge_mae_mm"] != narrow["object_edge_mae_mm"]

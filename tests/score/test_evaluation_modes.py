@@ -1,0 +1,142 @@
+"""Units and modes: mm, m and normalised depth, and the paper's rule for individually normalised rows."""
+
+import json
+
+import numpy as np
+import pytest
+from scored_dataset import make_dataset, write_description, write_predictions
+
+from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.depth import denormalise, normalise
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.units import scored_pair
+
+ORACLE = {"units": "normalised", "uses_ground_truth_range": True}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+def span_of(target):
+    inside = target[target > 0]
+    return float(inside.min()), float(inside.max())
+
+
+def write_normalised(folder, dataset, noise=0.01, **changes):
+    """Normalised targets with noise of either sign everywhere, as a network gives them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, sample in enumerate(dataset.samples("test")):
+        target = dataset.depth_mm(sample)
+        values = normalise(target, "individual", *span_of(target)).astype(np.float64)
+        values += np.random.default_rng(number).normal(0, noise, target.shape)
+        np.save(folder / f"{sample}.npy", values)
+    write_description(folder, **{**ORACLE, **changes})
+    return folder
+
+
+def to_the_letter(values, target):
+    """Paper Section 5.3.2 under individual normalisation, literally: normalise, mask, denormalise both, subtract."""
+    low, high = span_of(target)
+    target_norm = (target.astype(np.longdouble) - low) / (high - low) * (target > 0)
+    inside = target_norm > 0
+    error = (values.astype(np.longdouble) * (high - low) + low) - (target_norm * (high - low) + low)
+    sets = {"overall": np.ones_like(inside), "object": inside, "background": ~inside}
+    scores = {f"{name}_mae_mm": np.abs(error[pixels]).mean() for name, pixels in sets.items()}
+    return scores | {f"{name}_rmse_mm": np.sqrt((error[pixels] ** 2).mean()) for name, pixels in sets.items()}
+
+
+def test_paper_mode_is_the_papers_rule_to_the_letter(dataset, tmp_path):
+    folder = write_normalised(tmp_path / "p", dataset)
+    result = evaluate(folder, dataset, mode="paper-individual")
+    assert result.mode == "paper-individual" and result.track == "oracle range"
+    for row in result.per_sample:
+        target, values = dataset.depth_mm(row.sample), np.load(folder / f"{row.sample}.npy")
+        for key, expected in to_the_letter(values, target).items():
+            assert getattr(row, key) == pytest.approx(float(expected), rel=1e-10), key
+        low, high = span_of(target)
+        # The object pixel at depth_min normalises to 0 and counts as background.
+        at_minimum = np.count_nonzero(target == low)
+        assert row.object_pixels == np.count_nonzero(target) - at_minimum and at_minimum >= 1
+        background = np.abs(values[(target == 0) | (target == low)])
+        assert row.background_mae_mm == pytest.approx(background.mean() * (high - low), rel=1e-12)
+    write_result(result, tmp_path / "r.json")
+    assert read_result(tmp_path / "r.json") == result
+
+
+def test_by_how_much_the_modes_differ_on_the_same_predictions(dataset, tmp_path):
+    """Strictly, a background value that is not 0 becomes a depth near depth_min, 1.8 m off; by the paper's rule it
+    costs its share of the range, 1.6 mm here. The object's error is the same but for the pixels at depth_min."""
+    folder = write_normalised(tmp_path / "p", dataset)
+    paper = evaluate(folder, dataset, mode="paper-individual")
+    strict = evaluate(folder, dataset)
+    assert strict.mode == "standard"
+    assert strict.metrics.object_mae_mm == pytest.approx(paper.metrics.object_mae_mm, rel=0.05)
+    ratio = strict.metrics.background_mae_mm / paper.metrics.background_mae_mm
+    ranges = [high - low for low, high in (span_of(dataset.depth_mm(s)) for s in dataset.samples("test"))]
+    nearest = [span_of(dataset.depth_mm(s))[0] for s in dataset.samples("test")]
+    expected = np.mean(nearest) / (0.01 * np.sqrt(2 / np.pi) * np.mean(ranges))
+    assert ratio == pytest.approx(expected, rel=0.05)
+    assert ratio > 800
+
+
+def test_exact_zeros_in_the_background_cost_nothing_in_either_mode(dataset, tmp_path):
+    folder = write_normalised(tmp_path / "p", dataset, noise=0.0)
+    for mode in ("standard", "paper-individual"):
+        result = evaluate(folder, dataset, mode=mode)
+        assert result.metrics.background_mae_mm == 0.0
+        for row in result.per_sample:
+            target = dataset.depth_mm(row.sample)
+            low, high = span_of(target)
+            # The object's nearest pixels normalise to 0: background by the paper's rule, lost by the strict one.
+            lost = np.count_nonzero(target == low) * low / np.count_nonzero(target) if mode == "standard" else 0.0
+            # Normalising in float32 rounds a value in [0, 1] three times, by at most 2^-24 each.
+            assert row.object_mae_mm == pytest.approx(lost, abs=3 * 2.0**-24 * (high - low))
+
+
+def test_denormalising_is_the_training_sides_inverse(dataset):
+    sample = dataset.samples("test")[0]
+    target = dataset.depth_mm(sample)
+    values = np.random.default_rng(0).uniform(0.01, 1.0, target.shape)
+    depth, same = scored_pair(values, target, "normalised", "standard", sample)
+    assert np.array_equal(depth, denormalise(values, "individual", *span_of(target))) and same is target
+
+
+def test_metres_score_like_millimetres(dataset, tmp_path):
+    mm = write_predictions(tmp_path / "mm", dataset, noise_mm=2.0)
+    m = write_predictions(tmp_path / "m", dataset, noise_mm=2.0, units="m")
+    for path in m.glob("*.npy"):
+        np.save(path, np.load(path).astype(np.float64) / 1000)
+    in_mm, in_m = (evaluate(folder, dataset).metrics.model_dump() for folder in (mm, m))
+    for key, value in in_mm.items():
+        assert in_m[key] == (value if value is None else pytest.approx(value, rel=1e-9, abs=1e-9)), key
+
+
+def test_modes_and_tracks_cannot_be_mixed_up(dataset, tmp_path, capsys):
+    folder = write_predictions(tmp_path / "p", dataset)
+    command = [str(folder), "--dataset", str(dataset.path)]
+    assert main([*command, "--mode", "paper-individual"]) == 2
+    assert "submission.yaml: --mode paper-individual scores normalised depth" in capsys.readouterr().err
+    normalised = write_normalised(tmp_path / "n", dataset, uses_ground_truth_range=False)
+    assert main([str(normalised), "--dataset", str(dataset.path)]) == 2
+    assert "units: normalised needs uses_ground_truth_range: true" in capsys.readouterr().err
+    write_description(normalised, **ORACLE)
+    written = tmp_path / "r.json"
+    command = [str(normalised), "--dataset", str(dataset.path), "--mode", "paper-individual", "--json", str(written)]
+    assert main(command) == 0
+    assert "oracle range track, mode paper-individual" in capsys.readouterr().out
+    assert json.loads(written.read_text())["mode"] == "paper-individual"
+
+
+def test_a_target_without_range_is_refused_by_sample():
+    empty, flat = np.zeros((4, 5), np.float32), np.full((4, 5), 1800, np.float32)
+    values = np.full((4, 5), 0.5)
+    with pytest.raises(DatasetError, match="s: the target holds no object"):
+        scored_pair(values, empty, "normalised", "standard", "s")
+    assert not scored_pair(0 * values, empty, "normalised", "standard", "s")[0].any()
+    with pytest.raises(DatasetError, match="s: the target is one flat plane"):
+        scored_pair(values, flat, "normalised", "paper-individual", "s")
+    assert np.array_equal(scored_pair(values, flat, "normalised", "standard", "s")[0], flat)

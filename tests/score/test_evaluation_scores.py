@@ -1,0 +1,261 @@
+"""The scores of one sample against an independent reference in extended precision, and against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_dataset import disk_depth
+
+from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.protocol import WITHIN
+from fpp_ml_bench.evaluation.result import mean_over_samples, median_over_samples, pooled
+from fpp_ml_bench.evaluation.score import error_stats
+from fpp_ml_bench.evaluation.score.scores import EMPTY, ErrorStats, combine, score_sample
+
+
+def reference(prediction, target):
+    """The six headline errors by boolean masking in long double: another arithmetic, another order of summation."""
+    error = prediction.astype(np.longdouble) - target.astype(np.longdouble)
+    scores = {}
+    for name, pixels in (
+        ("overall", np.ones(target.shape, bool)),
+        ("object", target > 0),
+        ("background", ~(target > 0)),
+    ):
+        chosen = error[pixels]
+        scores[f"{name}_mae_mm"] = np.abs(chosen).mean() if chosen.size else None
+        scores[f"{name}_rmse_mm"] = np.sqrt((chosen**2).mean()) if chosen.size else None
+    return scores
+
+
+def assert_agrees(prediction, target, relative=1e-12):
+    computed = score_sample(prediction, target).metrics()
+    for key, expected in reference(prediction, target).items():
+        if expected is None:
+            assert computed[key] is None, key
+        else:
+            assert computed[key] == pytest.approx(float(expected), rel=relative, abs=0), key
+    return computed
+
+
+@st.composite
+def maps(draw):
+    """A prediction and a target of any small shape, cover, scale and dtype, with errors of either sign."""
+    shape = draw(st.tuples(st.integers(1, 40), st.integers(1, 40)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    cover = draw(st.sampled_from([0.0, 0.05, 0.5, 1.0]))
+    kind = draw(st.sampled_from([np.float16, np.float32, np.float64]))
+    largest = {np.float16: 4, np.float32: 30, np.float64: 30}[kind]
+    scale = 10.0 ** draw(st.integers(-largest, largest))
+    target = np.where(rng.random(shape) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
+    prediction = target + rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0]))
+    order = draw(st.sampled_from("CF"))
+    return np.asarray(prediction.astype(kind), order=order), target.astype(draw(st.sampled_from([kind, np.float64])))
+
+
+@given(maps())
+@settings(max_examples=300, deadline=None)
+def test_agrees_with_long_double_reference(case):
+    assert_agrees(*case)
+
+
+@given(maps())
+@settings(max_examples=200, deadline=None)
+def test_overall_is_composed_of_object_and_background(case):
+    prediction, target = case
+    s, overall = score_sample(prediction, target), reference(prediction, target)
+    share = s.object.pixels / target.size
+    inside, outside = s.object.mae_mm or 0.0, s.background.mae_mm or 0.0
+    assert share * inside + (1 - share) * outside == pytest.approx(float(overall["overall_mae_mm"]), rel=1e-12, abs=0)
+    assert s.object.pixels + s.background.pixels == target.size
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+@pytest.mark.parametrize("size", [(3, 5), (97, 101), (240, 250)])
+def test_scales_from_1e_minus_30_to_1e30(scale, size):
+    rng = np.random.default_rng(1)
+    target = np.where(rng.random(size) < 0.3, 1.0, 0.0) * scale
+    assert_agrees(target + rng.normal(0, 1, size) * scale, target, relative=1e-13)
+
+
+def test_unequal_magnitudes_are_not_lost():
+    """A background of tiny errors beside an object of huge ones: float32, or overall minus object, would lose it."""
+    target = disk_depth((64, 64), 3).astype(np.float64)
+    prediction = np.where(target > 0, target + 1e12, 1e-6)
+    computed = assert_agrees(prediction, target)
+    assert computed["background_mae_mm"] == pytest.approx(1e-6, rel=1e-14)
+
+
+def test_block_borders_and_empty_blocks(monkeypatch):
+    target = disk_depth((48, 52), 5)
+    prediction = target + np.random.default_rng(0).normal(0, 2, target.shape)
+    expected = score_sample(prediction, target).metrics()
+    for block in (1, 7, 52, 1000):
+        monkeypatch.setattr(error_stats, "BLOCK", block)
+        blocked = score_sample(prediction, target).metrics()
+        for key, value in expected.items():
+            assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_ground_truth_scores_exactly_zero(kind):
+    target = disk_depth((120, 140), 1).astype(kind)
+    computed = score_sample(target.copy(), target).metrics()
+    errors = [value for key, value in computed.items() if key.endswith("_mm")]
+    assert errors == [0.0] * len(errors)
+    assert computed["object_missing_share"] == 0.0
+    assert {computed[key] for key in WITHIN} == {1.0}
+
+
+def test_closed_forms_of_a_shift_and_of_nothing():
+    target = disk_depth((120, 140), 2)
+    shifted = score_sample(target.astype(np.float64) + 2.5, target).metrics()
+    assert shifted.pop("object_shift_free_mae_mm") == 0.0
+    assert {value for key, value in shifted.items() if key.endswith("_mm")} == {2.5}
+    assert [shifted[key] for key in WITHIN] == [0.0, 0.0, 1.0, 1.0]
+    empty = score_sample(np.zeros_like(target), target)
+    inside = target[target > 0].astype(np.float64)
+    assert empty.object.mae_mm == pytest.approx(inside.mean(), rel=1e-14)
+    assert empty.background == ErrorStats(empty.background.pixels, 0.0, 0.0)
+    assert empty.missing == inside.size and empty.valid == EMPTY
+    assert empty.metrics()["object_missing_share"] == 1.0
+    assert empty.metrics()["object_valid_mae_mm"] is None
+
+
+def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
+    target = np.full((4, 5), 1800.0)
+    prediction = target + 1.0
+    prediction[0] = 0.0
+    prediction[1, 0] = -3.0
+    s = score_sample(prediction, target)
+    assert s.missing == 6
+    assert s.metrics()["object_missing_share"] == 0.3
+    assert s.valid == ErrorStats(14, 1.0, 1.0)
+    assert s.object.mae_mm == pytest.approx((5 * 1800 + 1803 + 14) / 20, rel=1e-15)
+    assert s.object.rmse_mm == pytest.approx(math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15)
+
+
+def test_missing_pixels_are_told_apart_by_the_edge_band():
+    target = disk_depth((80, 80), 7)
+    near, inside = object_near_edge(target, 3), target > 0
+    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * inside
+    gone = np.random.default_rng(0).random(target.shape) < 0.2
+    prediction[gone & inside] = 0.0
+    s = score_sample(prediction, target)
+    assert (s.interior_valid.mae_mm, s.edge_valid.mae_mm) == (0.25, 5.0)
+    metrics = s.metrics()
+    assert metrics["object_interior_valid_mae_mm"] == 0.25
+    assert metrics["object_missing_share"] == (gone & inside).sum() / inside.sum()
+    assert metrics["object_interior_missing_share"] == (gone & inside & ~near).sum() / (inside & ~near).sum()
+    assert_agrees(prediction, target)
+
+
+def test_empty_sets_have_no_score():
+    flat = np.zeros((6, 7), np.float32)
+    empty = score_sample(flat + 1, flat).metrics()
+    assert [key for key, value in empty.items() if value is None] == [key for key in empty if key.startswith("object")]
+    assert empty["overall_mae_mm"] == empty["background_mae_mm"] == 1.0
+    full = score_sample(flat + 1801, flat + 1800).metrics()
+    assert full["background_mae_mm"] is None and full["background_rmse_mm"] is None
+    assert full["overall_mae_mm"] == full["object_mae_mm"] == 1.0
+    assert full["object_edge_share"] == 0.0 and full["object_edge_mae_mm"] is None
+
+
+def test_edge_band_is_the_distance_rule():
+    """The dilation must give the very pixels of OpenCV's exact Euclidean distance transform."""
+    for seed in range(4):
+        depth = disk_depth((70, 90), seed)
+        depth[10:14, 3:9] = 1700.0
+        for band in (0, 1, 2, 3, 5, 8, 40, 200):
+            expected = (edge_distance_px(depth) < band) & (depth > 0)
+            assert np.array_equal(object_near_edge(depth, band), expected), (seed, band)
+    border = np.full((9, 9), 1800.0)
+    border[0, 0] = 0.0
+    assert np.array_equal(object_near_edge(border, 3), (edge_distance_px(border) < 3) & (border > 0))
+
+
+@given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 12), st.integers(0, 2**32 - 1))
+@settings(max_examples=150, deadline=None)
+def test_edge_band_on_random_masks(height, width, band, seed):
+    rng = np.random.default_rng(seed)
+    depth = np.where(rng.random((height, width)) < 0.9, 1800.0 + 300.0 * (rng.random((height, width)) < 0.1), 0.0)
+    assert np.array_equal(object_near_edge(depth, band), (edge_distance_px(depth) < band) & (depth > 0))
+
+
+def test_interior_and_edge_are_scored_apart():
+    target = disk_depth((80, 80), 7)
+    near = object_near_edge(target, 3)
+    assert 0 < near.sum() < (target > 0).sum()
+    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * (target > 0)
+    s = score_sample(prediction, target, edge_band_px=3)
+    assert (s.interior.mae_mm, s.edge.mae_mm, s.background.mae_mm) == (0.25, 5.0, 0.0)
+    assert s.edge.pixels == near.sum()
+    assert score_sample(prediction, target, edge_band_px=0).edge == EMPTY
+    assert depth_edges(target).any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+@pytest.mark.parametrize("inside", [True, False])
+def test_errors_that_are_not_finite_never_become_a_score(bad, inside):
+    target = disk_depth((20, 20), 0)
+    prediction = target.astype(np.float64)
+    row, column = np.argwhere((target > 0) == inside)[0]
+    prediction[row, column] = bad
+    with pytest.raises(PredictionError, match="finite"):
+        score_sample(prediction, target)
+    with pytest.raises(PredictionError, match="finite"):
+        score_sample(target, np.where(target > 0, np.inf, target) if math.isinf(bad) else target * np.nan)
+
+
+def test_wrong_arguments_are_named():
+    target = np.zeros((4, 5), np.float32)
+    with pytest.raises(PredictionError, match=r"\(4, 5\) \(H, W\), got \(5, 4\)"):
+        score_sample(target.T, target)
+    with pytest.raises(PredictionError, match="got int64"):
+        score_sample(target.astype(np.int64), target)
+    with pytest.raises(PredictionError, match="complex"):
+        score_sample(target.astype(complex), target)
+
+
+def test_combine_is_the_union():
+    rng = np.random.default_rng(4)
+    parts = [rng.normal(0, 10.0**k, 50 + k) for k in range(4)]
+    stats = [ErrorStats(p.size, float(np.abs(p).mean()), float(np.sqrt((p**2).mean()))) for p in parts]
+    union = np.concatenate(parts).astype(np.longdouble)
+    combined = combine(*stats, EMPTY)
+    assert combined.pixels == union.size
+    assert combined.mae_mm == pytest.approx(float(np.abs(union).mean()), rel=1e-14)
+    assert combined.rmse_mm == pytest.approx(float(np.sqrt((union**2).mean())), rel=1e-14)
+    assert combine(EMPTY, EMPTY) == EMPTY
+
+
+def test_averages_over_samples_and_pixels_differ_as_documented():
+    """Two samples of unequal object size: the mean counts samples alike, pooling counts pixels alike."""
+    small, large = np.zeros((10, 10)), np.zeros((10, 10))
+    small[:1] = 1800.0  # 10 px, error 4
+    large[:9] = 1800.0  # 90 px, error 1
+    samples = [score_sample(small + 4 * (small > 0), small), score_sample(large + 1 * (large > 0), large)]
+    without_object = score_sample(np.ones((10, 10)), np.zeros((10, 10)))
+    rows = [s.metrics() for s in (*samples, without_object)]
+    assert mean_over_samples(rows)["object_mae_mm"] == 2.5
+    assert median_over_samples(rows)["object_mae_mm"] == 2.5
+    assert pooled([*samples, without_object])["object_mae_mm"] == pytest.approx((10 * 4 + 90 * 1) / 100, rel=1e-15)
+    assert pooled(samples)["object_rmse_mm"] == pytest.approx(math.sqrt((10 * 16 + 90) / 100), rel=1e-15)
+    assert mean_over_samples(rows)["background_mae_mm"] == pytest.approx(1 / 3, rel=1e-15)
+    assert mean_over_samples([without_object.metrics()])["object_mae_mm"] is None
+
+
+@pytest.mark.parametrize("scale", [1e-160, 1e-300, 5e-324])
+def test_errors_whose_squares_vanish_have_an_rmse_all_the_same(scale):
+    errors = scale * np.arange(1, 101, dtype=np.float64).reshape(10, 10)
+    target = np.zeros((10, 10))
+    target[:5] = 256 * scale
+    scores = score_sample(target + errors, target)
+    sets = ((scores.overall, errors), (scores.object, errors[:5]), (scores.background, errors[5:]))
+    for stats, part in sets:
+        ratio = float(np.sqrt(np.mean((part / part.max()) ** 2)) * part.max())
+        assert stats.rmse_mm == pytest.approx(ratio, rel=1e-12, abs=5e-324)
+        assert stats.rmse_mm > 0

@@ -1,0 +1,122 @@
+"""The torchmetrics metric: the evaluator's numbers whatever the batches, the order and the number of processes."""
+
+import numpy as np
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as spawning
+from scored_dataset import disk_depth
+
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.result import mean_over_samples
+from fpp_ml_bench.evaluation.score.scores import score_sample
+from fpp_ml_bench.evaluation.score.torch_metric import KEYS, DepthScores
+
+SIZE, SAMPLES = (40, 48), 11
+
+
+def data(kind=np.float32):
+    """Predictions and targets (N, H, W), one sample without object, one without background, missing pixels."""
+    rng = np.random.default_rng(5)
+    target = np.stack([disk_depth(SIZE, seed) for seed in range(SAMPLES)])
+    target[3] = 0.0
+    target[4] = 1800.0
+    prediction = (target + rng.normal(0, 3, target.shape)) * (rng.random(target.shape) < 0.95)
+    return prediction.astype(kind), target.astype(kind)
+
+
+def scored(batches, kind=np.float32, order=None):
+    prediction, target = data(kind)
+    metric = DepthScores()
+    order = np.arange(SAMPLES) if order is None else order
+    for part in np.array_split(order, batches):
+        metric.update(torch.from_numpy(prediction[part]), torch.from_numpy(target[part]))
+    return {key: float(value) for key, value in metric.compute().items()}
+
+
+def assert_same(scores, expected, relative=1e-12):
+    for key in KEYS:
+        assert scores[key] == pytest.approx(expected[key], rel=relative, abs=1e-13), key
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_same_numbers_as_the_evaluator(kind):
+    prediction, target = data(kind)
+    rows = [score_sample(p, t).metrics() for p, t in zip(prediction, target, strict=True)]
+    assert_same(scored(3, kind), mean_over_samples(rows))
+
+
+@pytest.mark.parametrize("batches", [2, 4, 11])
+def test_batches_and_order_change_nothing(batches):
+    shuffled = np.random.default_rng(batches).permutation(SAMPLES)
+    assert_same(scored(batches, order=shuffled), scored(1))
+
+
+def _process(rank, address, folder):
+    dist.init_process_group("gloo", init_method=address, rank=rank, world_size=2)
+    prediction, target = data()
+    metric = DepthScores()
+    indices = range(7) if rank == 0 else range(7, SAMPLES)  # unequal shares
+    for index in indices:
+        metric.update(torch.from_numpy(prediction[index : index + 1]), torch.from_numpy(target[index : index + 1]))
+    scores = {key: float(value) for key, value in metric.compute().items()}
+    metric.reset()  # rank 1 gets no sample, as in a short last epoch
+    if rank == 0:
+        metric.update(torch.from_numpy(prediction), torch.from_numpy(target))
+    scores_of_rank_0 = {key: float(value) for key, value in metric.compute().items()}
+    torch.save([scores, scores_of_rank_0], f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
+
+
+def test_two_processes_give_the_same_numbers(tmp_path):
+    spawning.spawn(_process, args=(f"file://{tmp_path}/meet", str(tmp_path)), nprocs=2)
+    expected = scored(1)
+    for rank in (0, 1):
+        scores, scores_of_rank_0 = torch.load(tmp_path / f"{rank}.pt")
+        assert_same(scores, expected)
+        assert_same(scores_of_rank_0, expected)
+
+
+def test_state_is_declared_and_stays_in_float64():
+    metric = DepthScores().half().float()
+    assert set(metric._reductions) == {"sums", "counts"}
+    assert all(reduce is torch.sum or reduce.__name__ == "dim_zero_sum" for reduce in metric._reductions.values())
+    prediction, target = data()
+    metric.update(torch.from_numpy(prediction)[:, None], torch.from_numpy(target)[:, None])
+    assert metric.sums.dtype == torch.float64 and metric.compute()["object_mae_mm"].dtype == torch.float64
+    assert_same({key: float(value) for key, value in metric.compute().items()}, scored(1))
+    metric.reset()
+    assert float(metric.counts.sum()) == 0
+
+
+def test_an_empty_set_is_no_score_and_never_zero():
+    metric = DepthScores()
+    metric.update(torch.ones(1, 4, 5), torch.zeros(1, 4, 5))
+    scores = metric.compute()
+    assert float(scores["background_mae_mm"]) == 1.0 and torch.isnan(scores["object_mae_mm"])
+
+
+def test_forward_gives_the_batch_and_keeps_the_whole():
+    prediction, target = map(torch.from_numpy, data())
+    metric = DepthScores()
+    first = metric(prediction[:2], target[:2])
+    metric(prediction[2:], target[2:])
+    alone = DepthScores()
+    alone.update(prediction[:2], target[:2])
+    assert float(first["object_mae_mm"]) == float(alone.compute()["object_mae_mm"])
+    assert_same({key: float(value) for key, value in metric.compute().items()}, scored(1))
+
+
+def test_gradients_are_not_held_and_bad_batches_are_refused():
+    prediction, target = map(torch.from_numpy, data(np.float64))
+    metric = DepthScores()
+    metric.update(prediction.requires_grad_(), target)
+    assert not metric.sums.requires_grad
+    with pytest.raises(PredictionError, match="finite"):
+        metric.update(torch.full_like(target, float("nan")), target)
+    with pytest.raises(PredictionError, match="shape"):
+        metric.update(prediction[:, 1:], target)
+    with pytest.raises(PredictionError, match="int64"):
+        metric.update(prediction.detach().long(), target)
+    with pytest.raises(PredictionError, match=r"\(B, H, W\)"):
+        metric.update(prediction[0], target[0])

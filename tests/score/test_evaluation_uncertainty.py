@@ -1,0 +1,247 @@
+"""Intervals over objects, ranks with ties, paired comparison and verification."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+from scored_dataset import make_dataset, write_predictions
+
+from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.report import compare
+from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.score import uncertainty
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval, ranks_with_ties
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture
+def make(tmp_path, dataset):
+    def write(file, **changes):
+        folder = write_predictions(tmp_path / file, dataset, **changes)
+        path = tmp_path / f"{file}.json"
+        write_result(evaluate(folder, dataset), path)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 49])
+def test_student_quantile_is_scipys(freedom):
+    assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
+
+
+def test_interval_is_the_expanded_percentile_of_resampled_objects():
+    """Against SciPy's bootstrap at the widened level: another generator, so only roughly the same."""
+    rng = np.random.default_rng(1)
+    means = rng.normal(1.0, 0.3, 12)
+    objects = np.repeat(np.arange(12), 6)
+    values = means[objects] + rng.normal(0, 0.05, objects.size)
+    low, high = object_interval(values.tolist(), objects.tolist())
+    widened = stats.norm.cdf(-np.sqrt(12 / 11) * stats.t.ppf(0.975, 11))
+    per_object = values.reshape(12, 6).mean(axis=1)
+    expected = stats.bootstrap(
+        (per_object,), np.mean, n_resamples=10_000, method="percentile", confidence_level=1 - 2 * widened,
+        rng=np.random.default_rng(0),
+    ).confidence_interval  # fmt: skip
+    assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.03)
+    assert low < values.mean() < high
+    assert object_interval(values.tolist(), objects.tolist()) == (low, high)
+
+
+def test_interval_covers_the_truth_about_as_often_as_it_says():
+    """Five objects of six correlated views each, as in the test split; the plain percentile interval covers 84%."""
+    rng = np.random.default_rng(7)
+    objects = np.repeat(np.arange(5), 6).tolist()
+    covered = 0
+    for _ in range(200):
+        values = (rng.normal(0, 1, 5)[objects] + rng.normal(0, 0.3, 30)).tolist()
+        low, high = object_interval(values, objects)
+        covered += low <= 0 <= high
+    assert 0.87 <= covered / 200 <= 0.99
+
+
+def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
+    values = [1.0, 1.0, 1.0, 5.0, None]
+    low, high = object_interval(values, ["a", "a", "a", "b", "c"])
+    assert (low, high) == (1.0, 5.0)
+    assert object_interval([1.0, 2.0], ["a", "a"]) is None
+    assert object_interval([None, None], ["a", "b"]) is None
+    assert object_interval([2.0, 2.0], ["a", "b"]) == (2.0, 2.0)
+
+
+def test_too_few_objects_for_95_percent_are_said():
+    assert "at most 50% of cases" in uncertainty.caution(2) and "at most 88%" in uncertainty.caution(4)
+    assert uncertainty.caution(5) is None and uncertainty.caution(1) is None
+    rng = np.random.default_rng(3)
+    for objects, reach in ((2, 0.5), (3, 0.75)):
+        covered = 0
+        for _ in range(150):
+            low, high = object_interval(rng.normal(0, 1, objects).tolist(), list(range(objects)))
+            covered += low <= 0 <= high
+        assert covered / 150 == pytest.approx(reach, abs=0.1)
+
+
+def test_ranks_with_ties():
+    spans = [(1.0, (0.8, 1.2)), (1.1, (0.9, 1.3)), (1.25, (1.21, 1.4)), (9.0, (8.0, 10.0))]
+    values, intervals = zip(*spans, strict=True)
+    # The third overlaps the second but not the first: a single entry is clearly better, so its rank is 2.
+    assert ranks_with_ties(values, intervals) == [1, 1, 2, 4]
+    assert ranks_with_ties(values[::-1], intervals[::-1]) == [4, 2, 1, 1]
+    assert ranks_with_ties([2.0, 1.0, 2.0, None], [None] * 4) == [2, 1, 2, None]
+
+
+def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
+    result = read_result(make("a", noise_mm=2.0))
+    assert set(type(result.intervals).model_fields) == set(HEADLINE)
+    for key in HEADLINE:
+        low, high = result.intervals[key]
+        assert low <= getattr(result.metrics, key) <= high
+    assert [(o.object, o.samples) for o in result.per_object] == [("power_drill", 2), ("wooden_boards", 2)]
+    first = [row.object_mae_mm for row in result.per_sample if row.object == "power_drill"]
+    assert result.per_object[0].metrics.object_mae_mm == pytest.approx(np.mean(first), rel=1e-14)
+    assert result.per_object[0].spread["object_mae_mm"] == pytest.approx(np.std(first, ddof=1), rel=1e-12)
+    assert result.seeds == {"bootstrap": 20250} and result.bootstrap.over == "objects"
+    assert result.intervals.of("object_median_mm") is None
+
+
+def test_one_object_has_no_interval(dataset, tmp_path):
+    folder = write_predictions(tmp_path / "p", dataset, split="train", noise_mm=1.0)
+    result = evaluate(folder, dataset, "train")
+    assert result.intervals["object_mae_mm"] == [None, None] and result.intervals.of("object_mae_mm") is None
+
+
+@pytest.mark.parametrize(
+    "path, value, message",
+    [
+        (["intervals", "object_mae_mm", 0], 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
+        (["per_object", 0, "metrics", "object_mae_mm"], 0.5, r"per_object\.0\.metrics\.object_mae_mm does not follow"),
+        (["per_object", 0, "spread", "object_mae_mm"], 0.5, r"per_object\.0\.spread\.object_mae_mm does not follow"),
+        (["per_object", 0, "object"], "mug", r"per_object\.0\.object does not follow"),
+        (["seeds", "bootstrap"], 1, r"seeds\.bootstrap does not follow"),
+        (["bootstrap", "resamples"], 10, r"bootstrap\.resamples does not follow"),
+        (["per_sample", 0, "object_bias_mm"], -99.0, "bias or shift-free MAE is above the MAE"),
+        (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
+        (["per_sample", 0, "object_p95_mm"], None, "null all together"),
+        (["mode"], "paper-individual", "its track is oracle range"),
+        (["environment", "code_sha256"], "x", "code_sha256"),
+    ],
+)
+def test_edited_result_contradicts_itself(path, value, message, make):
+    file = make("a", noise_mm=2.0)
+    content = json.loads(file.read_text())
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    file.write_text(json.dumps(content))
+    with pytest.raises(SubmissionError, match=message):
+        read_result(file)
+
+
+def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
+    first, second = make("one", noise_mm=2.0, name="One"), make("two", noise_mm=1.0, name="Two")
+    comparison = compare(read_result(first), read_result(second))
+    rows = [row.differences["object_mae_mm"] for row in comparison.per_sample]
+    first_rows, second_rows = (json.loads(p.read_text())["per_sample"] for p in (first, second))
+    assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(first_rows, second_rows, strict=True)]
+    main_difference = comparison.differences["object_mae_mm"]
+    assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
+    assert main_difference.told_apart
+    assert comparison.sentence.startswith("Two has a lower object MAE than One, by 0.8")
+    assert "lower in 4 of 4 samples" in comparison.sentence
+    assert main(["compare", str(first), str(second), "--json", str(tmp_path / "d.json")]) == 0
+    printed = capsys.readouterr().out
+    assert "Two has a lower object MAE than One" in " ".join(printed.split())
+    assert json.loads((tmp_path / "d.json").read_text())["differences"]["object_mae_mm"]["lower"] == 4
+
+
+def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
+    first = make("one", noise_mm=1.0, name="One")
+    folder = write_predictions(tmp_path / "two", dataset, noise_mm=1.0, name="Two")
+    for number, sample in enumerate(dataset.samples("test")):  # better on an object, worse on the other
+        depth = np.load(folder / f"{sample}.npy")
+        np.save(folder / f"{sample}.npy", depth + np.float32(1.0 if number < 2 else -0.5))
+    write_result(evaluate(folder, dataset), tmp_path / "two.json")
+    comparison = compare(read_result(first), read_result(tmp_path / "two.json"))
+    assert not comparison.differences["object_mae_mm"].told_apart
+    assert "can't be told apart" in comparison.sentence and "holds 0" in comparison.sentence
+    assert "the same object MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
+
+
+def test_results_of_other_data_are_not_compared(make, dataset, tmp_path, capsys):
+    first = make("one")
+    second = tmp_path / "oracle.json"
+    folder = write_predictions(tmp_path / "two", dataset, uses_ground_truth_range=True)
+    write_result(evaluate(folder, dataset, target="depth_exact"), second)
+    assert main(["compare", str(first), str(second)]) == 2
+    message = capsys.readouterr().err
+    assert "target: depth against depth_exact" in message and "track: metric against oracle range" in message
+
+
+def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
+    file, folder = make("p", noise_mm=2.0), tmp_path / "p"
+    command = ["verify", str(file), str(folder), "--dataset", str(dataset.path)]
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith("verified: ")
+    sample = dataset.samples("test")[0]
+    depth = np.load(folder / f"{sample}.npy")
+    np.save(folder / f"{sample}.npy", depth + np.float32(0.001))
+    assert main(command) == 1
+    printed = capsys.readouterr().out
+    assert printed.startswith("not verified: ") and f"{sample}: prediction_sha256" in printed
+    assert f"{sample}: object_mae_mm" in printed
+    np.save(folder / f"{sample}.npy", depth)
+    assert main(command) == 0
+    write_predictions(folder, dataset, noise_mm=2.0, name="Another name", frames_used=[0, 1])
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "submission.name" in (printed := capsys.readouterr().out) and "submission.frames_used" in printed
+    (folder / f"{sample}.npy").unlink()
+    assert main(command) == 2
+
+
+def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys):
+    other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
+    file = make("p", noise_mm=2.0)
+    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(other_dataset.path)]) == 1
+    assert "dataset.fingerprint" in capsys.readouterr().out
+    file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
+    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(dataset.path)]) == 2
+    assert "scored by protocol 9" in capsys.readouterr().err
+
+
+def test_schema_describes_the_file(make, capsys):
+    import jsonschema
+
+    for name in ("result", "submission", "comparison"):
+        assert main(["schema", name]) == 0
+        schema = json.loads(capsys.readouterr().out)
+        jsonschema.Draft202012Validator.check_schema(schema)
+    assert main(["schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    content = json.loads(make("p").read_text())
+    jsonschema.validate(content, schema)
+    content["per_sample"][0]["object_mae_mm"] = "0.1"
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(content, schema)
+
+
+def test_schema_needs_no_library_to_be_read(capsys):
+    assert main(["schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert schema["$schema"].endswith("2020-12/schema") and schema["additionalProperties"] is False
+    assert {"intervals", "per_object", "per_sample", "seeds", "mode", "environment"} <= set(schema["required"])
+
+
+def test_a_folder_named_like_a_subcommand_is_scored_by_its_path(dataset, tmp_path, monkeypatch):
+    write_predictions(tmp_path / "compare", dataset)
+    monkeypatch.chdir(tmp_path)
+    assert main(["./compare", "--dataset", str(dataset.path)]) == 0

@@ -1,0 +1,208 @@
+"""The stability cases: nothing fails here, and everything that should be able to fail does."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines.stability.case import Case, Outcome, Verdict, family, judge, refusal, worst
+from fpp_ml_bench.baselines.stability.report import document, write_report
+from fpp_ml_bench.baselines.stability.run import GROUPS, all_cases, run_case, run_cases
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import DecodeError, StabilityError
+from fpp_ml_bench.evaluation.score import error_stats
+
+QUICK = {
+    "phase": ("modulation, real frames", "gamma", "quantisation", "dead frame", "steps close together"),
+    "order": ("on a Gray edge", "phase at +-pi", "more periods than codes", "code length"),
+    "triangulation": ("baseline", "nearly parallel rays", "float32 calibration layer"),
+    "rig": ("intrinsic matrix", "rotation off orthonormal", "impossible rig", "tangential lens"),
+    "normalisation": ("range", "subnormal range", "range from a file", "scored"),
+    "metrics": ("magnitude", "mixed magnitudes", "merging order", "not a number"),
+    "scenes": ("wall edge-on", "needle", "camera inside the object", "light at distance 0"),
+}
+
+
+def cases_of(group, *families):
+    cases = [case for case in all_cases([group]) if case.family in families]
+    assert {case.family for case in cases} == set(families)
+    return cases
+
+
+def failing(rows):
+    return {row.case.name: row.against for row in rows if row.verdict is Verdict.FAIL}
+
+
+@pytest.mark.parametrize("group", QUICK)
+def test_no_case_fails(group):
+    rows = run_cases(cases_of(group, *QUICK[group]))
+    assert not failing(rows)
+    assert {row.verdict for row in rows} >= {Verdict.WITHIN}
+
+
+def test_no_case_of_losses_and_layers_fails():
+    rows = run_cases(
+        cases_of("networks", "zero residual", "empty mask", "half-precision loss", "constant input, instance norm",
+                 "loss gradient", "training metric")
+    )  # fmt: skip
+    assert not failing(rows)
+
+
+def case(run, expects="number"):
+    return family("phase", "made up", run, {}, computes="x", reference="x", predicts="x", unit="1", expects=expects)[0]
+
+
+@pytest.mark.parametrize(
+    "outcome, expects, verdict, says",
+    [
+        (Outcome(1.0, 2.0), "number", Verdict.WITHIN, ""),
+        (Outcome(0.0, 0.0), "number", Verdict.WITHIN, ""),
+        (Outcome(2.0, 1.0), "number", Verdict.FAIL, "exceeds its bound"),
+        (Outcome(float("nan"), 1.0), "number", Verdict.FAIL, "exceeds its bound"),
+        (Outcome(1.0, float("inf")), "number", Verdict.FAIL, "no finite error"),
+        (Outcome(1.0, 2.0, flagged=0.5), "number", Verdict.FAIL, "refused 50.00%"),
+        (Outcome(1.0, 2.0, flagged=0.5, may_flag=0.5), "number", Verdict.WITHIN, ""),
+        (Outcome(None), "number", Verdict.FAIL, "refused what can be computed"),
+        (Outcome(None), "refusal", Verdict.FLAGGED, ""),
+        (Outcome(None), "either", Verdict.FLAGGED, ""),
+        (Outcome(0.0, 1.0), "refusal", Verdict.FAIL, "where there is none"),
+    ],
+)
+def test_the_verdict(outcome, expects, verdict, says):
+    judged, against = judge(case(lambda: outcome, expects), outcome)
+    assert judged is verdict and says in against
+
+
+def test_the_worst_element_is_the_one_nearest_to_its_bound_and_nan_beats_them_all():
+    assert worst([1.0, 5.0, 2.0], [1.1, 50.0, 100.0]).error == 1.0
+    assert worst([1.0, 5.0], [1.0, 1.0], [False, True]) == Outcome(1.0, 1.0, flagged=0.5)
+    assert np.isnan(worst([1.0, np.nan], 1.0).error)
+    assert worst([np.nan, 1.0], 1.0, [True, True]).error is None
+    assert refusal(lambda: 1, DecodeError).error == 0.0
+
+
+def test_a_crash_is_a_finding_and_not_the_end():
+    row = run_case(case(lambda: 1 / 0))
+    assert row.verdict is Verdict.FAIL and "ZeroDivisionError" in row.against
+
+
+def naive_float32(errors):
+    """MAE and RMSE by a running float32 sum."""
+    total, squares = np.cumsum(np.abs(errors), dtype=np.float32)[-1], np.cumsum(errors**2, dtype=np.float32)[-1]
+    return error_stats.ErrorStats(errors.size, float(total) / errors.size, float(np.sqrt(squares / errors.size)))
+
+
+def break_metrics(monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.metrics_checks.stats_of", naive_float32)
+    return cases_of("metrics", "mixed magnitudes")
+
+
+def break_arctangent(monkeypatch):
+    def arctan(sine, cosine):
+        return -np.arctan(sine / cosine)  # loses the quadrant
+
+    monkeypatch.setattr("fpp_ml_bench.decoding.phase.minus_atan2", arctan)
+    return cases_of("phase", "modulation, real frames", "gamma")
+
+
+def break_interval(monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.order_checks.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    return cases_of("order", "interval of the phase")
+
+
+def break_triangulation(monkeypatch):
+    def in_single(rays, coordinate, rig, direction):
+        x, u, device = np.float32(rays[0]), np.float32(coordinate), rig.projector
+        bottom = u - np.float32(device.cx) - np.float32(device.fx) * x
+        return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
+
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.triangulation_checks.depth_from_coordinate", in_single)
+    return [member for member in cases_of("triangulation", "baseline") if member.parameters["direction"] == "vertical"]
+
+
+def break_normalisation(monkeypatch):
+    def in_single(depth, name, low, high):
+        share = (np.float32(depth) - np.float32(low)) / (np.float32(high) - np.float32(low))
+        return np.where(depth > 0, share, 0)
+
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.normalisation_checks.normalise", in_single)
+    return cases_of("normalisation", "range from a file")
+
+
+def break_instance_norm(monkeypatch):
+    import torch
+    from torch import nn
+
+    class OnePass(nn.InstanceNorm2d):
+        def forward(self, x):
+            mean = x.mean((2, 3), keepdim=True)
+            variance = (x * x).mean((2, 3), keepdim=True) - mean * mean  # may even be negative
+            return (x - mean) / torch.sqrt(variance + self.eps)
+
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.networks_checks.InstanceNorm", OnePass)
+    return cases_of("networks", "nearly constant input, instance norm")
+
+
+def break_guard(monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.decoding.decode.check_frames", lambda *_: None)
+    return cases_of("phase", "dead frame")
+
+
+def break_lens(monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.optics.lens._radial_start", lambda x, y, _: (x.copy(), y.copy()))
+    missed = {"k1": 0.6, "k2": 0.9, "k3": -0.3}
+    return [member for member in cases_of("rig", "lens inverse, several terms") if member.parameters == missed]
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        break_metrics, break_arctangent, break_interval, break_triangulation, break_normalisation,
+        break_instance_norm, break_guard, break_lens,
+    ],
+)  # fmt: skip
+def test_code_that_is_broken_on_purpose_fails(broken, monkeypatch):
+    assert failing(run_cases(broken(monkeypatch)))
+
+
+def test_every_group_has_cases_that_say_what_they_are():
+    cases = all_cases()
+    assert {member.group for member in cases} == set(GROUPS)
+    assert len({(member.group, member.name) for member in cases}) == len(cases)
+    for member in cases:
+        assert member.computes and member.reference and member.predicts and member.unit
+    assert any(member.heavy for member in cases) and not any(member.heavy for member in all_cases(quick=True))
+    with pytest.raises(StabilityError, match="unknown group 'chance'"):
+        all_cases(["chance"])
+
+
+def test_the_report_says_what_failed(tmp_path):
+    rows = run_cases([*cases_of("order", "interval of the phase"), case(lambda: Outcome(2.0, 1.0)), failing_case()])
+    page, data, picture = write_report(rows, tmp_path / "out")
+    text = page.read_text(encoding="utf-8")
+    assert "2 of 3 cases FAIL" in text and "error 2 exceeds its bound 1" in text and "<script" not in text
+    content = json.loads(data.read_text(encoding="utf-8"))
+    assert content == json.loads(json.dumps(document(rows)))
+    assert content["summary"]["all"]["FAIL"] == 2 and content["cases"][2]["error"] == "inf"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def failing_case() -> Case:
+    return case(lambda: Outcome(float("inf"), 1.0, note="<b>not bold</b>"))
+
+
+def test_the_command(tmp_path, capsys, monkeypatch):
+    assert main(["stability", "--group", "normalisation", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["summary"]["normalisation"]["FAIL"] == 0
+    assert main(["stability", "--group", "rig", "--list"]) == 0
+    assert "rig: intrinsic matrix (11)" in capsys.readouterr().out
+    (tmp_path / "file").write_text("x")
+    assert main(["stability", "--group", "rig", "--out", str(tmp_path / "file")]) == 2
+    with pytest.raises(SystemExit) as stopped:
+        main(["stability", "--group", "chance"])
+    assert stopped.value.code == 2
+    broken = break_interval(monkeypatch)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.run.all_cases", lambda *_, **__: broken)
+    assert main(["stability", "--group", "order"]) == 1
+    assert "FAIL order: interval of the phase" in capsys.readouterr().out

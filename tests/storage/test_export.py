@@ -1,0 +1,363 @@
+"""Exports: the published tree, which imports back bit by bit, and Parquet that plain ``datasets`` opens."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import datasets
+import numpy as np
+import pytest
+import scipy.io
+import trimesh
+from conftest import TINY_OBJECTS, file_bytes
+from published_trees import write_png
+from scored_dataset import write_predictions
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.loaders.published import FrameOrder, import_notes, import_tree, parse_order, plan_import
+from fpp_ml_bench.loaders.published import export as export_tree
+from fpp_ml_bench.loaders.sample import config_columns
+from fpp_ml_bench.loaders.storage.exporting import chosen_splits, export
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
+
+TRAINING = Path("training_datasets")
+SCANS = Path("fpp_synthetic_dataset")
+NAMES = {"train": "train", "validation": "val", "test": "test"}
+SAMPLE = "power_drill_A60"
+PIXELS = 176 * 176
+
+
+def command(*words):
+    return main([str(word) for word in words])
+
+
+def imported(tree, out, **settings):
+    import_tree(out, plan_import(tree, **settings), workers=1)
+    return DatasetFolder(out)
+
+
+@pytest.fixture(scope="module")
+def tree(opened, tmp_path_factory):
+    """The tiny dataset as a published tree."""
+    out = tmp_path_factory.mktemp("export") / "tree"
+    export(opened, out, ["mat"], chosen_splits(opened, "all"), threads=2)
+    return out
+
+
+@pytest.fixture(scope="module")
+def returned(tree, tmp_path_factory):
+    """The same tree, imported again."""
+    return imported(tree, tmp_path_factory.mktemp("import") / "dataset")
+
+
+@pytest.fixture(scope="module")
+def test_tree(opened, tmp_path_factory):
+    """The test split alone with raw scans; broken copies are made from it."""
+    out = tmp_path_factory.mktemp("export") / "test"
+    export(opened, out, ["mat"], ["test"])
+    return out
+
+
+def test_the_tree_comes_back_bit_by_bit_with_the_same_split(opened, returned):
+    assert returned.splits == opened.splits and returned.configs == CONFIGS
+    for sample in opened.samples("all"):
+        assert returned.depth_mm(sample).tobytes() == opened.depth_mm(sample).tobytes()
+        for index in range(52):
+            assert np.array_equal(returned.frame(sample, index), opened.frame(sample, index))
+    assert returned.manifest.settings["frame_order"] == "paper"
+
+
+@pytest.mark.parametrize("split", ["test", "all"])
+def test_predictions_score_the_same_on_both(opened, returned, tmp_path, split):
+    predictions = write_predictions(tmp_path / "predictions", opened, split, offset_mm=1.7, noise_mm=20.0)
+    original, reimported = (evaluate(predictions, dataset, split) for dataset in (opened, returned))
+    assert original.metrics == reimported.metrics and original.per_sample == reimported.per_sample
+    assert original.metrics.object_mae_mm > 1
+
+
+@pytest.mark.parametrize("variant", ["global_normalized", "individual_normalized"])
+def test_a_normalised_variant_alone_brings_back_the_same_float32(opened, tree, tmp_path, variant):
+    shutil.copytree(tree / TRAINING, tmp_path / "tree" / TRAINING)
+    for folder in (tmp_path / "tree" / TRAINING).glob("training_data_depth_*"):
+        if not folder.name.endswith(variant):
+            shutil.rmtree(folder)
+    dataset = imported(tmp_path / "tree", tmp_path / "out")
+    for sample in opened.samples("all"):
+        expected = opened.depth_mm(sample).copy()
+        if variant == "individual_normalized":
+            expected[expected == opened.measured(sample)["depth_min_mm"]] = 0
+        assert dataset.depth_mm(sample).tobytes() == expected.tobytes()
+    assert any("became background" in note for note in import_notes(dataset.manifest)) == variant.startswith(
+        "individual"
+    )
+
+
+def test_files_and_variables_are_those_of_the_published_layout(opened, tree):
+    folders = [
+        f"training_data_{removed}depth_{variant}"
+        for removed in ("", "bgremoved_")
+        for variant in ("raw", "global_normalized", "individual_normalized")
+    ]
+    assert sorted(path.name for path in (tree / TRAINING).iterdir()) == sorted([*folders, "info_depth_params"])
+    for split, samples in opened.splits.items():
+        for folder in folders:
+            for kind, suffix in (("fringe", "png"), ("depth", "mat")):
+                names = {path.name for path in (tree / TRAINING / folder / NAMES[split] / kind).iterdir()}
+                assert names == {f"{sample}.{suffix}" for sample in samples}
+    depth, frame = opened.depth_mm(SAMPLE).astype(np.float64), opened.frame(SAMPLE, 0)
+    low, high = depth[depth > 0].min(), depth.max()
+    expected = {
+        "raw": ("depthMap", depth),
+        "global_normalized": ("depthMapMeters", depth / 1000),
+        "individual_normalized": ("depthMapNormalized", np.where(depth > 0, (depth - low) / (high - low), 0)),
+    }
+    for variant, (variable, values) in expected.items():
+        for removed, image in (("", frame), ("bgremoved_", np.where(depth > 0, frame, 0))):
+            folder = tree / TRAINING / f"training_data_{removed}depth_{variant}" / "test"
+            np.testing.assert_allclose(scipy.io.loadmat(folder / f"depth/{SAMPLE}.mat")[variable], values, rtol=1e-12)
+            assert np.array_equal(cv2.imread(str(folder / f"fringe/{SAMPLE}.png"), cv2.IMREAD_UNCHANGED), image)
+    info = scipy.io.loadmat(tree / TRAINING / f"info_depth_params/test/depth/{SAMPLE}.mat")
+    assert (info["depth_min"], info["depth_max"]) == ([[low]], [[high]])
+
+
+def test_raw_scans_hold_52_frames_and_phases_that_belong_together(opened, tree):
+    folder = tree / SCANS / "power_drill" / "A60"
+    assert len(list(folder.iterdir())) == 54
+    for index in range(52):
+        image = cv2.imread(str(folder / f"A_{index}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(image, opened.frame(SAMPLE, index))
+    wrapped = scipy.io.loadmat(folder / "wrapped_phase.mat")["wph"]
+    unwrapped = scipy.io.loadmat(folder / "unwrapped_phase.mat")["uph"]
+    decoded = np.isfinite(unwrapped)
+    assert decoded.mean() > 0.8 and np.abs(wrapped).max() <= np.float32(np.pi)
+    turns = (unwrapped[decoded].astype(np.float64) - wrapped[decoded]) / (2 * np.pi)
+    # Each phase is rounded once to float32, by at most 2**-24 of the largest value.
+    np.testing.assert_allclose(turns, np.round(turns), rtol=0, atol=2**-23 * unwrapped[decoded].max() / (2 * np.pi))
+    # The paper's Eq. 2, directly, where the fringes are bright.
+    shifts = 2 * np.pi * np.arange(18) / 18
+    stack = np.stack(opened.frames(SAMPLE, range(18))).astype(np.float64)
+    expected = -np.arctan2(np.tensordot(np.sin(shifts), stack, 1), np.tensordot(np.cos(shifts), stack, 1))
+    difference = np.angle(np.exp(1j * (wrapped - expected)))[decoded]
+    assert np.abs(difference).max() < 2**-23 * np.pi  # float64 rounded once to float32, with a factor 2 to spare
+
+
+def test_two_exports_are_equal_byte_by_byte_whatever_the_threads(opened, tmp_path):
+    for threads in (1, 3):
+        export(opened, tmp_path / str(threads), ["mat"], ["validation"], threads)
+    assert file_bytes(tmp_path / "1") == file_bytes(tmp_path / "3")
+
+
+def reordered(tree, order):
+    """Rename the files of all raw scans to another order."""
+    for folder in (path for path in (tree / SCANS).glob("*/*") if path.is_dir()):
+        contents = {i: (folder / f"A_{i}.png").read_bytes() for i in range(52)}
+        for number, frame in enumerate(order.frames(PAPER_SEQUENCE)):
+            (folder / f"A_{number}.png").write_bytes(contents[frame.index])
+
+
+def scan_folder(tree):
+    return tree / SCANS / "power_drill" / "A60"
+
+
+def swap(first, second):
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+
+
+BROKEN_SCANS = {
+    "frame missing": (lambda f: (f / "A_7.png").unlink(), "A_7.png: is missing"),
+    "frame too many": (lambda f: shutil.copy(f / "A_7.png", f / "A_52.png"), "A_52.png: does not belong here"),
+    "view missing": (lambda f: shutil.rmtree(f), "A60: the raw scan is missing"),
+    "scan without depth": (lambda f: shutil.copytree(f, f.parents[1] / "mug/A60"), "A60: a raw scan without depth"),
+    "no view at all": (lambda f: (f.parent / "A45").mkdir(), "A45: does not belong here"),
+    "frame of 16 bits": (
+        lambda f: write_png(f / "A_9.png", np.zeros((176, 176), np.uint16)),
+        "A_9.png: expected an 8-bit PNG, got 16 bits",
+    ),
+    "frame of another size": (
+        lambda f: write_png(f / "A_9.png", np.zeros((88, 88), np.uint8)),
+        "A_9.png: expected 176 x 176 px",
+    ),
+    "frame damaged": (
+        lambda f: (f / "A_9.png").write_bytes((f / "A_9.png").read_bytes()[:-500]),
+        "A_9.png: the PNG is cut off",
+    ),
+    "not the single-shot frame": (lambda f: shutil.copy(f / "A_1.png", f / "A_0.png"), "A_0.png: differs from"),
+    "two frames exchanged": (lambda f: swap(f / "A_20.png", f / "A_23.png"), "A_20.png: expected vertical sinusoid"),
+    "one view in another order": (lambda f: swap(f / "A_50.png", f / "A_51.png"), "has the order paper+white-first"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN_SCANS)
+def test_a_broken_raw_scan_is_refused_and_named(test_tree, tmp_path, case):
+    breaking, message = BROKEN_SCANS[case]
+    shutil.copytree(test_tree, tmp_path / "tree")
+    breaking(scan_folder(tmp_path / "tree"))
+    with pytest.raises(LayoutError) as caught:
+        imported(tmp_path / "tree", tmp_path / "out")
+    assert message in str(caught.value) and not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_another_frame_order_is_detected_undone_and_reported(opened, test_tree, tmp_path):
+    tree = tmp_path / "tree"
+    shutil.copytree(test_tree, tree)
+    order = parse_order("vertical-first+white-first")
+    reordered(tree, order)
+    for path in (tree / TRAINING).glob("training_data_depth_*/test/fringe/*.png"):
+        name, view = path.stem.rsplit("_", 1)
+        shutil.copy(tree / SCANS / name / view / "A_0.png", path)
+    dataset = imported(tree, tmp_path / "out")
+    assert dataset.manifest.settings["frame_order"] == order.name
+    for index in range(52):
+        assert np.array_equal(dataset.frame(SAMPLE, index), opened.frame(SAMPLE, index))
+    assert any("is a vertical fringe, stored in column frame_18" in note for note in import_notes(dataset.manifest))
+    with pytest.raises(LayoutError, match=r"not in frame order paper, it has the order vertical-first\+white-first"):
+        imported(tree, tmp_path / "other", frame_order=FrameOrder().name)
+
+
+@pytest.fixture(scope="module")
+def parquet(opened, tmp_path_factory):
+    out = tmp_path_factory.mktemp("export") / "parquet"
+    export(opened, out, ["parquet"], chosen_splits(opened, "all"))
+    return out
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_plain_datasets_opens_every_configuration_of_the_parquet(opened, parquet, config):
+    loaded = datasets.load_dataset(str(parquet), config)
+    columns = config_columns(opened.sequence, config, True)
+    frames = opened.sequence.config(config)
+    assert list(loaded) == list(opened.splits)
+    for split, samples in opened.splits.items():
+        part = loaded[split]
+        assert part.column_names == columns and part["sample"] == samples
+        assert part.features["frame_00" if 0 in frames else "frame_18"] == datasets.Array2D((176, 176), "uint8")
+        assert part.features["depth"] == datasets.Array2D((176, 176), "float32")
+        # Only the configuration's own columns went into the cache.
+        cached = sum(Path(file["filename"]).stat().st_size for file in part.cache_files)
+        pixels = len(samples) * PIXELS * (len(frames) + 8)
+        assert pixels < cached < 1.02 * pixels + 60_000
+    rows = loaded["test"].with_format("numpy")
+    for row, sample in zip(rows, opened.samples("test"), strict=True):
+        assert row["depth"].tobytes() == opened.depth_mm(sample).tobytes()
+        assert row["depth_exact"].tobytes() == opened.depth_mm(sample, "depth_exact").tobytes()
+        assert row["depth_min"] == opened.measured(sample)["depth_min_mm"]
+        for index in frames:
+            assert np.array_equal(row[f"frame_{index:02d}"], opened.frame(sample, index))
+
+
+def test_no_pixel_is_stored_twice_and_the_default_is_single_shot(opened, parquet):
+    import pyarrow.parquet as pq
+
+    stored = {}
+    for path in parquet.rglob("*.parquet"):
+        names = pq.read_schema(path).names
+        assert len(names) == len(set(names))
+        stored[path.name] = pq.ParquetFile(path).metadata.num_rows
+    assert sum(stored.values()) == len(opened.samples("all"))
+    assert datasets.load_dataset(str(parquet), split="test").column_names[4] == "frame_00"
+
+
+def test_parquet_of_one_split_and_of_another_in_the_same_place_do_not_share_a_cache(opened, tmp_path):
+    for split in ("validation", "test"):
+        export(opened, tmp_path / "out", ["parquet"], [split])
+        loaded = datasets.load_dataset(str(tmp_path / "out"), "single_shot")
+        assert list(loaded) == [split] and loaded[split]["sample"] == opened.samples(split)
+        shutil.rmtree(tmp_path / "out")
+
+
+def test_an_imported_dataset_exports_too(returned, tmp_path):
+    export(returned, tmp_path / "out", ["parquet"], ["test"])
+    loaded = datasets.load_dataset(str(tmp_path / "out"), "vertical", split="test")
+    assert "depth_exact" not in loaded.column_names and len(loaded) == 6
+    with pytest.raises(DatasetError, match="imported datasets have no meshes"):
+        export(returned, tmp_path / "meshes", ["meshes"], ["test"])
+    assert not (tmp_path / "meshes").exists()
+
+
+def test_several_forms_each_get_a_folder(opened, tiny, tmp_path, capsys):
+    assert command("export", tiny, tmp_path / "out", "--meshes", "--patterns") == 0
+    assert "meshes, patterns of 24 samples" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"meshes", "patterns"}
+    assert {path.stem for path in (tmp_path / "out/meshes").iterdir()} == set(TINY_OBJECTS)
+    assert trimesh.load(tmp_path / "out/meshes/mug.ply").is_watertight
+    assert len(list((tmp_path / "out/patterns").glob("A_*.png"))) == 52
+
+
+def test_one_form_and_one_split_go_straight_into_the_folder(tiny, tmp_path):
+    (tmp_path / "out").mkdir()
+    assert command("export", tiny, tmp_path / "out", "--meshes", "--split", "test") == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["power_drill.ply"]
+
+
+def test_a_full_disk_leaves_nothing_and_a_second_try_succeeds(opened, tmp_path, monkeypatch):
+    out = tmp_path / "deep" / "out"
+    written = []
+
+    def full(path, content):
+        written.append(path)
+        if len(written) > 20:
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    write = export_tree._write
+    monkeypatch.setattr(export_tree, "_write", full)
+    with pytest.raises(BuildError, match="No space left on device"):
+        export(opened, out, ["mat"], ["test"], threads=2)
+    assert list(out.parent.iterdir()) == []
+    monkeypatch.undo()
+    (out.parent / ".out.export" / "half").mkdir(parents=True)  # what a killed export leaves
+    export(opened, out, ["mat"], ["test"])
+    assert {path.name for path in out.parent.iterdir()} == {"out"}
+    assert {path.name for path in out.iterdir()} == {TRAINING.name, SCANS.name}
+
+
+def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp_path):
+    from fpp_ml_bench.loaders.storage.exporting import exporting
+
+    with exporting(tmp_path / "out"):
+        with pytest.raises(BuildError, match="another process"):
+            export(opened, tmp_path / "out", ["patterns"], ["test"])
+        assert not (tmp_path / "out").exists()
+    assert list((tmp_path / "out").iterdir()) == []
+    (tmp_path / "out" / "mine.txt").write_text("keep")
+    with pytest.raises(BuildError, match="not empty"):
+        export(opened, tmp_path / "out", ["patterns"], ["test"])
+    assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
+    with pytest.raises(BuildError, match="in the dataset itself"):
+        export(opened, opened.path / "export", ["patterns"], ["test"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("{data}", "out"),
+        ("nowhere", "out", "--mat"),
+        ("{data}", "file", "--mat"),
+        ("{data}", "full", "--mat"),
+        ("{data}", "{data}", "--parquet"),
+        ("/dev/null", "out", "--patterns"),
+        ("{data}", "/proc/none/out", "--patterns"),
+    ],
+)
+def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("")
+    Path("full").mkdir()
+    Path("full/mine").write_text("")
+    assert command("export", *(word.format(data=tiny) for word in words)) == 2
+    message = capsys.readouterr().err
+    assert "error:" in message and "Traceback" not in message and not Path("out").exists()
+
+
+def test_an_unknown_split(opened, tmp_path, tiny):
+    folder = tmp_path / "one"
+    export(opened, tmp_path / "tree", ["mat"], ["test"])
+    dataset = imported(tmp_path / "tree", folder)
+    with pytest.raises(DatasetError, match="no split 'train'"):
+        chosen_splits(dataset, "train")
+    assert command("export", folder, tmp_path / "out", "--parquet", "--split", "train") == 2

@@ -1,0 +1,215 @@
+"""`load_dataset` and Hugging Face's own tools on the same folder: equal values, and `load_dataset` copies nothing."""
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pytest
+from conftest import TINY_SIZE, tiny_settings
+from synthetic import SyntheticShard, make
+
+import fpp_ml_bench
+from fpp_ml_bench.constants import OBJECTS, VIEWS, split_sample_name
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders import load_dataset
+from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.loaders.sample import arrow_schema, config_columns, features
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
+
+datasets.disable_progress_bars()
+IMAGES = ("frame_00", "depth", "depth_exact")
+
+
+def rows_by_sample(dataset, columns):
+    """Arrays by sample and column, through the numpy format of `datasets`."""
+    formatted = dataset.with_format("numpy", columns=["sample", *columns])
+    return {row["sample"]: {c: row[c] for c in columns} for row in formatted}
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, opened, config):
+    dataset = load_dataset(tiny, config, split="validation")
+    frames = [f"frame_{i:02d}" for i in PAPER_SEQUENCE.config(config)]
+    assert dataset.column_names == [
+        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "depth_min", "depth_max",
+    ]  # fmt: skip
+    assert len(dataset) == 6 and dataset.split == "validation"
+    assert dataset["sample"][:] == opened.splits["validation"]
+    row = dataset.with_format("numpy")[3]
+    assert (row["sample"], row["object"], row["view"], row["split"]) == ("mug_A180", "mug", "A180", "validation")
+    for index in PAPER_SEQUENCE.config(config):
+        np.testing.assert_array_equal(row[f"frame_{index:02d}"], opened.frame("mug_A180", index))
+        assert dataset.features[f"frame_{index:02d}"] == datasets.Array2D(opened.size, "uint8")
+    np.testing.assert_array_equal(row["depth"], opened.depth_mm("mug_A180"))
+    np.testing.assert_array_equal(row["depth_exact"], opened.depth_mm("mug_A180", "depth_exact"))
+    inside = row["depth"][row["depth"] > 0]
+    assert (row["depth_min"], row["depth_max"]) == (inside.min(), inside.max())
+
+
+def test_all_splits_at_once_and_the_lazy_name(tiny, opened):
+    parts = fpp_ml_bench.load_dataset(tiny)
+    assert isinstance(parts, datasets.DatasetDict)
+    assert {split: part["sample"][:] for split, part in parts.items()} == opened.splits
+    assert parts["train"].info.config_name == "single_shot"
+
+
+def test_plain_load_dataset_and_load_from_disk_give_the_same_values(tiny):
+    joined = load_dataset(tiny, "single_shot", split="train")
+    plain = datasets.load_dataset(str(tiny), "single_shot", split="train")
+    default = datasets.load_dataset(str(tiny), split="train")
+    in_place = datasets.load_from_disk(str(tiny))
+    assert sorted(in_place) == ["test", "train", "validation"]
+    expected = rows_by_sample(joined, IMAGES)
+    assert len(expected) == 12
+    for loaded in (plain, default, in_place["train"]):
+        assert loaded.column_names == joined.column_names
+        assert loaded.features == joined.features
+        values = rows_by_sample(loaded, IMAGES)
+        assert list(values) == list(expected)
+        for sample, images in expected.items():
+            for column, image in images.items():
+                np.testing.assert_array_equal(values[sample][column], image)
+    assert datasets.get_dataset_split_names(str(tiny), "single_shot") == ["train", "validation", "test"]
+
+
+def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
+    """Nine objects of a split are two files of 30 and 24 rows."""
+    folder = make(tmp_path / "set", {"train": OBJECTS[:9], "test": ("power_drill",)}, origin="imported")
+    folder_read = DatasetFolder(folder)
+    assert [s.rows for s in folder_read.manifest.shards if s.split == "train"] == [30, 24]
+    expected = [f"{name}_{view}" for name in OBJECTS[:9] for view in VIEWS]
+    datasets_by_way = {
+        "joined": load_dataset(folder, split="train"),
+        "plain": datasets.load_dataset(str(folder), split="train"),
+        "in place": datasets.load_from_disk(str(folder))["train"],
+    }
+    for dataset in datasets_by_way.values():
+        assert dataset["sample"][:] == expected == folder_read.splits["train"]
+        formatted = dataset.with_format("numpy")
+        for row in (0, 29, 30, 53):
+            for column in ("depth", "depth_exact"):
+                np.testing.assert_array_equal(formatted[row][column], folder_read.depth_mm(expected[row], column))
+            np.testing.assert_array_equal(formatted[row]["frame_00"], folder_read.frame(expected[row], 0))
+    alone = SyntheticShard().row(expected[30], *split_sample_name(expected[30]))
+    np.testing.assert_array_equal(folder_read.frame(expected[30], 0), alone.frames[0])
+    np.testing.assert_array_equal(folder_read.depth_mm(expected[30]), alone.depth_mm)
+
+
+def test_in_place_reading_copies_nothing_into_a_cache(tiny):
+    joined = load_dataset(tiny, "all", split="train")
+    assert joined.cache_files == [] or all(str(tiny) in f["filename"] for f in joined.cache_files)
+    before = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
+    rows_by_sample(joined, ["frame_00", "frame_51"])
+    after = {p for p in Path(datasets.config.HF_DATASETS_CACHE).rglob("*") if p.is_file()}
+    assert before == after
+
+
+def test_memory_is_the_files_own_map(tiny):
+    dataset = load_dataset(tiny, "all", split="train")
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    for column in ("frame_00", "frame_10", "frame_30", "frame_51", "depth"):
+        storage = dataset.data.column(column).chunk(0).storage
+        buffer = storage.values.values.buffers()[1]
+        holder = [
+            line for line in maps
+            if int(line.split("-")[0], 16) <= buffer.address < int(line.split()[0].split("-")[1], 16)
+        ]  # fmt: skip
+        assert len(holder) == 1 and str(tiny) in holder[0]
+
+
+def test_new_data_in_the_same_folder_is_not_read_out_of_the_old_cache(tmp_path):
+    folder = tmp_path / "set"
+    frames = []
+    for seed in (1, 2):
+        build(folder, tiny_settings(objects=("cork",), stored="single_shot", seed=seed), workers=1)
+        frames.append(np.array(datasets.load_dataset(str(folder), split="train")[0]["frame_00"]))
+        np.testing.assert_array_equal(frames[-1], DatasetFolder(folder).frame("cork_A0", 0))
+        shutil.rmtree(folder)
+    assert (frames[0] != frames[1]).any()
+
+
+def test_usual_operations(tiny, opened, tmp_path):
+    folder = tmp_path / "copy"  # `filter` and `map` leave their caches beside the data
+    shutil.copytree(tiny, folder)
+    dataset = load_dataset(folder, "vertical", split="train")
+    shuffled = dataset.shuffle(seed=3)
+    assert (
+        sorted(shuffled["sample"]) == sorted(opened.splits["train"]) and shuffled["sample"][:] != dataset["sample"][:]
+    )
+    selected = shuffled.select([4, 0])
+    for row in selected.with_format("numpy"):
+        np.testing.assert_array_equal(row["frame_20"], opened.frame(row["sample"], 20))
+    filtered = dataset.filter(lambda view: view == "A60", input_columns="view")
+    assert filtered["sample"][:] == ["bowl_A60", "cork_A60"]
+    mapped = dataset.select(range(2)).map(lambda row: {"top": max(map(max, row["depth"]))})
+    assert mapped["top"][:] == [float(opened.depth_mm(s).max()) for s in opened.splits["train"][:2]]
+    import torch
+
+    row = dataset.with_format("torch", columns=["frame_18", "depth"], dtype=torch.float32)[0]
+    assert row["frame_18"].dtype == torch.float32 and row["frame_18"].shape == (TINY_SIZE, TINY_SIZE)
+    again = pickle.loads(pickle.dumps(dataset))
+    np.testing.assert_array_equal(again.with_format("numpy")[7]["depth"], opened.depth_mm(again[7]["sample"]))
+    joined = datasets.concatenate_datasets([dataset, load_dataset(folder, "vertical", split="test")])
+    assert len(joined) == 18
+    assert verify(folder) == []  # verify ignores those caches
+
+
+def test_fingerprints_follow_the_data(tiny, tmp_path):
+    shutil.copytree(tiny, tmp_path / "moved")
+    fingerprint = load_dataset(tiny, "single_shot", split="train")._fingerprint
+    assert load_dataset(tmp_path / "moved", "single_shot", split="train")._fingerprint == fingerprint
+    other_fingerprints = {
+        load_dataset(tiny, c, split=s)._fingerprint for c, s in (("all", "train"), ("single_shot", "test"))
+    }
+    assert len(other_fingerprints | {fingerprint}) == 3
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("exact", [True, False])
+def test_schema_is_what_datasets_itself_would_write(config, exact):
+    columns = config_columns(PAPER_SEQUENCE, config, exact)
+    expected_features = datasets.Features(
+        {
+            name: datasets.Value("string")
+            if name in ("sample", "object", "view", "split")
+            else datasets.Value("float32")
+            if name in ("depth_min", "depth_max")
+            else datasets.Array2D((120, 160), "float32" if name.startswith("depth") else "uint8")
+            for name in columns
+        }
+    )
+    # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from the metadata.
+    schema, expected = pa.ipc.read_schema(arrow_schema(columns, (120, 160)).serialize()), expected_features.arrow_schema
+    assert schema.equals(expected)
+    assert json.loads(schema.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
+    assert datasets.Features.from_arrow_schema(schema) == expected_features
+    assert datasets.Features.from_dict(features(columns, (120, 160))) == expected_features
+
+
+@pytest.mark.parametrize(
+    ("config", "split", "message"),
+    [
+        ("both", "train", "unknown configuration 'both'"),
+        ("single_shot", "val", "no split 'val'"),
+        ("single_shot", "all", "expected one of train, validation, test, or None"),
+    ],
+)
+def test_errors(tiny, config, split, message):
+    with pytest.raises(DatasetError, match=message):
+        load_dataset(tiny, config, split=split)
+
+
+def test_configuration_that_is_not_stored(tmp_path):
+    build(tmp_path / "set", tiny_settings(objects=("cork",), stored="horizontal"), workers=1)
+    assert len(load_dataset(tmp_path / "set", "horizontal", split="train")) == 6
+    assert list(load_dataset(tmp_path / "set", "single_shot")) == ["train"]
+    with pytest.raises(DatasetError, match=r"'vertical' is not stored.*--frames vertical or --frames all"):
+        load_dataset(tmp_path / "set", "vertical", split="train")
+    with pytest.raises(DatasetError, match="no such folder"):
+        load_dataset(tmp_path / "none")

@@ -1,0 +1,385 @@
+"""Crash safety, with real processes, real signals and a really full disk: no partial result, the same bytes at last."""
+
+import contextlib
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import BuildError, DatasetError
+from fpp_ml_bench.loaders.render import Studio, assembly_of, build
+from fpp_ml_bench.loaders.storage import assembly as assembling
+from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMAND = [sys.executable, "-c", "import sys; from fpp_ml_bench.cli import main; sys.exit(main())"]
+SMALL = {"objects": ("cork",), "stored": "single_shot"}
+
+
+def build_arguments(folder, *more, workers=1):
+    return [
+        "build", str(folder), "--size", str(TINY_SIZE), "--objects", ",".join(TINY_OBJECTS), "--workers", str(workers),
+        *more,
+    ]  # fmt: skip
+
+
+def start(folder, *more, **options):
+    """A build in a separate process and process group."""
+    return subprocess.Popen(
+        [*COMMAND, *build_arguments(folder, *more, **options)], cwd=ROOT, start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def wait_for(reached, process, seconds=300):
+    """Wait until ``reached()`` holds; False when the process ended before."""
+    end = time.monotonic() + seconds
+    while not reached():
+        if process.poll() is not None:
+            return False
+        assert time.monotonic() < end, "the build never got that far"
+        time.sleep(0.001)
+    return True
+
+
+def final_shards(folder):
+    return sorted(folder.rglob("*.arrow"))
+
+
+def group_members(group):
+    """Living processes of a process group, by /proc."""
+    members = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            members.append(int(stat.parent.name))
+    return members
+
+
+@pytest.fixture
+def half_built(tmp_path, monkeypatch):
+    """A folder whose build was stopped in its second shard, and whose lock is free."""
+    folder, views = tmp_path / "half", []
+    photograph = Studio.photograph
+
+    def stop_at_eight(self, mesh, view):
+        views.append(view)
+        if len(views) == 8:
+            raise KeyboardInterrupt
+        return photograph(self, mesh, view)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Studio, "photograph", stop_at_eight)
+        with pytest.raises(KeyboardInterrupt):
+            build(folder, half_settings(), workers=1)
+    assert len(final_shards(folder)) == 1 and not (folder / "manifest.json").exists()
+    return folder
+
+
+def half_settings(**changes):
+    return tiny_settings(**{"objects": ("cork", "mug"), "stored": "single_shot", **changes})
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """Files of the dataset of `half_built`, built without interruption."""
+    folder = tmp_path_factory.mktemp("uninterrupted") / "set"
+    build(folder, half_settings(), workers=1)
+    return file_bytes(folder)
+
+
+def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, capsys):
+    folder = tmp_path / "killed"
+    work = folder / ".build"
+
+    def largest(pattern):
+        """Size of the largest unfinished file of that name."""
+        sizes = [0]
+        for path in work.glob(pattern):
+            with contextlib.suppress(FileNotFoundError):  # finished and renamed meanwhile
+                sizes.append(path.stat().st_size)
+        return max(sizes)
+
+    moments = [
+        (1, lambda: largest("train*.tmp") > 1_000_000),  # in the middle of a shard
+        (1, lambda: (work / "train-00000-of-00001.json").exists()),  # straight after the first
+        (2, lambda: largest("*.tmp") > 100_000),  # with two worker processes
+        (1, lambda: largest("test*.tmp") > 1_000_000),
+    ]
+    reached = 0
+    for workers, moment in moments:
+        process = start(folder, workers=workers)
+        if wait_for(moment, process):
+            reached += 1
+            if reached == 1:
+                # While it runs, a second build into the folder is refused.
+                assert main(build_arguments(folder)) == 2
+                assert "another process is writing" in capsys.readouterr().err
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stderr.close()
+        # No worker outlives its parent and writes into an unlocked folder.
+        end = time.monotonic() + 120
+        while group_members(process.pid):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        whole_shards = file_bytes(tiny)
+        for shard in final_shards(folder):  # a file with its final name is complete
+            assert shard.read_bytes() == whole_shards[str(shard.relative_to(folder))]
+        if not (folder / "manifest.json").exists():
+            with pytest.raises(DatasetError, match="not finished"):
+                DatasetFolder(folder)
+    assert reached >= 3
+    build(folder, tiny_settings(), workers=1)
+    assert file_bytes(folder) == file_bytes(tiny)
+    assert not work.exists()
+
+
+def test_resume_makes_only_what_is_missing(half_built, uninterrupted, monkeypatch):
+    names, photograph = [], Studio.photograph
+
+    def count(self, mesh, view):
+        names.append(mesh.name)
+        return photograph(self, mesh, view)
+
+    monkeypatch.setattr(Studio, "photograph", count)
+    reported = []
+    build(half_built, half_settings(), workers=1, progress=reported.append)
+    assert names == ["mug"] * 6
+    assert reported == [6, *[1] * 6]
+    assert file_bytes(half_built) == uninterrupted
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove", "mesh", "receipt", "receipt of nothing"])
+def test_resume_trusts_no_damaged_work(half_built, uninterrupted, damage):
+    (shard,) = final_shards(half_built)
+    receipt = half_built / ".build" / "train-00000-of-00001.json"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    if damage == "flip":
+        shard.write_bytes(content)
+    elif damage == "cut":
+        shard.write_bytes(content[:-100])
+    elif damage == "remove":
+        shard.unlink()
+    elif damage == "mesh":
+        (half_built / "meshes" / "cork.ply").unlink()
+    elif damage == "receipt":
+        receipt.write_text(receipt.read_text()[:100])
+    else:
+        receipt.write_text('{"files": [], "rows": []}')
+    build(half_built, half_settings(), workers=1)
+    assert file_bytes(half_built) == uninterrupted
+
+
+def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_dataset(half_built, uninterrupted):
+    for name in (
+        ".README.md.123.tmp",
+        "train/.state.json.9.tmp",
+        "meshes/.mug.ply.tmp",
+        ".build/test.1.data.tmp",
+        ".build/.x.json.7.tmp",
+    ):
+        (half_built / name).write_text("half a file")
+    (half_built / "notes.txt").write_text("mine")
+    build(half_built, half_settings(), workers=1)
+    files = file_bytes(half_built)
+    assert files.pop("notes.txt") == b"mine"
+    assert files == uninterrupted
+    findings = verify(half_built)
+    assert len(findings) == 1 and "notes.txt" in findings[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 43}, r"seed \(there 42, now 43\)"),
+        ({"objects": ("cork", "bowl")}, r"objects \(there \[\"mug\", \"cork\"\], now"),
+        ({"placement": "varied"}, "placement"),
+        ({"stored": "all"}, "stored"),
+        ({"noise_sigma_grey": 2.0}, "noise_sigma_grey"),
+        ({"shadows": True}, "shadows"),
+    ],
+)
+def test_other_settings_are_refused_by_name_before_and_after_the_end(half_built, change, message):
+    for _ in range(2):
+        before = file_bytes(half_built)
+        with pytest.raises(BuildError, match=message):
+            build(half_built, half_settings(**change), workers=1)
+        assert file_bytes(half_built) == before
+        build(half_built, half_settings(), workers=1)
+
+
+def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.loaders.render.builder.__version__", "0.0.9")
+    with pytest.raises(BuildError, match="version"):
+        build(half_built, half_settings(), workers=1)
+
+
+def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, uninterrupted, capsys):
+    build(half_built, half_settings(), workers=1)
+    stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
+    arguments = ["build", str(half_built), "--size", str(TINY_SIZE), "--objects", "mug,cork", "--frames", "single_shot"]
+    assert main(arguments) == 0
+    assert "complete already" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()} == stamps
+    final_shards(half_built)[0].unlink()
+    assert main(arguments) == 2
+    assert "missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["file", "folder with files", "dataset of others", "damaged settings"])
+def test_folders_with_other_content(tmp_path, half_built, content, capsys):
+    folder = tmp_path / "out"
+    if content == "file":
+        folder.write_text("x")
+    elif content == "damaged settings":
+        folder = half_built
+        (folder / ".build" / "settings.json").write_text("{")
+    else:
+        folder.mkdir()
+        (folder / ("manifest.json" if content == "dataset of others" else "thesis.tex")).write_text("{}")
+    with pytest.raises(DatasetError, match=str(folder)):
+        build(folder, half_settings(), workers=1)
+    if content == "folder with files":
+        assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
+
+
+def test_lock_is_free_after_an_error(tmp_path, monkeypatch):
+    def fail(*_):
+        raise BuildError("no")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Studio, "photograph", fail)
+        with pytest.raises(BuildError, match="no"):
+            build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
+    assert not list((tmp_path / "set").rglob("*.tmp"))
+    build(tmp_path / "set", tiny_settings(**SMALL), workers=1)
+    assert verify(tmp_path / "set") == []
+
+
+# ---- dying workers
+
+
+def die(folder, scratch, plan, row_done):
+    if plan.split == "validation":
+        os._exit(9)  # as the system ends a process that took too much memory
+    return assembly_of(half_settings()).work(folder, scratch, plan, row_done)
+
+
+def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
+    folder = tmp_path / "set"
+    assembly = assembly_of(half_settings())
+    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.bytes_per_row, assembly.mesh_folder)
+    with pytest.raises(BuildError, match="worker process died"):
+        assemble(folder, broken, workers=2)
+    assert not (folder / "manifest.json").exists()
+    build(folder, half_settings(), workers=1)
+    assert file_bytes(folder) == uninterrupted
+
+
+# ---- full disks
+
+
+def can_mount(folder, size):
+    return subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True
+    ).returncode == 0  # fmt: skip
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    try:
+        mounted = can_mount(folder, "1500k")
+    except OSError:
+        mounted = False
+    if not mounted:
+        pytest.skip("mounting a small file system needs privileges; the test with a file-size limit covers the case")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_full_disk_is_refused_beforehand(small_disk, capsys):
+    arguments = ["build", str(small_disk / "set"), "--size", str(TINY_SIZE), "--objects", "cork", "--workers", "1"]
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    assert "GB free" in message and str(small_disk) in message
+    assert not final_shards(small_disk)
+
+
+def test_disk_that_fills_up_during_the_build(small_disk, uninterrupted, monkeypatch, capsys):
+    """A real ENOSPC in the second shard; after freeing space the same command resumes."""
+    monkeypatch.setattr(assembling, "_check_space", lambda *_: None)
+    folder = small_disk / "set"
+    for filler_kb in (300, 0):  # 1.2 MB without the filler: one shard fits, not two
+        filler = small_disk / "filler"
+        filler.write_bytes(b"x" * 1024 * filler_kb)
+        with pytest.raises(BuildError, match=r"No space left on device.*resumes"):
+            build(folder, half_settings(), workers=1)
+        for shard in final_shards(folder):
+            assert shard.read_bytes() == uninterrupted[str(shard.relative_to(folder))]
+        assert not list(folder.rglob("*.tmp"))
+        assert not (folder / "manifest.json").exists()
+        filler.unlink()
+    subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
+    build(folder, half_settings(), workers=1)
+    assert file_bytes(folder) == uninterrupted
+
+
+def test_files_that_can_not_grow(tmp_path, uninterrupted):
+    """The same through a limit on file sizes (EFBIG), which needs no privileges, and the real command."""
+    folder = tmp_path / "set"
+    arguments = [
+        *COMMAND, "build", str(folder), "--size", str(TINY_SIZE), "--objects", "cork,mug", "--frames", "single_shot",
+        "--workers", "1",
+    ]  # fmt: skip
+    limit = 1_000_000  # bytes; a shard has 1.7 million
+
+    def no_large_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "numba"), "FPP_BENCH_NUMBA": "0"}
+    done = subprocess.run(
+        arguments, cwd=ROOT, env=environment, capture_output=True, text=True, preexec_fn=no_large_files
+    )
+    assert done.returncode == 2
+    assert os.strerror(errno.EFBIG) in done.stderr and "resumes" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not final_shards(folder) and not list(folder.rglob("*.tmp"))
+    build(folder, half_settings(), workers=1)
+    assert file_bytes(folder) == uninterrupted
+
+
+@pytest.mark.parametrize("name", ["README.md", "manifest.json", "state.json"])
+def test_disk_that_is_full_at_the_very_end(tmp_path, uninterrupted, monkeypatch, name):
+    """No space for a small file: the card, the manifest, a state file."""
+    folder = tmp_path / "set"
+    opened = Path.open
+
+    def no_space(self, mode="r", *more, **options):
+        if "w" in mode and name in self.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
+        return opened(self, mode, *more, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", no_space)
+        with pytest.raises(BuildError, match="No space left on device"):
+            build(folder, half_settings(), workers=1)
+    assert not (folder / "manifest.json").exists()
+    build(folder, half_settings(), workers=1)
+    assert file_bytes(folder) == uninterrupted

@@ -1,0 +1,192 @@
+"""Reading images by memory map: the right pixels, without a copy, read-only, and helpful errors."""
+
+import gc
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.sample import DATA_GROUP
+from fpp_ml_bench.loaders.storage.manifest import read_manifest
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics import PAPER_SEQUENCE
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def plain_arrow(path, column, row):
+    """One cell read with pyarrow alone, through Python lists."""
+    table = pa.ipc.open_stream(path.read_bytes()).read_all()
+    cell = table[column]
+    cell = cell.combine_chunks()
+    cell = getattr(cell, "storage", cell)
+    return np.array(cell[row].as_py())
+
+
+@pytest.mark.parametrize(
+    ("group", "column", "index"),
+    [("data", "frame_00", 0), ("horizontal", "frame_17", 17), ("vertical", "frame_18", 18), ("codes", "frame_51", 51)],
+)
+def test_frames_are_the_bytes_of_their_file(tiny, opened, group, column, index):
+    path = next(tiny.rglob(f"train/{group}-*.arrow"))
+    for row in (0, 5, 6, 11):  # both objects of the shard, first and last view
+        sample = opened.splits["train"][row]
+        np.testing.assert_array_equal(opened.frame(sample, index), plain_arrow(path, column, row))
+
+
+def test_depths_are_the_values_of_their_file(tiny, opened):
+    path = next(tiny.rglob("train/data-*.arrow"))
+    for row in (0, 11):
+        sample = opened.splits["train"][row]
+        np.testing.assert_array_equal(opened.depth_mm(sample), plain_arrow(path, "depth", row).astype(np.float32))
+        exact = opened.depth_mm(sample, "depth_exact")
+        np.testing.assert_array_equal(exact, plain_arrow(path, "depth_exact", row).astype(np.float32))
+        assert exact.dtype == np.float32 and opened.frame(sample, 0).dtype == np.uint8
+
+
+def test_views_share_the_mapped_memory_and_are_read_only(opened):
+    view, again = opened.frame("mug_A60", 20), opened.frame("mug_A60", 20)
+    assert np.shares_memory(view, again)
+    assert not view.flags.writeable and not view.flags.owndata
+    with pytest.raises(ValueError, match="read-only"):
+        view[0, 0] = 1
+    depth = opened.depth_mm("mug_A60")
+    assert not depth.flags.writeable and not depth.flags.owndata
+    # The memory is that of the file's map: its address lies in a mapping of that file.
+    shard = next(s for s in opened.manifest.shards if s.split == "validation" and s.group == "vertical")
+    address = view.__array_interface__["data"][0]
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    inside = [line for line in maps if str(opened.path / shard.path) in line]
+    spans = [tuple(int(x, 16) for x in line.split()[0].split("-")) for line in inside]
+    assert any(low <= address < high for low, high in spans)
+
+
+def test_a_view_outlives_the_folder_object(tiny):
+    dataset = DatasetFolder(tiny)
+    view, copy = dataset.depth_mm("cork_A0"), dataset.depth_mm("cork_A0").copy()
+    del dataset
+    gc.collect()
+    np.testing.assert_array_equal(view, copy)
+
+
+def test_frames_in_the_order_of_the_indices(opened):
+    stack = opened.frames("bowl_A0", [51, 0, 18])
+    for frame, index in zip(stack, (51, 0, 18), strict=True):
+        np.testing.assert_array_equal(frame, opened.frame("bowl_A0", index))
+    # White is brighter than black, and each frame of a sequence is another image.
+    white, black = opened.frame("bowl_A0", PAPER_SEQUENCE.white), opened.frame("bowl_A0", PAPER_SEQUENCE.black)
+    inside = opened.depth_mm("bowl_A0") > 0
+    assert white[inside].mean() > black[inside].mean() + 80
+    assert len({opened.frame("bowl_A0", i).tobytes() for i in range(52)}) == 52
+
+
+def test_target_is_the_decoded_set_of_pixels(opened):
+    for sample in opened.samples("all"):
+        depth, exact = opened.depth_mm(sample), opened.depth_mm(sample, "depth_exact")
+        assert opened.target_mm(sample) is depth or np.shares_memory(opened.target_mm(sample), depth)
+        target = opened.target_mm(sample, "depth_exact")
+        np.testing.assert_array_equal(target > 0, depth > 0)
+        np.testing.assert_array_equal(target[target > 0], exact[target > 0])
+        assert target.dtype == np.float32
+
+
+def test_names_splits_and_what_was_measured(opened):
+    assert opened.samples("all") == [s for split in ("train", "validation", "test") for s in opened.splits[split]]
+    assert opened.split_of_sample("mug_A300") == "validation"
+    assert opened.measured("cork_A120")["object"] == "cork"
+    assert len(opened.fingerprint) == 64 and opened.has_exact
+    assert opened.sequence == PAPER_SEQUENCE and opened.rig.sequence == PAPER_SEQUENCE
+    names = opened.samples("train")
+    names.clear()
+    assert len(opened.samples("train")) == 12
+
+
+def test_pickles_by_path(opened):
+    content = pickle.dumps(opened)
+    assert len(content) < 1000
+    again = pickle.loads(content)
+    np.testing.assert_array_equal(again.frame("mug_A0", 3), opened.frame("mug_A0", 3))
+    assert not np.shares_memory(again.frame("mug_A0", 3), opened.frame("mug_A0", 3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda d: d.frame("mug_A61", 0), "no sample 'mug_A61'; similar names: mug_A"),
+        (lambda d: d.frame("mug_A60", 52), "frame 52 is not stored"),
+        (lambda d: d.frame("mug_A60", -1), "frame -1 is not stored"),
+        (
+            lambda d: d.depth_mm("mug_A60", "depth_min"),
+            "unknown depth column 'depth_min'; there are depth and depth_exact",
+        ),
+        (lambda d: d.samples("val"), "no split 'val'; there are train, validation, test and all"),
+        (lambda d: d.split_of_sample(""), "no sample ''"),
+    ],
+)
+def test_errors_of_reading(opened, call, message):
+    with pytest.raises(DatasetError, match=message):
+        call(opened)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda p: None, "no such folder; build one with"),
+        (lambda p: p.mkdir(), "no manifest.json there"),
+        (lambda p: (p / ".build").mkdir(parents=True), "not finished"),
+        (lambda p: (p.mkdir(), (p / "manifest.json").write_text("{")), "damaged"),
+        (lambda p: (p.mkdir(), (p / "manifest.json").write_text("[]")), "damaged"),
+        (lambda p: (p.mkdir(), (p / "manifest.json").write_text("{}")), "damaged"),
+        (lambda p: (p.mkdir(), (p / "manifest.json").write_bytes(b"\xff\xfe\x00")), "damaged"),
+        (lambda p: (p.mkdir(), (p / "manifest.json").write_text('{"fingerprint": 1, "schema_version": "9.0"}')), "9.0"),
+        (lambda p: p.write_text(""), "no such folder"),
+    ],
+)
+def test_folders_that_are_no_dataset(tmp_path, make, message):
+    folder = tmp_path / "x"
+    make(folder)
+    with pytest.raises(DatasetError, match=message) as caught:
+        DatasetFolder(folder)
+    assert str(folder) in str(caught.value)
+
+
+@pytest.fixture
+def copied(tiny, tmp_path):
+    shutil.copytree(tiny, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_missing_and_cut_shards_are_noticed_when_opening(copied):
+    shard = copied / read_manifest(copied).shards[3].path
+    content = shard.read_bytes()
+    shard.write_bytes(content[:-1])
+    with pytest.raises(DatasetError, match=f"expected {len(content)} bytes, it has {len(content) - 1}"):
+        DatasetFolder(copied)
+    shard.unlink()
+    with pytest.raises(DatasetError, match="it is missing"):
+        DatasetFolder(copied)
+
+
+def test_same_length_but_no_arrow_is_an_error_not_a_crash(copied):
+    shard = next(s for s in read_manifest(copied).shards if s.split == "train" and s.group == DATA_GROUP)
+    path = copied / shard.path
+    opened = DatasetFolder(copied)
+    path.write_bytes(b"\0" * shard.bytes)
+    with pytest.raises(DatasetError, match="verify"):
+        opened.depth_mm("cork_A0")
+
+
+def test_reading_imports_neither_torch_nor_datasets_nor_pandas(tiny):
+    code = (
+        "import sys; from fpp_ml_bench.loaders import DatasetFolder; d = DatasetFolder(sys.argv[1]);"
+        "d.depth_mm('mug_A0').sum(); d.frame('mug_A0', 30).sum();"
+        "print([m for m in ('torch', 'datasets', 'pandas', 'scipy', 'trimesh', 'numba') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tiny)], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,298 @@
+"""`verify` reports every kind of damage and leak, with one finding each, and none on a clean dataset."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import make
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.constants import VIEWS
+from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders.storage import shards as writing
+from fpp_ml_bench.loaders.storage.manifest import ShardFile, file_hash, read_manifest
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+
+
+@pytest.fixture
+def clean(tmp_path):
+    return make(tmp_path / "set")
+
+
+@pytest.fixture
+def copied(tiny, tmp_path):
+    shutil.copytree(tiny, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def shard_of(folder, split="train", group="data"):
+    return next(s for s in read_manifest(folder).shards if (s.split, s.group) == (split, group))
+
+
+def flip(path, share=0.5):
+    content = bytearray(path.read_bytes())
+    content[int(len(content) * share)] ^= 0x10
+    path.write_bytes(content)
+
+
+def restate(folder, **changes):
+    """Write the manifest again with a right fingerprint, as someone who wants to hide a change would do."""
+    replace(read_manifest(folder), **changes).write(folder)
+
+
+def reseal(folder, shard):
+    """Make the manifest agree with the present bytes of a shard."""
+    path = folder / shard.path
+    sealed = replace(shard, bytes=path.stat().st_size, xxh3_128=file_hash(path))
+    restate(folder, shards=[sealed if s.path == shard.path else s for s in read_manifest(folder).shards])
+
+
+def test_clean_datasets_have_no_findings(tiny, clean, capsys):
+    reported = []
+    assert verify(tiny, reported.append) == [] and verify(clean) == []
+    manifest = read_manifest(tiny)
+    assert reported == [1] * (len(manifest.shards) + len(manifest.others))
+    assert main(["verify", str(tiny)]) == 0
+    out = capsys.readouterr().out
+    assert "intact" in out and manifest.fingerprint in out
+
+
+# ---- files
+
+
+@pytest.mark.parametrize("group", ["data", "horizontal", "vertical", "codes"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999999])
+def test_flipped_byte_in_a_shard(copied, group, share, capsys):
+    path = copied / shard_of(copied, "validation", group).path
+    flip(path, share)
+    (finding,) = verify(copied)
+    assert str(path) in finding and "content has changed" in finding
+    assert main(["verify", str(copied)]) == 1
+    assert "1 finding(s)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["README.md", "rig.yaml", "dataset_dict.json", "train/state.json", "test/dataset_info.json", "meshes/mug.ply"],
+)
+def test_changed_file_beside_the_shards(copied, name):
+    flip(copied / name)
+    (finding,) = verify(copied)
+    assert name in finding and "content has changed" in finding
+    (copied / name).unlink()
+    (finding,) = verify(copied)
+    assert name in finding and "is missing" in finding
+
+
+def test_cut_missing_and_foreign_files(copied):
+    cut, gone = copied / shard_of(copied).path, copied / shard_of(copied, "test", "codes").path
+    size = cut.stat().st_size
+    cut.write_bytes(cut.read_bytes()[:-8])
+    gone.unlink()
+    shutil.copy(copied / shard_of(copied, "test").path, copied / "test" / "data-00001-of-00002.arrow")
+    (copied / "frames" / "note.txt").write_text("x")
+    findings = verify(copied)
+    assert len(findings) == 4
+    for name, message in (
+        (cut.name, f"has {size - 8} bytes, expected {size}"),
+        (gone.name, "is missing"),
+        ("data-00001-of-00002.arrow", "not part of this dataset"),
+        ("note.txt", "not part of this dataset"),
+    ):
+        assert any(name in finding and message in finding for finding in findings)
+
+
+def test_link_in_place_of_nothing_is_foreign(clean):
+    (clean / "link").symlink_to("/nowhere")
+    (finding,) = verify(clean)
+    assert "link" in finding and "not part" in finding
+
+
+def test_caches_that_datasets_leaves_are_no_finding(clean):
+    (clean / "train" / "cache-1234567890abcdef.arrow").write_bytes(b"x")
+    assert verify(clean) == []
+
+
+def test_swapped_shards(clean):
+    validation_path, test_path = (clean / shard_of(clean, split).path for split in ("validation", "test"))
+    content = validation_path.read_bytes(), test_path.read_bytes()
+    test_path.write_bytes(content[0])
+    validation_path.write_bytes(content[1])
+    findings = verify(clean)
+    assert len(findings) == 2 and all("expected" in f or "changed" in f for f in findings)
+    # With a manifest that agrees with the swapped files, the labels in the rows show it.
+    for split in ("validation", "test"):
+        reseal(clean, shard_of(clean, split))
+    findings = verify(clean)
+    assert sum("expected labels" in f for f in findings) == 12
+
+
+def test_no_arrow_under_a_right_checksum(clean):
+    shard = shard_of(clean)
+    (clean / shard.path).write_bytes(b"no arrow at all")
+    reseal(clean, shard)
+    (finding,) = verify(clean)
+    assert "can't be read as Arrow" in finding
+
+
+def test_other_columns_under_a_right_checksum(clean):
+    import pyarrow as pa
+
+    shard = shard_of(clean)
+    table = pa.ipc.open_stream((clean / shard.path).read_bytes()).read_all()
+    for wrong in (
+        table.drop_columns(["depth"]),
+        table.slice(1),
+        table.set_column(7, "depth_min", pa.array(["1"] * 12)),
+    ):
+        with pa.OSFile(str(clean / shard.path), "wb") as sink, pa.ipc.new_stream(sink, wrong.schema) as writer:
+            writer.write_table(wrong)
+        reseal(clean, shard)
+        (finding,) = verify(clean)
+        assert "rows or columns are not those" in finding
+
+
+# ---- contents
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, "not finite or negative"),
+        (np.inf, "not finite or negative"),
+        (-1.0, "not finite or negative"),
+        (0.0, "no depth above 0"),
+        (9000.0, "depth_min and depth_max do not fit"),
+    ],
+)
+def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, message):
+    """The writer refuses them, but a dataset written by another program may contain them."""
+    monkeypatch.setattr(writing, "depth_range_mm", lambda depth, sample: (1500.0, 2100.0))
+    folder = make(tmp_path / "set", spoil=("mug_A60", value))
+    findings = [finding for finding in verify(folder) if "mug_A60" in finding]
+    assert len(findings) == 1 and message in findings[0] and "column depth" in findings[0]
+
+
+@pytest.mark.parametrize("key", ["sample", "object", "view", "depth_min_mm"])
+def test_labels_that_contradict_the_manifest(clean, key):
+    samples = {split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()}
+    samples["train"][7][key] = samples["train"][8][key] if key != "object" else "bowl"
+    restate(clean, samples=samples)
+    findings = verify(clean)
+    assert any("expected labels" in f for f in findings)
+
+
+def test_sample_named_otherwise_than_its_object(clean):
+    samples = {split: [dict(row) for row in rows] for split, rows in read_manifest(clean).samples.items()}
+    samples["test"][0]["object"] = "drill"
+    restate(clean, samples=samples)
+    assert any("'power_drill_A0'" in f and "said to be" in f for f in verify(clean))
+
+
+# ---- splits
+
+
+def test_object_in_two_splits(tmp_path):
+    folder = make(tmp_path / "set", {"train": ("bowl", "mug"), "validation": ("mug",)}, origin="imported")
+    findings = verify(folder)
+    assert sum("in two splits" in f and "'mug'" in f for f in findings) >= 1
+    assert any("same image stands in two splits: train/mug_A0" in f for f in findings)
+    assert main(["verify", str(folder)]) == 1
+
+
+def test_image_in_two_splits_under_other_names(tmp_path):
+    folder = make(tmp_path / "set", same=(("power_drill_A120", "bowl_A60"),))
+    (finding,) = verify(folder)
+    assert finding == "the same image stands in two splits: train/bowl_A60 frame_00, test/power_drill_A120 frame_00"
+
+
+def test_image_twice_in_one_split_is_no_leak(tmp_path):
+    assert verify(make(tmp_path / "set", same=(("cork_A0", "bowl_A60"),))) == []
+
+
+def test_benchmark_object_in_the_wrong_split(tmp_path):
+    wrong = {"train": ("power_drill", "bowl"), "test": ("wooden_boards",)}
+    assert any(
+        "'power_drill' is in train, the benchmark has it in test" in f for f in verify(make(tmp_path / "a", wrong))
+    )
+    assert verify(make(tmp_path / "b", wrong, origin="imported")) == []  # a published tree has its own split
+
+
+def test_object_without_all_its_views(tmp_path):
+    findings = verify(make(tmp_path / "set", {"train": ("bowl",)}, views=VIEWS[:5]))
+    assert len(findings) == 1 and "'bowl'" in findings[0] and "expected the views" in findings[0]
+
+
+def test_rows_missing_from_all_files(clean):
+    manifest = read_manifest(clean)
+    shard = shard_of(clean, "validation")
+    (clean / shard.path).unlink()
+    restate(clean, shards=[s for s in manifest.shards if s != shard])
+    (finding,) = verify(clean)
+    assert "validation, data: the files hold 0 rows, expected each of 6 once" in finding
+
+
+def test_rows_present_in_two_files(clean):
+    manifest = read_manifest(clean)
+    shard = shard_of(clean, "validation")
+    twin = ShardFile(**{**vars(shard), "path": "validation/data-00009-of-00009.arrow"})
+    shutil.copy(clean / shard.path, clean / twin.path)
+    restate(clean, shards=[*manifest.shards, twin])
+    assert any("hold 12 rows" in f for f in verify(clean))
+
+
+# ---- the manifest
+
+
+def test_every_kind_of_tampering_with_the_manifest_is_noticed(clean, capsys):
+    path = clean / "manifest.json"
+    text = path.read_text()
+    for old, new in (
+        ('"bowl_A0"', '"bowl_A1"'),
+        ('"rows": 12', '"rows": 13'),
+        ('"stored": "single_shot"', '"stored": "all"'),
+        ('"exact": true', '"exact": false'),
+        ('"schema_version": "1', '"schema_version": "2'),
+        ('"origin": "generated"', '"origin": "imported"'),
+        ('"xxh3_128": "', '"xxh3_128": "0'),  # the first is that of a shard
+        ('"shards": [', '"shard": ['),
+        ('"fingerprint"', '"fingerprints"'),
+        ("{", "["),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(DatasetError, match=r"manifest\.json"):
+            verify(clean)
+        assert main(["verify", str(clean)]) == 2
+        err = capsys.readouterr().err
+        assert "manifest.json" in err and "Traceback" not in err
+
+
+def test_any_flipped_bit_of_the_manifest_is_noticed_or_does_not_concern_the_data(clean):
+    path = clean / "manifest.json"
+    content, manifest = path.read_bytes(), read_manifest(clean)
+    rng = np.random.default_rng(0)
+    harmless = 0
+    for position in rng.integers(0, len(content), 400):
+        changed = bytearray(content)
+        changed[position] ^= 1 << rng.integers(0, 8)
+        path.write_bytes(changed)
+        try:
+            changed_manifest = read_manifest(clean)
+        except DatasetError:
+            continue
+        if changed_manifest.others != manifest.others:
+            assert verify(clean)
+        harmless += 1
+        assert replace(changed_manifest, generator=manifest.generator, others=manifest.others) == manifest
+    assert harmless < 150  # white space, the generator's name, the entries of files that are looked at themselves
+
+
+def test_folders_that_can_not_be_verified(tmp_path, capsys):
+    for folder in (tmp_path / "none", tmp_path):
+        assert main(["verify", str(folder)]) == 2
+        assert "error:" in capsys.readouterr().err
+    with pytest.raises(DatasetError):
+        DatasetFolder(tmp_path)

@@ -1,0 +1,115 @@
+"""Powers of costs: against closed forms and SciPy's regression, and what is flagged."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fpp_ml_bench.leaderboard.tradeoff import clock as tradeoff_clock
+from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
+from fpp_ml_bench.leaderboard.tradeoff.figure import draw_growth
+from fpp_ml_bench.leaderboard.tradeoff.growth import fit_power, growth
+from fpp_ml_bench.leaderboard.tradeoff.ladder import Ladder, Rung, time_ladder
+from fpp_ml_bench.leaderboard.tradeoff.report import growth_csv
+
+AMOUNTS = [10, 20, 40, 80, 160]
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
+def test_a_pure_power_is_found_exactly(power):
+    fitted = fit_power(AMOUNTS, [3e-4 * n**power for n in AMOUNTS])
+    assert fitted.exponent == pytest.approx(power, abs=1e-9) and fitted.tail == pytest.approx(power, abs=1e-9)
+    assert fitted.low == pytest.approx(power, abs=1e-6) and fitted.high == pytest.approx(power, abs=1e-6)
+
+
+def test_slope_and_interval_are_those_of_scipys_regression():
+    rng = np.random.default_rng(1)
+    seconds = 2e-3 * np.array(AMOUNTS) ** 1.4 * np.exp(0.1 * rng.standard_normal(5))
+    fitted = fit_power(AMOUNTS, list(seconds))
+    regression = stats.linregress(np.log(AMOUNTS), np.log(seconds))
+    half = stats.t.ppf(0.975, 3) * regression.stderr
+    assert fitted.exponent == pytest.approx(regression.slope)
+    assert (fitted.low, fitted.high) == pytest.approx((regression.slope - half, regression.slope + half))
+    assert fitted.tail == pytest.approx(stats.linregress(np.log(AMOUNTS[2:]), np.log(seconds[2:])).slope)
+
+
+def test_a_quadratic_shows_and_a_line_does_not():
+    line = growth("read", "rows", AMOUNTS, [1e-3 * n for n in AMOUNTS])
+    assert line.flag is None and line.exponent == 1.0
+    assert growth("read", "rows", AMOUNTS, [1e-6 * n * n for n in AMOUNTS]).flag == "steeper than linear"
+    hidden = growth("read", "rows", AMOUNTS, [0.01 + 1e-6 * n * n for n in AMOUNTS])
+    assert hidden.exponent < 1 and hidden.flag is None  # the fixed cost still outweighs it everywhere
+    late = growth(
+        "read", "rows", [10, 20, 40, 80, 160, 320, 640], [0.01 + 1e-6 * n * n for n in (10, 20, 40, 80, 160, 320, 640)]
+    )
+    assert late.exponent < 1.3 and late.flag == "steeper than linear at the largest amounts"
+    scattered = growth("read", "rows", AMOUNTS, [1e-3, 1e-3, 9e-3, 9e-3, 0.1])
+    assert scattered.flag.startswith("perhaps") and scattered.low < 1.3
+
+
+@pytest.mark.parametrize(
+    "amounts, seconds, message",
+    [
+        ([1, 2], [1, 2], "at least 3"),
+        ([1, 2, 3], [1, 2], "at least 3"),
+        ([1, 3, 2], [1, 2, 3], "ascending"),
+        ([1, 2, 3], [1, 0, 3], "above 0"),
+        ([1, 2, 3], [1, float("nan"), 3], "finite"),
+    ],
+)
+def test_what_has_no_power_is_refused(amounts, seconds, message):
+    with pytest.raises(ValueError, match=message):
+        fit_power(amounts, seconds)
+
+
+class World:
+    """A clock that only the work moves; every third run is disturbed."""
+
+    def __init__(self):
+        self.now, self.runs = 0.0, 0
+
+    def work(self, seconds):
+        self.runs += 1
+        self.now += seconds * (5 if self.runs % 3 == 0 else 1)
+
+
+@pytest.fixture
+def world(monkeypatch):
+    clock = World()
+    monkeypatch.setattr(tradeoff_clock, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(tradeoff_clock, "process_time", lambda: clock.now)
+    return clock
+
+
+def quadratic(world, folders):
+    def prepare(step, folder):
+        assert folder.is_dir() and not any(folder.iterdir())
+        folders.append(folder)
+
+        def run():
+            world.work(0.001 * step * step)
+            return {"search": 0.0009 * step * step, "rest": 0.0001}
+
+        return Rung(step, run)
+
+    return Ladder("look up", "rows", (4, 8, 16, 32), prepare)
+
+
+def test_a_ladder_takes_the_least_time_and_flags_a_nested_loop(world):
+    folders = []
+    stage, search, rest = time_ladder(quadratic(world, folders))
+    assert stage.stage == "look up" and stage.over == "rows" and stage.amounts == [4, 8, 16, 32]
+    assert stage.seconds == pytest.approx([0.016, 0.064, 0.256, 1.024]) and stage.flag == "steeper than linear"
+    assert search.stage == "look up: search" and search.exponent == 2.0 and rest.exponent == 0.0 and rest.flag is None
+    assert not any(folder.exists() for folder in folders)
+
+
+def test_parts_are_the_walls_and_are_left_out_of_processor_time(world):
+    assert [growth.stage for growth in time_ladder(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
+
+
+def test_csv_of_growth(world, tmp_path):
+    growths = time_ladder(quadratic(world, []))
+    lines = growth_csv(growths).splitlines()
+    assert lines[0].startswith("stage,over,amount,seconds,exponent") and len(lines) == 1 + 3 * 4
+    assert lines[1] == "look up,rows,4,0.016,2,2,2,2,steeper than linear"
+    assert not draw_growth([], tmp_path / "none.png") and not (tmp_path / "none.png").exists()

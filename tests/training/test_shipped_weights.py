@@ -1,0 +1,47 @@
+"""The weights in the package: small, readable, and what their names say."""
+
+import pytest
+
+from fpp_ml_bench.baselines import load
+from fpp_ml_bench.baselines.training.recipe import load_recipe, recipe_from_dict
+from fpp_ml_bench.baselines.training.weights import SHIPPED, shipped_names
+from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+from fpp_ml_bench.loaders.render import BuildSettings, build
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import paper_rig
+
+SAMPLE = "power_drill_A60"
+
+
+def test_there_are_some_and_they_are_small():
+    assert "unet-individual-hybrid_l1_0.7" in shipped_names()
+    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 20e6
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """One test view at the size of the weights: fringe and true depth."""
+    size = load_recipe("base", "cpu").size
+    folder = tmp_path_factory.mktemp("shipped") / "dataset"
+    settings = BuildSettings(rig=paper_rig(size), objects=("bowl", "mug", "power_drill"), stored="single_shot")
+    build(folder, settings, workers=1)
+    opened = DatasetFolder(folder)
+    return opened.frame(SAMPLE, 0), opened.depth_mm(SAMPLE)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_each_is_its_recipe_and_gives_the_score_of_its_row(name, scene):
+    """Against the leaderboard's row of the same weights, whose per-sample scores come from the full set."""
+    model = load(name)
+    assert model.config.name == name == recipe_from_dict(model.config.recipe).name
+    suffix = "-range-predicted" if model.config.normalisation == "individual" else ""
+    row = read_entry(SHIPPED_ROWS / f"cpu-{name}{suffix}.json").result
+    assert row.submission.settings["weights_sha256"] == model.sha256
+    (expected,) = [scores for scores in row.per_sample if scores.sample == SAMPLE]
+    fringe, truth = scene
+    scores = score_sample(model.predict(fringe), truth)
+    # A pixel on the mask's threshold may fall to the other side on another processor.
+    assert scores.object.mae_mm == pytest.approx(expected.object_mae_mm, rel=0.01)
+    assert scores.background.mae_mm == pytest.approx(expected.background_mae_mm, rel=0.01)
+    assert scores.overall.mae_mm == pytest.approx(expected.overall_mae_mm, rel=0.01)

@@ -1,0 +1,81 @@
+"""The training benchmark's two ways: the same images, the same network, one pass each."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from conftest import TINY_SIZE, tiny_settings
+
+from fpp_ml_bench.loaders.published import write_tree
+from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """One training object as a dataset and as the published tree."""
+    folder = tmp_path_factory.mktemp("train_speed")
+    build(folder / "dataset", tiny_settings(stored="single_shot", objects=("bowl", "mug")), workers=1)
+    write_tree(DatasetFolder(folder / "dataset"), folder / "tree", ["train"], 1)
+    return folder / "dataset", folder / "tree"
+
+
+@pytest.fixture
+def ways(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    import train_ways
+
+    yield train_ways
+    train_ways._surroundings.close()
+
+
+def job(ways, data, tmp_path, **changes):
+    told = {"network": "unet", "size": TINY_SIZE, "width": 2, "batch": 2, "threads": None}
+    return ways.Job(**{"data": data, "scratch": tmp_path, **told, **changes})
+
+
+def test_both_ways_read_the_same_images(monkeypatch, ways, data):
+    import train_speed
+
+    train_speed.check_same(*data)
+    monkeypatch.setattr(ways.PngAndMat, "__len__", lambda self: 5)
+    with pytest.raises(SystemExit, match="holds 6 training pairs, the exported tree 5"):
+        train_speed.check_same(*data)
+
+
+def test_a_difference_is_noticed(ways, data, tmp_path):
+    import train_speed
+
+    dataset, tree = data
+    reader = ways.PngAndMat(tree)
+    content = reader.depths[2].read_bytes()
+    depth = scipy.io.loadmat(reader.depths[2])["depthMapNormalized"]
+    try:
+        scipy.io.savemat(reader.depths[2], {"depthMapNormalized": np.where(depth > 0, depth + 0.001, 0)})
+        with pytest.raises(SystemExit, match=f"{reader.depths[2].stem}: the two ways read different numbers"):
+            train_speed.check_same(dataset, tree)
+    finally:
+        reader.depths[2].write_bytes(content)
+
+
+def test_an_epoch_of_each(ways, data, tmp_path):
+    """From the same weights, over the same six pairs in orders of their own: nearly the same loss."""
+    dataset, tree = data
+    losses = []
+    for kind, folder in ((ways.Plain, tree), (ways.Ours, dataset)):
+        ways.start(kind, job(ways, folder, tmp_path))
+        epoch = ways.run_epoch(True)
+        assert 0 < epoch.data < epoch.step and 0 < epoch.compute < epoch.step
+        assert epoch.memory_gib > 0
+        losses.append(epoch.loss)
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
+
+
+def test_the_cost_of_a_step(monkeypatch, ways, tmp_path):
+    monkeypatch.setattr(ways, "ENOUGH_S", 0.0)
+    seconds = ways.step_seconds(job(ways, tmp_path, tmp_path, size=32, batch=1))
+    assert 0 < seconds < math.inf

@@ -1,0 +1,119 @@
+"""Weights say which benchmark they were trained on, and a mismatch with the dataset at hand is one sentence."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from tiny_network import config_of, tiny_network
+
+from fpp_ml_bench.baselines.phase_network import NetConfig, PhaseNet, load_net, save_net
+from fpp_ml_bench.baselines.training import provenance_of_data as training_data
+from fpp_ml_bench.baselines.training.provenance_of_data import (
+    TrainingBenchmark,
+    training_benchmark,
+    training_data_warning,
+)
+from fpp_ml_bench.baselines.training.recipe import load_recipe
+from fpp_ml_bench.baselines.training.setup import model_config
+from fpp_ml_bench.baselines.training.weights import SHIPPED, read_weights, save_weights, shipped_names
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.loaders.storage import Benchmark, benchmark
+
+OLD = "a" * 64
+NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0}
+
+
+@pytest.fixture
+def benchmarks(monkeypatch, opened):
+    """The tiny dataset as version 1 of a benchmark ``tiny``, and a second benchmark."""
+    named = (
+        Benchmark("tiny", 1, "mini", 176, opened.fingerprint),
+        Benchmark("large", 0, "full", 960, "c" * 64),
+    )
+    monkeypatch.setattr(benchmark, "BENCHMARKS", named)
+    return named
+
+
+def phase_net_config(**changes):
+    content = {"name": "phase-net", "title": "Small", "options": NET_OPTIONS, "threshold": -1.0,
+               "period_px": {"horizontal": 5.6}, "dataset_fingerprint": "0" * 64}  # fmt: skip
+    return NetConfig(**{**content, **changes})
+
+
+def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
+    recipe = load_recipe("loss/l1", "cpu")
+    network = tiny_network()
+    for fingerprint, expected in ((opened.fingerprint, TrainingBenchmark("tiny", 1)), (OLD, None)):
+        config = replace(model_config(recipe, network, fingerprint, 1, {}), image_size=(32, 48))
+        assert config.benchmark == expected
+        path = tmp_path / "net.safetensors"
+        save_weights(path, network, config)
+        assert read_weights(path)[0].benchmark == expected
+        save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=training_benchmark(fingerprint)))
+        assert load_net(path).config.benchmark == expected
+
+
+def test_a_file_without_the_entry_is_read(tmp_path):
+    """The shipped weights are older than the entry."""
+    for name in shipped_names():
+        assert read_weights(SHIPPED / f"{name}.safetensors")[0].benchmark is None
+    assert load_net().config.benchmark is None
+    data = load_net().path.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    assert "benchmark" not in json.loads(header["__metadata__"]["config"])
+
+
+@pytest.mark.parametrize(
+    "fingerprint, trained_on, words",
+    [
+        ("same", None, None),
+        ("same", TrainingBenchmark("tiny", 0), None),
+        (OLD, None, "trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"),
+        (OLD, TrainingBenchmark("tiny", 0), "trained on tiny version 0; predicting on tiny version 1"),
+        (OLD, TrainingBenchmark("large", 7), None),
+        ("c" * 64, None, None),
+    ],
+)
+def test_what_is_said_on_a_named_benchmark(benchmarks, opened, fingerprint, trained_on, words):
+    fingerprint = opened.fingerprint if fingerprint == "same" else fingerprint
+    config = config_of(tiny_network(), dataset_fingerprint=fingerprint, benchmark=trained_on)
+    assert training_data_warning(config, opened.manifest) == words
+
+
+def test_other_bytes_of_a_benchmarks_settings_are_said(benchmarks, opened, monkeypatch):
+    """A dataset that was built with a benchmark's settings, and differs from it: on another processor, say."""
+    built = replace(benchmarks[0], fingerprint="d" * 64)
+    monkeypatch.setattr(training_data, "intended_benchmark", lambda manifest: built)
+    monkeypatch.setattr(benchmark, "BENCHMARKS", (built,))
+    config = config_of(tiny_network(), dataset_fingerprint="d" * 64)
+    expected = f"trained on tiny version 1; predicting on dataset {opened.fingerprint[:8]}, which has the settings of "
+    assert training_data_warning(config, opened.manifest) == f"{expected}tiny version 1 but other bytes"
+
+
+def test_nothing_is_said_on_data_of_the_users_own(opened):
+    config = config_of(tiny_network(), dataset_fingerprint=OLD)
+    assert training_data_warning(config, opened.manifest) is None
+    imported = replace(opened.manifest, origin="imported")
+    assert training_data_warning(config, imported) is None
+
+
+@pytest.mark.parametrize("command", ["predict", "time"])
+@pytest.mark.parametrize("method", ["network", "phase-net", "classical"])
+def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, capsys, command, method):
+    options = ["--out", tmp_path / "predictions"] if command == "predict" else ["--repeats", 1, "--batch", 1]
+    if method == "network":
+        config = config_of(
+            tiny_network(), normalisation="global", image_size=opened.size, dataset_fingerprint=OLD, name="mine"
+        )
+        save_weights(tmp_path / "mine.safetensors", tiny_network(), config)
+        method = tmp_path / "mine.safetensors"
+    if method == "phase-net":
+        period_px = opened.rig.image_px_per_period("horizontal")
+        config = phase_net_config(period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
+        save_net(tmp_path / "net.safetensors", PhaseNet(**NET_OPTIONS), config)
+        options += ["--weights", tmp_path / "net.safetensors"]
+    assert main([str(argument) for argument in (command, method, tiny, *options)]) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    name = {"classical": None, "phase-net": "phase-net"}.get(str(method), "mine")
+    expected = "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"
+    assert warnings == ([] if name is None else [f"warning: {name} {expected}"])

@@ -1,0 +1,204 @@
+"""Weights on disk: what goes in comes out to the bit, and nothing else is read."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from tiny_network import config_of, tiny_network
+
+from fpp_ml_bench.baselines.training import weights as weights_file
+from fpp_ml_bench.baselines.training.weights import open_weights, read_weights, save_weights, weights_path
+from fpp_ml_bench.errors import WeightsError
+
+HEADS = {"range_mean": torch.tensor([1700.0, 1900.0], dtype=torch.float64)}
+
+
+@pytest.fixture(scope="module")
+def network():
+    return tiny_network()
+
+
+@pytest.fixture
+def saved(tmp_path, network):
+    path = tmp_path / "net.safetensors"
+    save_weights(path, network, config_of(network), HEADS)
+    return path
+
+
+def rewrite(path, metadata=None, tensors=None):
+    """The file again, by the safetensors library, with parts of it changed."""
+    with path.open("rb") as file:
+        header = json.loads(file.read(struct.unpack("<Q", file.read(8))[0]))
+    old = header["__metadata__"]
+    save_file({**load_file(path), **(tensors or {})}, path, {**old, **(metadata or {})})
+    return path
+
+
+def config_with(path, **changes):
+    """The file's configuration as JSON with ``changes``; a key set to ``...`` is left out."""
+    with path.open("rb") as file:
+        header = json.loads(file.read(struct.unpack("<Q", file.read(8))[0]))
+    content = {**json.loads(header["__metadata__"]["config"]), **changes}
+    return json.dumps({key: value for key, value in content.items() if value is not ...})
+
+
+def test_what_goes_in_comes_out(saved, network):
+    config, tensors = read_weights(saved)
+    assert config == config_of(network) and config.image_size == (32, 48) and config.recipe["loss"]["alpha"] == 0.7
+    assert tensors.keys() == network.state_dict().keys()
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(tensors[name], tensor) and tensors[name].dtype == tensor.dtype
+    heads = open_weights(saved).heads
+    assert heads.keys() == HEADS.keys() and torch.equal(heads["range_mean"], HEADS["range_mean"])
+    network.load_state_dict(tensors)
+    # Anyone's safetensors reads it, and finds the configuration as plain JSON.
+    assert set(load_file(saved)) == {*network.state_dict(), "range_head.range_mean"}
+
+
+def test_same_content_same_bytes(saved, network, tmp_path):
+    for number in range(4):
+        again = tmp_path / f"again{number}.safetensors"
+        save_weights(again, network, config_of(network), HEADS)
+        assert again.read_bytes() == saved.read_bytes()
+    assert int.from_bytes(saved.read_bytes()[:8], "little") % 8 == 0
+
+
+def test_training_layouts_are_saved_plainly(saved, tmp_path):
+    network = tiny_network().to(memory_format=torch.channels_last).train()
+    path = tmp_path / "channels-last.safetensors"
+    save_weights(path, network, config_of(network), HEADS)
+    assert path.read_bytes() == saved.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"colour": "blue"}, "colour: is not a key of this file"),
+        ({"normalisation": ...}, "normalisation: is missing"),
+        ({"normalisation": "log"}, "normalisation.*'individual'"),
+        ({"image_size": [32]}, "image_size"),
+        ({"image_size": ["32", 48]}, "image_size.0"),
+        ({"epoch": -1}, "epoch"),
+        ({"image_size": [32, 40]}, "makes no network.*multiples of 16.*given 32x40"),
+        ({"data_config": "few"}, "unknown data_config 'few'; there are single_shot"),
+        ({"dataset_fingerprint": "abc"}, "dataset_fingerprint"),
+        ({"network": "vnet"}, "makes no network.*unet"),
+        ({"options": {"depth_of_thought": 3}}, "makes no network.*depth_of_thought"),
+        ({"options": {"width": 5}}, r"tensor \S+: expected float32 \(5, .*, got float32 \(4, "),
+    ],
+)
+def test_configurations_that_do_not_fit(saved, changes, words):
+    rewrite(saved, {"config": config_with(saved, **changes)})
+    with pytest.raises(WeightsError, match=f"(?s)net.safetensors: .*{words}"):
+        read_weights(saved)
+
+
+@pytest.mark.parametrize(
+    "metadata, words",
+    [
+        ({"format": "pt"}, "expected weights of fpp-ml-bench, got format 'pt'"),
+        ({"version": "2"}, "expected version 1, got '2'"),
+        ({"config": "{"}, "its configuration is not valid"),
+        ({"config": "[]"}, "its configuration is not valid"),
+    ],
+)
+def test_foreign_metadata(saved, metadata, words):
+    with pytest.raises(WeightsError, match=words):
+        read_weights(rewrite(saved, metadata))
+
+
+def test_tensors_that_do_not_fit(saved, network, tmp_path):
+    name = next(iter(network.state_dict()))
+    with pytest.raises(WeightsError, match="tensor extra is none of unet with"):
+        read_weights(rewrite(saved, tensors={"extra": torch.zeros(1)}))
+    tensors = load_file(saved)
+    del tensors["extra"]
+    for broken, words in (
+        ({**tensors, name: tensors[name].half()}, "expected float32 .*got float16"),
+        ({**tensors, name: tensors[name] * float("nan")}, f"tensor {name} holds values that are not finite"),
+        (
+            {**tensors, "range_head.range_mean": torch.tensor([1.0, np.inf])},
+            "tensor range_head.range_mean holds values that are",
+        ),
+        ({key: value for key, value in tensors.items() if key != name}, f"tensor {name} is missing"),
+    ):
+        path = tmp_path / "broken.safetensors"
+        save_file(broken, path, {"format": "fpp-ml-bench", "version": "1", "config": config_with(saved)})
+        with pytest.raises(WeightsError, match=words):
+            read_weights(path)
+
+
+def test_damage_at_every_place(saved):
+    data = saved.read_bytes()
+    for cut in (0, 1, 7, 8, 9, 100, len(data) // 2, len(data) - 1):
+        saved.write_bytes(data[:cut])
+        with pytest.raises(WeightsError, match=r"net\.safetensors: damaged"):
+            read_weights(saved)
+    for foreign in (
+        b"\xff" * 64,
+        b"version https://git-lfs.github.com/spec/v1\n",
+        data + b"\0",
+        b"\x02" + bytes(7) + b"{}",
+    ):
+        saved.write_bytes(foreign)
+        with pytest.raises(WeightsError, match=r"net\.safetensors: (damaged|expected weights of)"):
+            read_weights(saved)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_pickle_is_never_opened(tmp_path, network, zipped):
+    class Trap:
+        def __reduce__(self):
+            return (pytest.fail, ("the pickle was opened",))
+
+    path = tmp_path / "net.pth"
+    torch.save({"model": network.state_dict(), "trap": Trap()}, path, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(WeightsError, match=r"got a PyTorch pickle.*never opened"):
+        read_weights(path)
+
+
+def test_nothing_is_written_that_could_not_be_read(tmp_path, network):
+    diverged = tiny_network()
+    with torch.no_grad():
+        next(diverged.parameters()).fill_(float("inf"))
+    good = config_of(network)
+    for net, config, heads, path, words in (
+        (diverged, good, None, "a.safetensors", "not finite"),
+        (network, config_of(network, options={"width": 8}), None, "a.safetensors", "expected float32"),
+        (network, good, {"b": torch.tensor(float("nan"))}, "a.safetensors", "range_head.b holds values"),
+        (network, good, None, "a.pt", "expected a name that ends in .safetensors"),
+        (network, good, None, "no/such/folder/a.safetensors", "can't be written"),
+    ):
+        with pytest.raises(WeightsError, match=words):
+            save_weights(tmp_path / path, net, config, heads)
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_old_file_survives_a_failed_write(saved, network, monkeypatch):
+    from fpp_ml_bench.loaders.storage import manifest
+
+    before = saved.read_bytes()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(manifest.os, "fsync", full)
+    with pytest.raises(WeightsError, match="No space left"):
+        save_weights(saved, network, config_of(network, epoch=3))
+    assert saved.read_bytes() == before and [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_names_and_paths(saved, monkeypatch, tmp_path):
+    monkeypatch.setattr(weights_file, "SHIPPED", saved.parent)
+    assert weights_path("net") == saved and weights_path(saved) == saved and weights_path(str(saved)) == saved
+    assert weights_path("elsewhere.safetensors").name == "elsewhere.safetensors"
+    with pytest.raises(WeightsError, match=r"no weights called 'nett'.*did you mean 'net'"):
+        weights_path("nett")
+    with pytest.raises(WeightsError, match="'quite-another' come with this package; there are net"):
+        weights_path("quite-another")
+    for path, words in ((tmp_path, "found a folder"), (tmp_path / "no.safetensors", "found nothing")):
+        with pytest.raises(WeightsError, match=words):
+            read_weights(path)
