@@ -18,8 +18,8 @@ from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing, read_result, write_result
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
 WARM_UP = 3

@@ -35,8 +35,9 @@ import trimesh
 from fpp_ml_bench.baselines.phase_route import PhaseRoute
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.render import BuildSettings, build, single_mesh
-from fpp_ml_bench.loaders.storage import DatasetFolder, file_hash
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import paper_rig
 from fpp_ml_bench.skipping import skipping

@@ -1,14 +1,16 @@
-"""Text of unknown origin (names in submissions, file names, JSON values): how it is checked and printed."""
+"""Files of any room: text of unknown origin, bounded reading, atomic writing, hashes, locks, and strict YAML."""
 
 import os
+import re
 import stat
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import BuildError, PredictionError
 
 NAME_LIMIT = 200
 """Longest text a submission may hold in any one value, in characters."""
@@ -80,3 +82,92 @@ def read_bounded(path: Path, limit: int) -> bytes:
     if length != size:
         raise PredictionError(f"ended early: expected {size} bytes, got {length}; write it again")
     return bytes(content)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that it is there complete or not at all, also after a power cut."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def file_hash(path: Path) -> str:
+    """XXH3 128-bit hash of a file's bytes, hex; a memory map, so a file in the page cache goes at memory speed."""
+    import mmap
+
+    import xxhash
+
+    digest = xxhash.xxh3_128()
+    if path.stat().st_size:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            view = memoryview(content)
+            for start in range(0, len(view), 1 << 24):
+                digest.update(view[start : start + (1 << 24)])
+            view.release()
+    return digest.hexdigest()
+
+
+@contextmanager
+def exclusive(lock_file: Path, folder: Path, activity: str) -> Iterator[None]:
+    """Hold ``lock_file``, created with its folder if absent; `BuildError` for ``folder`` if another process has it.
+
+    The operating system releases the lock when the process ends in any way.
+    """
+    import filelock
+
+    lock = filelock.FileLock(lock_file, timeout=0)
+    try:
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except filelock.Timeout:
+        raise BuildError(f"{folder}: another process is {activity}; wait for it or choose another folder") from None
+    except OSError as error:
+        raise BuildError(f"{folder}: can't be written ({error.strerror or error})") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@cache
+def _strict_loader() -> type:
+    import yaml
+
+    class StrictLoader(yaml.SafeLoader):
+        """SafeLoader without aliases, without duplicate keys, and with 1e-3 read as the number it is."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.events.AliasEvent):
+                mark = self.peek_event().start_mark
+                raise yaml.YAMLError(f"line {mark.line + 1} uses an alias (*); write the value out")
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            seen = set()
+            for key, _ in node.value:
+                if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
+                    raise yaml.YAMLError(f"line {key.start_mark.line + 1}: expected text as key")
+                if key.value in seen:
+                    raise yaml.YAMLError(
+                        f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} is given twice"
+                    )
+                seen.add(key.value)
+            return super().construct_mapping(node, deep=deep)
+
+    StrictLoader.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+    )
+    return StrictLoader
+
+
+def strict_yaml(text: str) -> Any:
+    """The plain values of a YAML text. Raises ``yaml.YAMLError``, also for an alias or a key given twice."""
+    import yaml
+
+    return yaml.load(text, _strict_loader())  # a subclass of SafeLoader: builds plain values only

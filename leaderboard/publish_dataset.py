@@ -8,6 +8,7 @@ from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DatasetError, PublishError
+from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.leaderboard.export import markdown_text
 from fpp_ml_bench.leaderboard.publish_tasks import BENCHMARK, FRAMEWORK, SCORE_TEXT, tasks_of
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes
@@ -19,8 +20,6 @@ from fpp_ml_bench.loaders.storage import (
     columns,
     data_shards,
     data_version,
-    file_hash,
-    write_atomically,
     write_shard,
 )
 

@@ -13,8 +13,7 @@ from typing import Literal, get_args
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content
 from fpp_ml_bench.evaluation.schema import StrictModel, validate
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import printable, write_atomically
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"

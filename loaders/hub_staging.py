@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import PublishError
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 
 _IDENTITY, _FILES = "staged.sha256", "files"
 

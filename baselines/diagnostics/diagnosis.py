@@ -21,7 +21,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names, probe
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.machine import describe_hardware
 
 if TYPE_CHECKING:

@@ -125,7 +125,7 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
 
     Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
     """
-    from fpp_ml_bench.loaders.storage import write_atomically
+    from fpp_ml_bench.files import write_atomically
 
     content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)

@@ -22,7 +22,8 @@ from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, sa
 from fpp_ml_bench.baselines.phase_route import Settings
 from fpp_ml_bench.baselines.training import CURVE_FILE, LOG_FILE, training_benchmark, write_log
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
 WEIGHTS_FILE, RECIPE_FILE = "phase-net.safetensors", "recipe.json"

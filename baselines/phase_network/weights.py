@@ -16,8 +16,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from fpp_ml_bench.baselines.training import SUFFIX, TrainingBenchmark, weights_path
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import printable, write_atomically
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.network import PhaseNet

@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.stability.report_html import report_page
 from fpp_ml_bench.baselines.stability.run import Row
 from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.evaluation.result import environment
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 
 PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
 SCHEMA_VERSION = "1.0.0"

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 
 _FORMAT = "fpp-ml-bench training 1"
 State = dict[str, Tensor]

@@ -42,7 +42,7 @@ from fpp_ml_bench.baselines.training.setup import model_config, objective_of, op
 from fpp_ml_bench.baselines.training.validation import validate
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 CHECKPOINT, WEIGHTS, RECIPE, DONE = "checkpoint.safetensors", "weights.safetensors", "recipe.json", "done.json"

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import write_atomically
 
 LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
 Record = dict[str, Any]

@@ -109,7 +109,7 @@ def save_weights(
     }
     _check_finite(path, head_tensors)
     metadata = {"format": FORMAT, "version": VERSION, "config": _CONFIG.dump_json(config).decode("utf-8")}
-    from fpp_ml_bench.loaders.storage import write_atomically
+    from fpp_ml_bench.files import write_atomically
 
     try:
         write_atomically(path, _ordered_header(save({**tensors, **head_tensors}, metadata)))

@@ -5,6 +5,7 @@ from .html import data_uri as data_uri
 from .html import escaped as escaped
 from .html import page as page
 from .html import palette_png as palette_png
+from .html import render as render
 from .numbers import millimetres as millimetres
 from .numbers import percent as percent
 from .numbers import seconds as seconds

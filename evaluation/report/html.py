@@ -11,11 +11,15 @@ import zlib
 from base64 import b64encode
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.files import NAME_LIMIT, printable
+
+if TYPE_CHECKING:
+    import jinja2
 
 _HERE = Path(__file__).resolve().parent
 
@@ -46,6 +50,32 @@ def page(title: str, body: str, style: str = "", script: str = "", description: 
         f'<title>{escaped(title)}</title>\n{meta}<link rel="icon" href="data:,">\n<style>{style}</style>\n</head>\n'
         f'<body>\n<a class="skip" href="#main">Skip to the content</a>\n{body}\n{code}</body>\n</html>\n'
     )
+
+
+def render(package: str, template: str, **values: object) -> str:
+    """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped.
+
+    A template may include or import those of this package's own ``templates`` too. Filters: ``printable``, and the
+    numbers of `fpp_ml_bench.evaluation.report.numbers`. Wrap only HTML that this package made in ``markupsafe.Markup``.
+    """
+    return str(_environment(package).get_template(template).render(values))
+
+
+@cache
+def _environment(package: str) -> "jinja2.Environment":
+    import jinja2
+
+    from fpp_ml_bench.evaluation.report import numbers
+
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p) for p in (package, "fpp_ml_bench.evaluation.report")]),
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )  # fmt: skip
+    environment.filters["printable"] = printable
+    for name in ("millimetres", "percent", "seconds", "signed", "interval_text"):
+        environment.filters[name] = getattr(numbers, name)
+    return environment
 
 
 def _source(text: str) -> str:

@@ -17,8 +17,7 @@ from fpp_ml_bench.evaluation.report.score_tables import sample_table, score_tabl
 from fpp_ml_bench.evaluation.result import Result, SampleResult
 from fpp_ml_bench.evaluation.score import scored_pair
 from fpp_ml_bench.evaluation.submission import list_folder, reader_for
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.optics import Sequence
 
 Pair = tuple[NDArray[np.floating], NDArray[np.floating]]

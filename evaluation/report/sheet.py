@@ -10,8 +10,7 @@ from fpp_ml_bench.evaluation.report.figures import Panel, colour_table
 from fpp_ml_bench.evaluation.report.html import palette_png
 from fpp_ml_bench.evaluation.report.report_page import ReportedDataset, chosen_panels
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import printable, write_atomically
 
 TILE_PX, GAP_PX = 160, 8
 PLACES = ("Best", "Median", "Worst")

@@ -8,8 +8,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import SchemaVersion
 from fpp_ml_bench.evaluation.result.result_model import Result
 from fpp_ml_bench.evaluation.schema import validate
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import write_atomically
+from fpp_ml_bench.files import printable, write_atomically
 
 MAX_BYTES = 64 * 1024 * 1024
 

@@ -1,6 +1,5 @@
 """``submission.yaml``: the description of a submission, as a strict model."""
 
-import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,37 +10,12 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import printable, strict_yaml
 
 SUBMISSION_FILE = "submission.yaml"
 REPORTS_FILE = "per_sample.json"
 """What a method may report of each sample beside its predictions; it is not scored."""
 MAX_BYTES = 65536
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader without aliases, without duplicate keys, and with 1e-3 read as the number it is."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.events.AliasEvent):
-            mark = self.peek_event().start_mark
-            raise yaml.YAMLError(f"line {mark.line + 1} uses an alias (*); write the value out")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        seen = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: a key must be plain text")
-            if key.value in seen:
-                raise yaml.YAMLError(f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} is given twice")
-            seen.add(key.value)
-        return super().construct_mapping(node, deep=deep)
-
-
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
 
 
 def read_plain(folder: Path) -> dict[Any, Any]:
@@ -70,7 +44,7 @@ def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
             data = stream.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; shorten names and settings")
-        content = yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
+        content = strict_yaml(data.decode("utf-8"))
     except OSError as error:
         raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:

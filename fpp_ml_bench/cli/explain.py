@@ -50,7 +50,7 @@ def explain(args: argparse.Namespace, account: "Callable[[], Explanation]") -> N
     if args.explain_json is not None:
         import json
 
-        from fpp_ml_bench.loaders.storage import write_atomically
+        from fpp_ml_bench.files import write_atomically
 
         text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
         write_atomically(args.explain_json, (text + "\n").encode("utf-8"))

@@ -68,13 +68,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
     from fpp_ml_bench.cli.console import output_width, show
+    from fpp_ml_bench.files import write_atomically
     from fpp_ml_bench.leaderboard.export import markdown, table_json
     from fpp_ml_bench.leaderboard.page import write_page
     from fpp_ml_bench.leaderboard.paper import chosen_tables
     from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, discover, expand, rank, read_entries, shipped_rows
     from fpp_ml_bench.leaderboard.rows import read_entry, write_row
     from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
-    from fpp_ml_bench.loaders.storage import write_atomically
 
     if args.check and args.readme is None:
         raise SubmissionError("--check checks a README; give it with --readme FILE")

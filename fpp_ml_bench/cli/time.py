@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.cli.console import progress_bar, show
     from fpp_ml_bench.cli.method_options import chosen_method
     from fpp_ml_bench.errors import SubmissionError
-    from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
+    from fpp_ml_bench.files import write_atomically
+    from fpp_ml_bench.loaders.storage import DatasetFolder
 
     opened = DatasetFolder(args.dataset)
     method = chosen_method(args, opened)

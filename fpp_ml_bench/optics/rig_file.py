@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Sequence
@@ -135,19 +136,8 @@ def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 def _parse_yaml(text: str) -> object:
     import yaml
 
-    class Loader(yaml.SafeLoader):
-        """SafeLoader that refuses a key given twice; PyYAML silently keeps the last value."""
-
-    def construct(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-        pairs = [(loader.construct_object(k, deep=True), loader.construct_object(v, deep=True)) for k, v in node.value]
-        for key, _ in pairs:
-            if not isinstance(key, str):
-                raise RigError(f"expected text as key, got {key!r}")
-        return _unique_keys(pairs)
-
-    Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, construct)
     try:
-        return yaml.load(text, Loader)  # a subclass of SafeLoader: builds plain values only
+        return strict_yaml(text)
     except (yaml.YAMLError, RecursionError) as error:
         raise RigError(f"malformed YAML: {str(error) or 'nested too deeply'}") from error
 

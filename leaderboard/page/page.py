@@ -12,7 +12,7 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.report import escaped, page
 from fpp_ml_bench.evaluation.result import result_json
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard.export import table_json
 from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group
 from fpp_ml_bench.leaderboard.page.objects import objects_table
@@ -25,7 +25,6 @@ from fpp_ml_bench.leaderboard.paper import PaperTable
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
 from fpp_ml_bench.leaderboard.tradeoff import Tradeoff
-from fpp_ml_bench.loaders.storage import write_atomically
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
 _HERE = Path(__file__).resolve().parent

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard.reproduce.plan import Folders, Job, common_size
-from fpp_ml_bench.loaders.storage import MANIFEST, DatasetFolder, write_atomically
+from fpp_ml_bench.loaders.storage import MANIFEST, DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 
 Report = Callable[[str], object]

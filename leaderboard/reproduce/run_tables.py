@@ -13,6 +13,7 @@ from time import perf_counter
 from fpp_ml_bench.baselines.networks.model import Model, load
 from fpp_ml_bench.baselines.training import SCORING, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
+from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.leaderboard.reproduce.data import open_dataset
 from fpp_ml_bench.leaderboard.reproduce.frames import all_frames_that_hold, score_all_frames, write_all_frames
 from fpp_ml_bench.leaderboard.reproduce.lines import MAIN_KEY, table_lines
@@ -22,7 +23,7 @@ from fpp_ml_bench.leaderboard.reproduce.row import make_row, row_that_holds
 from fpp_ml_bench.leaderboard.reproduce.scored_methods import named_method
 from fpp_ml_bench.leaderboard.reproduce.table import table_markdown
 from fpp_ml_bench.leaderboard.reproduce.train_row import check_machine, check_run_folders, finished_weights, is_trained
-from fpp_ml_bench.loaders.storage import DatasetFolder, exclusive, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Report = Callable[[str], object]
 REASON_LENGTH = 400

@@ -9,9 +9,10 @@ from pathlib import Path
 from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.training import DONE, RECIPE, WEIGHTS, Recipe, TrainingRun
 from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard.reproduce.plan import PREDICTED, Folders, Job, variants
 from fpp_ml_bench.leaderboard.reproduce.row import file_sha256
-from fpp_ml_bench.loaders.storage import DatasetFolder, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 PAPER_PRESET = "paper"
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.evaluation.result import HardwareInfo
+from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.leaderboard.tradeoff.clock import Clock, Rules
 from fpp_ml_bench.leaderboard.tradeoff.journal import Journal
 from fpp_ml_bench.leaderboard.tradeoff.ladder import Ladder, time_ladder
@@ -27,7 +28,7 @@ from fpp_ml_bench.leaderboard.tradeoff.settings import (
     size_settings,
 )
 from fpp_ml_bench.leaderboard.tradeoff.views import StoredViews, choose_views
-from fpp_ml_bench.loaders.storage import DatasetFolder, exclusive
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
 VIEWS_AN_OBJECT, QUICK_VIEWS = 2, 1

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import write_json
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard.tradeoff.figure import draw_growth, draw_sizes, draw_tradeoff
 from fpp_ml_bench.leaderboard.tradeoff.points import SLOWED, TRADEOFF_FILE, Growth, Point, Tradeoff, failures
-from fpp_ml_bench.loaders.storage import write_atomically
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -13,7 +13,6 @@ from .exporting import MESH_FOLDER as MESH_FOLDER
 from .exporting import SAMPLE_FORMS as SAMPLE_FORMS
 from .exporting import chosen_splits as chosen_splits
 from .exporting import export as export
-from .folder_lock import exclusive as exclusive
 from .joined import load_dataset as load_dataset
 from .manifest import GENERATED as GENERATED
 from .manifest import MANIFEST as MANIFEST
@@ -21,9 +20,7 @@ from .manifest import WORK_FOLDER as WORK_FOLDER
 from .manifest import Manifest as Manifest
 from .manifest import ShardFile as ShardFile
 from .manifest import describe_file as describe_file
-from .manifest import file_hash as file_hash
 from .manifest import read_manifest as read_manifest
-from .manifest import write_atomically as write_atomically
 from .shards import Row as Row
 from .shards import ShardPlan as ShardPlan
 from .shards import ShardWriter as ShardWriter

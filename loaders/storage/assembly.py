@@ -19,16 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.folder_lock import writing
-from fpp_ml_bench.loaders.storage.manifest import (
-    MANIFEST,
-    Manifest,
-    ShardFile,
-    describe_file,
-    file_hash,
-    write_atomically,
-)
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST, Manifest, ShardFile, describe_file
 from fpp_ml_bench.loaders.storage.shards import ShardPlan
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import THREAD_COUNTS

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, features, group_columns, stored_groups
-from fpp_ml_bench.loaders.storage.manifest import Manifest, write_atomically
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 
 RIG_FILE = "rig.yaml"
 CARD_HEAD = """\

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.loaders.storage.folder_lock import exclusive
+from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 
 _LOCK = ".lock"

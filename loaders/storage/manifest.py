@@ -5,7 +5,6 @@ builds of the same settings: no date, no path, no machine.
 """
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -14,6 +13,7 @@ from typing import Any
 
 from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import file_hash, write_atomically
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
@@ -114,35 +114,6 @@ def read_manifest(folder: Path) -> Manifest:
     if actual != claimed:
         raise DatasetError(f"{path}: damaged, its fingerprint does not match its content; build the dataset again")
     return manifest
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is there complete or not at all, also after a power cut."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def file_hash(path: Path) -> str:
-    """XXH3 128-bit hash of a file's bytes, hex; a memory map, so a file in the page cache goes at memory speed."""
-    import mmap
-
-    import xxhash
-
-    digest = xxhash.xxh3_128()
-    if path.stat().st_size:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            view = memoryview(content)
-            for start in range(0, len(view), 1 << 24):
-                digest.update(view[start : start + (1 << 24)])
-            view.release()
-    return digest.hexdigest()
 
 
 def describe_file(folder: Path, path: Path) -> OtherFile:

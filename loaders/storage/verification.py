@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
     DEPTH,
@@ -20,15 +21,7 @@ from fpp_ml_bench.loaders.sample import (
     group_columns,
     stored_groups,
 )
-from fpp_ml_bench.loaders.storage.manifest import (
-    GENERATED,
-    MANIFEST,
-    Manifest,
-    ShardFile,
-    dataset_files,
-    file_hash,
-    read_manifest,
-)
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MANIFEST, Manifest, ShardFile, dataset_files, read_manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics import Sequence
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, arrow_schema, config_columns
 from fpp_ml_bench.loaders.sample import features as array_features
-from fpp_ml_bench.loaders.storage.manifest import ShardFile, file_hash
+from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.loaders.storage.parquet import all_columns
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 

@@ -10,8 +10,9 @@ from synthetic import make
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.storage import shards as writing
-from fpp_ml_bench.loaders.storage.manifest import ShardFile, file_hash, read_manifest
+from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify
 

@@ -16,6 +16,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.tradeoff import report as tradeoff_report
 from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
@@ -26,7 +27,6 @@ from fpp_ml_bench.leaderboard.tradeoff.points import Point, Tradeoff, read_trade
 from fpp_ml_bench.leaderboard.tradeoff.precision import DecodeInType
 from fpp_ml_bench.leaderboard.tradeoff.report import remarks, write_report
 from fpp_ml_bench.leaderboard.tradeoff.views import choose_views
-from fpp_ml_bench.loaders.storage import exclusive
 
 QUICK = Rules(runs=3, limit_s=0.05)
 
