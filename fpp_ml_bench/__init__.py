@@ -2,7 +2,7 @@
 
 The front door is the seven functions of `fpp_ml_bench.api`. Behind it: ``optics`` and ``decoding`` (rig, patterns,
 phase, triangulation), then the subpackages ``loaders <- evaluation <- baselines <- leaderboard``; each imports only the
-core and those to its left. Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes a few milliseconds.
+core and those to its left. Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes milliseconds.
 """
 
 import sys as _sys

@@ -46,8 +46,9 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     Returns
     -------
     datasets.Dataset or datasets.DatasetDict
-        Columns ``sample``, ``object``, ``view``, ``split``; a uint8 (H, W) column ``frame_NN`` for each frame; ``depth``
-        and, for generated data, ``depth_exact`` (float32 (H, W), mm, 0 = background); ``depth_min``, ``depth_max`` (mm).
+        Columns ``sample``, ``object``, ``view``, ``split``; a uint8 (H, W) column ``frame_NN`` for each frame;
+        ``depth`` and, for generated data, ``depth_exact`` (float32 (H, W), mm, 0 = background); ``depth_min`` and
+        ``depth_max`` (mm).
 
     Raises
     ------
