@@ -26,7 +26,9 @@ Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
 Refusals = type[Exception] | tuple[type[Exception], ...]
 
-U64, U32, U16, UB16 = 2.0**-53, 2.0**-24, 2.0**-11, 2.0**-8
+Floats, Mask = NDArray[np.float64], NDArray[np.bool_]
+
+U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
 
 MODULES = {
@@ -248,13 +250,13 @@ def high_precision() -> Any:
     return context
 
 
-def difference(values: NDArray, exact: Iterable[Any]) -> NDArray[np.float64]:
+def difference(values: NDArray, exact: Iterable[Any]) -> Floats:
     """``values`` (n,) minus high-precision numbers, subtracted before it is rounded."""
     context = high_precision()
     return np.array([float(context.mpf(float(a)) - b) for a, b in zip(values, exact, strict=True)])
 
 
-def rounded(values: Iterable[Any]) -> NDArray[np.float64]:
+def rounded(values: Iterable[Any]) -> Floats:
     """High-precision numbers rounded once to float64."""
     return np.array([float(value) for value in values])
 

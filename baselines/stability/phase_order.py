@@ -6,10 +6,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.stability.cases import (
     U64,
     Expects,
+    Floats,
     Group,
+    Mask,
     Outcome,
     difference,
     high_precision,
@@ -18,35 +21,7 @@ from fpp_ml_bench.baselines.stability.cases import (
 )
 from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import (
-    MIN_MODULATION,
-    Limits,
-    Reason,
-    choose_steps,
-    decode_direction,
-    decode_stack,
-    minus_atan2,
-    phase_weights,
-    plan_direction,
-    wrapped_phase,
-)
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.optics import (
-    DIRECTIONS,
-    INCONSISTENT_RAD,
-    Direction,
-    Pinhole,
-    Rig,
-    Sequence,
-    absolute_phase,
-    binary_to_gray,
-    bits_needed,
-    cell_centres_rad,
-    cell_count,
-    cell_of,
-    gray_to_binary,
-    paper_rig,
-)
 
 PHASE, ORDER = Group("phase"), Group("order")
 MEAN, MODULATION = 127.5, 100.0
@@ -55,12 +30,12 @@ SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 NOISE_GREY = 1.0
 
 
-def phases(count: int = 720) -> NDArray[np.float64]:
+def phases(count: int = 720) -> Floats:
     """Phases over the whole circle in rad, none of them a special value."""
     return -np.pi + 2 * np.pi * (np.arange(count) + 0.3819) / count
 
 
-def shifts(steps: int) -> NDArray[np.float64]:
+def shifts(steps: int) -> Floats:
     """Equal phase shifts 2 pi n / N."""
     return 2 * np.pi * np.arange(steps) / steps
 
@@ -75,9 +50,9 @@ def grey(values: NDArray) -> NDArray[np.uint8]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def phase_error(frames: NDArray, phase: NDArray, deltas: NDArray | None = None) -> NDArray[np.float64]:
+def phase_error(frames: NDArray, phase: NDArray, deltas: NDArray | None = None) -> Floats:
     """Error of the wrapped phase of frames in rad, on the circle."""
-    return np.angle(np.exp(1j * (wrapped_phase(frames, deltas).phase[0] - phase)))
+    return np.angle(np.exp(1j * (decoding.wrapped_phase(frames, deltas).phase[0] - phase)))
 
 
 def frame_gain(steps: int) -> float:
@@ -93,25 +68,25 @@ def worst_angle(shift: float, modulation: float = MODULATION) -> float:
     return math.asin(shift / modulation) if shift < modulation else math.pi
 
 
-def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: int | None = None) -> Rig:
+def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: int | None = None) -> optics.Rig:
     """The paper's rig with another pitch and number of steps, and as many Gray bits as these need."""
-    rig = paper_rig(size)
+    rig = optics.paper_rig(size)
     device = rig.projector
     if length is not None:
         focal = device.fx * length / device.width
-        device = Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
-    bits_v, bits_u = (bits_needed(side, pitch_px) for side in (device.height, device.width))
-    sequence = Sequence(steps, bits_v, bits_u)
-    return Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
+        device = optics.Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
+    bits_v, bits_u = (optics.bits_needed(side, pitch_px) for side in (device.height, device.width))
+    sequence = optics.Sequence(steps, bits_v, bits_u)
+    return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
 def direction_levels(
-    rig: Rig,
+    rig: optics.Rig,
     coordinate_px: NDArray,
-    direction: Direction = "vertical",
+    direction: optics.Direction = "vertical",
     mean: float = MEAN,
     modulation: float = MODULATION,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,); float64 (N + bits, n).
 
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to.
@@ -119,20 +94,20 @@ def direction_levels(
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
     angle = 2 * np.pi * coordinate_px / pitch
     waves = sinusoids(angle, shifts(rig.sequence.steps), mean, modulation)[:, 0]
-    code = binary_to_gray(cell_of(np.rint(coordinate_px), pitch))
+    code = optics.binary_to_gray(optics.cell_of(np.rint(coordinate_px), pitch))
     bright = np.stack([(code >> (bits - 1 - bit)) & 1 for bit in range(bits)])
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
 
 def plane_stack(
-    rig: Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
-) -> tuple[list[NDArray[np.uint8] | None], dict[Direction, NDArray[np.float64]]]:
+    rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
+) -> tuple[list[NDArray[np.uint8] | None], dict[optics.Direction, Floats]]:
     """All frames of a plane square to the axis, and its exact projector coordinates by direction, (H, W)."""
     x, y = rig.camera.rays()
     u, v = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
-    exact: dict[Direction, NDArray[np.float64]] = {"vertical": u, "horizontal": v}
+    exact: dict[optics.Direction, Floats] = {"vertical": u, "horizontal": v}
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
-    for direction in DIRECTIONS:
+    for direction in optics.DIRECTIONS:
         levels = grey(direction_levels(rig, exact[direction].ravel(), direction, mean, modulation))
         indices = [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)]
         for index, level in zip(indices, levels, strict=True):
@@ -140,22 +115,28 @@ def plane_stack(
     return frames, exact
 
 
-def inside_pattern(rig: Rig, exact: dict[Direction, NDArray[np.float64]]) -> NDArray[np.bool_]:
+def inside_pattern(rig: optics.Rig, exact: dict[optics.Direction, Floats]) -> Mask:
     """The pixels more than 3 px inside the projector's image."""
     u, v = exact["vertical"], exact["horizontal"]
     return (u > 3) & (u < rig.projector.width - 4) & (v > 3) & (v < rig.projector.height - 4)
 
 
-def coordinate_error(rig: Rig, levels: NDArray, exact_px: NDArray) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, Mask]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
-    plan = plan_direction(rig, "vertical", rig.sequence.steps, Limits())
-    decoded = decode_direction(grey(levels), plan, Limits())
-    return decoded.coordinate_px - exact_px, decoded.reason != Reason.DECODED
+    plan = decoding.plan_direction(rig, "vertical", rig.sequence.steps, decoding.Limits())
+    decoded = decoding.decode_direction(grey(levels), plan, decoding.Limits())
+    return decoded.coordinate_px - exact_px, decoded.reason != decoding.Reason.DECODED
+
+
+def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: float | NDArray = 0.0) -> Outcome:
+    """The outcome of coordinates with the error of 8-bit frames and of ``rounding_px``."""
+    error_px, flagged = coordinate_error(rig, levels, exact_px)
+    return worst(error_px, _rounding_px(rig) + rounding_px, flagged)
 
 
 def _decoded_phase(
     mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Floats, Mask]:
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
     rig, rng = coded_rig(), np.random.default_rng(7)
     positions_px = _positions_px(rig, count)
@@ -166,11 +147,11 @@ def _decoded_phase(
     return error_px * 2 * np.pi / rig.pitch("vertical"), flagged
 
 
-def _positions_px(rig: Rig, count: int) -> NDArray[np.float64]:
+def _positions_px(rig: optics.Rig, count: int) -> Floats:
     return np.linspace(2.0, rig.pattern_length("vertical") - 1 - 2.0, count)
 
 
-def _rounding_px(rig: Rig) -> float:
+def _rounding_px(rig: optics.Rig) -> float:
     """Largest error of a coordinate in px by rounding frames to whole grey levels."""
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(0.5 * frame_gain(rig.sequence.steps))
 
@@ -197,14 +178,14 @@ def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     exact = _exact_phase(frames, [2 * mp.pi * n / steps for n in range(steps)])
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
-    return worst(difference(wrapped_phase(frames).phase[0], exact), bound, condition=condition)
+    return worst(difference(decoding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
 def _expects_modulation(modulation: float) -> Expects:
     shift = 0.5 * frame_gain(18)
-    if modulation + shift < MIN_MODULATION:
+    if modulation + shift < decoding.MIN_MODULATION:
         return "refusal"
-    return "number" if modulation - shift >= MIN_MODULATION else "either"
+    return "number" if modulation - shift >= decoding.MIN_MODULATION else "either"
 
 
 @PHASE.family("modulation, 8-bit frames", "rad", expects=_expects_modulation, modulation=MODULATIONS)
@@ -212,16 +193,16 @@ def modulation_8bit(modulation: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: asin(g /
     2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused"""
     shift = 0.5 * frame_gain(18)
-    may_flag = 0.0 if modulation - shift >= MIN_MODULATION else 1.0
+    may_flag = 0.0 if modulation - shift >= decoding.MIN_MODULATION else 1.0
     error, flagged = _decoded_phase(modulation=modulation)
     return worst(error, worst_angle(shift, modulation), flagged, may_flag)
 
 
 def _expects_noise(modulation: float) -> Expects:
     sigma = math.sqrt(2 / 18) * math.hypot(NOISE_GREY, math.sqrt(1 / 12))
-    if modulation + 6 * sigma < MIN_MODULATION:
+    if modulation + 6 * sigma < decoding.MIN_MODULATION:
         return "refusal"
-    return "number" if modulation - 6 * sigma > MIN_MODULATION else "either"
+    return "number" if modulation - 6 * sigma > decoding.MIN_MODULATION else "either"
 
 
 @PHASE.family("modulation, noise of 1 grey level", "rad", expects=_expects_noise, modulation=MODULATIONS)
@@ -232,7 +213,7 @@ def noise(modulation: float) -> Outcome:
     sigma = math.sqrt(2 / 18) * math.hypot(NOISE_GREY, math.sqrt(1 / 12)) / modulation
     unflagged = error[~flagged]
     # Up to six sigma of noise above the limit of the modulation, pixels may be flagged.
-    may_flag = 0.0 if modulation > MIN_MODULATION + 6 * sigma * modulation else 1.0
+    may_flag = 0.0 if modulation > decoding.MIN_MODULATION + 6 * sigma * modulation else 1.0
     if not unflagged.size:
         return Outcome(None, flagged=1.0, note="every pixel is masked: low modulation")
     bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * unflagged.size))
@@ -319,7 +300,7 @@ def few_steps(steps: int) -> Outcome:
 def uneven_steps(chosen: int) -> Outcome:
     """wrapped phase of this number of 18 steps, 8-bit frames; against the phase that the frames were made from; bound:
     asin(g' / 2B), g' = max over directions of sum |least-squares weight|"""
-    deltas = 2 * np.pi * np.array(choose_steps(18, chosen)) / 18
+    deltas = 2 * np.pi * np.array(decoding.choose_steps(18, chosen)) / 18
     model = np.stack([np.ones(chosen), np.cos(deltas), np.sin(deltas)], axis=1)
     solve = np.linalg.inv(model.T @ model) @ model.T
     turn = np.linspace(0, np.pi, 3601)
@@ -337,7 +318,7 @@ def close_steps(spread_rad: float) -> Outcome:
     B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused"""
     deltas = np.array([0.0, spread_rad, 2 * spread_rad])
     frames = sinusoids(phases(48), deltas)
-    measured = wrapped_phase(frames, deltas).phase[0]
+    measured = decoding.wrapped_phase(frames, deltas).phase[0]
     mp = high_precision()
     exact = _exact_phase(frames, [mp.mpf(float(delta)) for delta in deltas])
     model = np.stack([np.ones(3), np.cos(deltas), np.sin(deltas)], axis=1)
@@ -352,7 +333,7 @@ def close_steps(spread_rad: float) -> Outcome:
 def equal_shifts() -> Outcome:
     """weights of the shifts 0, 1, 1 rad; against there is no such phase; bound: two different shifts do not determine
     the phase"""
-    phase_weights([0.0, 1.0, 1.0])
+    decoding.phase_weights([0.0, 1.0, 1.0])
     return Outcome(0.0)
 
 
@@ -364,7 +345,7 @@ def dead_frame(steps: int, level: int) -> Outcome:
     frames, _ = plane_stack(rig, mean=120.0)
     dead = rig.sequence.sinusoids("vertical")[1]
     frames[dead] = np.full((32, 32), level, np.uint8)
-    depth = decode_stack(frames, rig).depth_mm
+    depth = decoding.decode_stack(frames, rig).depth_mm
     # The epipolar check allows 1.5 px across the line, and e px of u alone are e sin(alpha) across.
     tx, ty, _ = rig.translation_m
     slip_px = 1.5 / (abs(ty) / math.hypot(tx, ty))
@@ -397,8 +378,7 @@ def pitch(pitch_px: float) -> Outcome:
     2B) over the whole pattern; under 4 px or beyond the pattern refused"""
     rig = coded_rig(pitch_px)
     positions_px = _positions_px(rig, 20_000)
-    error_px, flagged = coordinate_error(rig, direction_levels(rig, positions_px), positions_px)
-    return worst(error_px, _rounding_px(rig), flagged)
+    return _decoded(rig, direction_levels(rig, positions_px), positions_px)
 
 
 @ORDER.family("on a Gray edge", "px", pitch_px=(4.0, 18.0, 37.3), blend=(0.0, 0.25, 0.5, 0.75, 1.0))
@@ -407,13 +387,12 @@ def edge_blend(pitch_px: float, blend: float) -> Outcome:
     made from; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
     rig = coded_rig(pitch_px)
     length, half = rig.pattern_length("vertical"), pitch_px / 2
-    edges = np.ceil(np.arange(1, cell_count(length, pitch_px)) * half)
+    edges = np.ceil(np.arange(1, optics.cell_count(length, pitch_px)) * half)
     positions_px = edges - 1 + blend  # between the last pixel of a cell and the first of the next
     levels, steps = direction_levels(rig, positions_px), rig.sequence.steps
     below, above = (direction_levels(rig, px)[steps:] for px in (edges - 1, edges))
     levels[steps:] = (1 - blend) * below + blend * above
-    error_px, flagged = coordinate_error(rig, levels, positions_px)
-    return worst(error_px, _rounding_px(rig), flagged)
+    return _decoded(rig, levels, positions_px)
 
 
 @ORDER.family("phase at +-pi", "px", pitch_px=(4.0, 18.0, 100.0), bit_noise=(0.0, 0.7))
@@ -425,8 +404,7 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
     positions_px = (np.arange(periods) + 0.5) * pitch_px  # where the sign of the sine is arbitrary
     levels, steps = direction_levels(rig, positions_px), rig.sequence.steps
     levels[steps:] += bit_noise * MODULATION * np.random.default_rng(1).uniform(-1, 1, levels[steps:].shape)
-    error_px, flagged = coordinate_error(rig, levels, positions_px)
-    return worst(error_px, _rounding_px(rig), flagged)
+    return _decoded(rig, levels, positions_px)
 
 
 _PI = 3.141592653589793
@@ -439,17 +417,17 @@ _PI = 3.141592653589793
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
-    rig = paper_rig(32)
-    centres = cell_centres_rad(rig.pattern_length("vertical"), rig.pitch("vertical"))
+    rig = optics.paper_rig(32)
+    centres = optics.cell_centres_rad(rig.pattern_length("vertical"), rig.pitch("vertical"))
     cells = np.arange(len(centres), dtype=np.int32)
-    absolute, agrees = absolute_phase(np.full(len(cells), phase_rad), cells, centres)
+    absolute, agrees = optics.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
     mp = high_precision()
     exact = []
     for centre in centres:
         order = mp.floor((mp.mpf(float(centre)) - mp.mpf(phase_rad)) / (2 * mp.pi) + mp.mpf(0.5))
         exact.append(mp.mpf(phase_rad) + 2 * mp.pi * order)
     near = np.array([abs(float(value) - centre) for value, centre in zip(exact, centres, strict=True)])
-    may_flag = float(np.mean(near > INCONSISTENT_RAD - 1e-9))
+    may_flag = float(np.mean(near > optics.INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
 
@@ -468,7 +446,7 @@ def arctangent(scale: float, code: str) -> Outcome:
 
         phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:
-        phase = minus_atan2(sine, cosine)
+        phase = decoding.minus_atan2(sine, cosine)
     mp = high_precision()
     exact = [-mp.atan2(mp.mpf(float(a)), mp.mpf(float(b))) for a, b in zip(sine, cosine, strict=True)]
     error = difference(phase, exact)
@@ -482,14 +460,14 @@ def order_range() -> Outcome:
     """-atan2 of signed zeros and the smallest sines at a negative cosine; against the interval [-pi, pi); bound: exact:
     +pi is mapped to -pi"""
     sine, cosine = np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0, -1.0, -1.0, -1.0, -1e-300])
-    phase = minus_atan2(sine, cosine)
+    phase = decoding.minus_atan2(sine, cosine)
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 
 @ORDER.family(
     "flipped bit, both directions", "mm", expects="either", direction=("vertical", "horizontal"), bit=range(7)
 )
-def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
+def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
     """depth of a plane with one Gray bit inverted in the whole image; against the plane, 1800 mm; bound: 8-bit frames,
     by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line"""
     rig = coded_rig(size=96)
@@ -498,10 +476,10 @@ def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
     turned_over = frames[flipped]
     frames[flipped] = None if turned_over is None else 255 - turned_over
     inside = inside_pattern(rig, exact)
-    decoded = decode_stack(frames, rig, mask=inside)
+    decoded = decoding.decode_stack(frames, rig, mask=inside)
     per_metre = rig.projector.fx * rig.translation_m[0] / 1.8**2
     bound_mm = _rounding_px(rig) / per_metre * MM_PER_M * np.sqrt(2) * 1.01
-    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != Reason.DECODED, 1.0)
+    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != decoding.Reason.DECODED, 1.0)
 
 
 @ORDER.family("flipped bit, one direction", "px", expects="either", bit=range(7))
@@ -515,17 +493,17 @@ def flipped_bit_alone(bit: int) -> Outcome:
     row = rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
     cells = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int)
-    read = np.asarray(gray_to_binary(binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
-    centres = cell_centres_rad(912, pitch)
+    read = np.asarray(optics.gray_to_binary(optics.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
+    centres = optics.cell_centres_rad(912, pitch)
     centre = centres[np.minimum(read, len(centres) - 1)]
     absolute = positions_px * 2 * np.pi / pitch
     slip = np.floor((centre - absolute) / (2 * np.pi) + 0.5)
     slipped_px = positions_px + pitch * slip
     off = np.abs(absolute + 2 * np.pi * slip - centre)
-    refused = (read >= len(centres)) | (off > INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
+    refused = (read >= len(centres)) | (off > optics.INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
     error, flagged = coordinate_error(rig, levels, slipped_px)
     # Within half a grey level of a limit both results are correct.
-    wrong_flag = (flagged != refused) & ~(np.abs(off - INCONSISTENT_RAD) < 0.01)
+    wrong_flag = (flagged != refused) & ~(np.abs(off - optics.INCONSISTENT_RAD) < 0.01)
     silent = float(np.mean(~flagged & (slip != 0)))
     note = f"{silent:.0%} of the pixels are wrong by whole periods, which only both directions together can detect"
     return worst(np.where(wrong_flag, np.inf, error), _rounding_px(rig), flagged & ~wrong_flag, 1.0, note=note)
@@ -534,16 +512,16 @@ def flipped_bit_alone(bit: int) -> Outcome:
 @ORDER.family("more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6))
 def too_few_codes(bits: int) -> Outcome:
     """a rig of 51 periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat"""
-    rig = paper_rig(32)
-    Rig(rig.camera, rig.projector, rig.rotation, rig.translation_m, 18.0, 18.0, Sequence(18, 7, bits))
+    rig = optics.paper_rig(32)
+    optics.Rig(rig.camera, rig.projector, rig.rotation, rig.translation_m, 18.0, 18.0, optics.Sequence(18, 7, bits))
     return Outcome(0.0)
 
 
 @ORDER.family("cell off the pattern", "px", expects="refusal", cell=(102, 103, 111, 127))
 def cell_off_pattern(cell: int) -> Outcome:
     """a pixel whose code names a cell beyond the pattern; against there is no such cell; bound: must be masked"""
-    rig = paper_rig(32)
-    code = int(binary_to_gray(cell))
+    rig = optics.paper_rig(32)
+    code = int(optics.binary_to_gray(cell))
     bits = np.array([(code >> (6 - bit)) & 1 for bit in range(7)], float)
     waves = sinusoids(np.linspace(-3, 3, 50), shifts(rig.sequence.steps))[:, 0]
     levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2 * bits[:, None] - 1), 50, axis=1)])
@@ -557,5 +535,4 @@ def code_length(bits: int) -> Outcome:
     # 15 bits fill the compiled decoder's 16-bit integers.
     rig = coded_rig(4.0, steps=3, length=min(65536, 2**bits * 2))
     positions_px = np.arange(2**bits) * 2 + 0.5
-    error_px, flagged = coordinate_error(rig, direction_levels(rig, positions_px), positions_px)
-    return worst(error_px, _rounding_px(rig) + 8 * U64 * positions_px, flagged)
+    return _decoded(rig, direction_levels(rig, positions_px), positions_px, 8 * U64 * positions_px)

@@ -5,18 +5,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.baselines.stability.cases import U64, Group, Outcome, masked, worst, wrong
+from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, masked, worst, wrong
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render import (
-    Hits,
-    Lighting,
-    PixelRays,
-    SolidMesh,
-    TracedObject,
-    light_surface,
-    place,
-    projector_centre_m,
-)
+from fpp_ml_bench.loaders import render
 from fpp_ml_bench.optics import paper_rig
 
 SCENES = Group("scenes")
@@ -27,19 +18,19 @@ EDGE_PX = 1e-9
 over, at 419 px focal length."""
 
 
-def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> Hits:
+def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> render.Hits:
     """What the camera sees of a mesh, of a quadrilateral without ``faces``."""
     vertices = np.asarray(vertices_m, dtype=np.float64)
-    mesh = SolidMesh("mesh", vertices, np.asarray(faces, dtype=np.int32))
-    return TracedObject(mesh, vertices).primary(PixelRays.of(RIG.camera))
+    mesh = render.SolidMesh("mesh", vertices, np.asarray(faces, dtype=np.int32))
+    return render.TracedObject(mesh, vertices).primary(render.PixelRays.of(RIG.camera))
 
 
-def rays_of(hits: Hits) -> tuple[NDArray[np.float64], ...]:
+def rays_of(hits: render.Hits) -> tuple[Floats, ...]:
     """x and y of the rays that hit, at z = 1."""
     return tuple(axis.ravel()[hits.pixels] for axis in RIG.camera.rays())
 
 
-def image(hits: Hits) -> NDArray[np.float64]:
+def image(hits: render.Hits) -> Floats:
     """Depth (H, W) in metres, 0 = nothing."""
     depth = np.zeros(RIG.camera.width * RIG.camera.height)
     depth[hits.pixels] = hits.depth_m
@@ -100,7 +91,7 @@ def needle(width_px: float, centre_px: float) -> Outcome:
     return worst([missing + extra, np.abs(hits.depth_m - 1.8).max(initial=0.0)], [0.0, 64 * U64])
 
 
-def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[Floats, NDArray[np.int32]]:
     import trimesh
 
     mesh = trimesh.creation.icosphere(subdivisions, radius_m)
@@ -215,7 +206,8 @@ def misplaced(name: str) -> Outcome:
     """placing an object that does not fit range and image; against there is no such sample; bound: must be refused"""
     radius_m, aside_m = _MISPLACED[name]
     vertices, faces = _ball(1, radius_m)
-    place(SolidMesh("mesh", vertices - AHEAD_M + np.array([aside_m, 0.0, 0.0]), faces), "A0", RIG, "fixed", 0)
+    mesh = render.SolidMesh("mesh", vertices - AHEAD_M + np.array([aside_m, 0.0, 0.0]), faces)
+    render.place(mesh, "A0", RIG, "fixed", 0)
     return Outcome(0.0)
 
 
@@ -229,7 +221,7 @@ def behind_camera() -> Outcome:
 @SCENES.family("light at distance 0", "grey")
 def light_at_projector() -> Outcome:
     """light on a point in the projector's centre; against finite and not negative; bound: must be finite"""
-    centre = projector_centre_m(RIG)
+    centre = render.projector_centre_m(RIG)
     points = np.array([centre, centre + 1e-200 * AHEAD_M, centre + 1e-6 * AHEAD_M, 0.0 * AHEAD_M, AHEAD_M])
-    gain = light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, Lighting()).gain
+    gain = render.light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, render.Lighting()).gain
     return worst(np.where(np.isfinite(gain) & (gain >= 0), 0.0, math.inf))

@@ -6,28 +6,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.stability.cases import (
-    U32,
-    U64,
-    Group,
-    Outcome,
-    gamma,
-    high_precision,
-    worst,
-    wrong,
-)
+from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, high_precision, worst, wrong
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.score import (
-    BLOCK,
-    EMPTY,
-    ErrorStats,
-    combine,
-    mean_of,
-    score_sample,
-    scored_pair,
-    stats_of,
-)
+from fpp_ml_bench.evaluation import score
 
 NORMALISATION, METRICS = Group("normalisation"), Group("metrics")
 NAMES = ("raw", "global", "individual")
@@ -36,12 +18,13 @@ SPANS = (1e-6, 1e-3, 1.0, 200.0, 1e3, 1e6)
 LIKELY = 6.0
 """Roundings of unrelated numbers add up like a random walk: n of them stay within 6 sqrt(n) u but for one case in a
 hundred million (Higham and Mary 2019). Where the numbers are all alike the worst case n u is used."""
+RANDOM = LIKELY * math.sqrt(score.BLOCK)
 _TINY = 2.0**-149
 _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
 _SIDE = 100
 
 
-def depth_map(kind: str, low_mm: float, span_mm: float) -> NDArray[np.float64]:
+def depth_map(kind: str, low_mm: float, span_mm: float) -> Floats:
     """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm + span_mm``."""
     depth = np.zeros((24, 24))
     if kind == "one pixel":
@@ -147,13 +130,13 @@ def scored(kind: str, mode: str) -> Outcome:
     target = depth_map(kind, 1700.0, 200.0).astype(np.float32)
     inside = object_mask(target)
     values = np.where(inside, np.float32(0.5), np.float32(0.0))
-    prediction, _ = scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
+    prediction, _ = score.scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
     low, high = _range(target)
     exact = 0.5 * (high - low) + (low if mode == "standard" else 0.0)
     return worst(prediction[inside] - exact, 4 * U64 * high) if inside.any() else worst(prediction)
 
 
-def _exact(*parts: tuple[NDArray[np.float64], int]) -> tuple[float, float]:
+def _exact(*parts: tuple[Floats, int]) -> tuple[float, float]:
     """MAE and RMSE of arrays repeated so many times: exact sums (integers of 2^-1074) in 50 digits."""
     mp = high_precision()
     mp.prec = 2300  # every product of two float64, added without rounding
@@ -167,7 +150,7 @@ def _exact(*parts: tuple[NDArray[np.float64], int]) -> tuple[float, float]:
     return float(absolute / pixels), float(mp.sqrt(squares / pixels))
 
 
-def _compared(stats: ErrorStats, exact: tuple[float, float], operations: float = LIKELY * math.sqrt(BLOCK)) -> Outcome:
+def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: float = RANDOM) -> Outcome:
     """Relative errors of MAE and RMSE; below the normal numbers a whole last place counts."""
     if stats.mae_mm is None or stats.rmse_mm is None:
         return wrong("no score of pixels that there are")
@@ -188,14 +171,14 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
     levels = scale_mm * rng.lognormal(0, 3, 64)
     kinds = [levels[rng.integers(0, 64, _STREAM_BLOCK)] for _ in range(_STREAM_KINDS)]
     blocks = round(pixels / _STREAM_BLOCK)
-    states = [stats_of(kind) for kind in kinds]
-    total = EMPTY
+    states = [score.stats_of(kind) for kind in kinds]
+    total = score.EMPTY
     for number in range(blocks):
-        total = combine(total, states[number % _STREAM_KINDS])
+        total = score.combine(total, states[number % _STREAM_KINDS])
     times = [blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)]
     if total.pixels != blocks * _STREAM_BLOCK:
         return wrong(f"{total.pixels} pixels counted, {blocks * _STREAM_BLOCK} streamed")
-    return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(BLOCK + 6 * blocks))
+    return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(score.BLOCK + 6 * blocks))
 
 
 @METRICS.family(
@@ -207,7 +190,7 @@ def magnitude(scale_mm: float) -> Outcome:
     """MAE and RMSE of 20,000 errors up to 999 x scale_mm; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
     in float64, random roundings; blocks are added exactly; squares above 1e308 refused"""
     errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000)
-    return _compared(stats_of(errors), _exact((errors, 1)))
+    return _compared(score.stats_of(errors), _exact((errors, 1)))
 
 
 @METRICS.family("mixed magnitudes", "relative", low_mm=(1e-30, 1e-6), high_mm=(1e-5, 1.0, 1e30))
@@ -216,7 +199,7 @@ def mixed(low_mm: float, high_mm: float) -> Outcome:
     in float64, random roundings; blocks are added exactly"""
     levels = np.logspace(math.log10(low_mm), math.log10(high_mm), 300)
     errors = np.random.default_rng(4).choice(levels, 30_000)
-    return _compared(stats_of(errors), _exact((errors, 1)))
+    return _compared(score.stats_of(errors), _exact((errors, 1)))
 
 
 @METRICS.family("one large error", "relative", large_mm=(1.0, 1.7e7, 1e8, 1e12, 1e16))
@@ -225,7 +208,7 @@ def one_large(large_mm: float) -> Outcome:
     case; blocks are added exactly"""
     errors = np.ones(10_000_000)  # summed naively in float32 the small ones vanish from 2^24 on
     errors[0] = large_mm
-    return _compared(stats_of(errors), _exact((errors, 1)), BLOCK)
+    return _compared(score.stats_of(errors), _exact((errors, 1)), score.BLOCK)
 
 
 @METRICS.family(
@@ -239,14 +222,14 @@ def sample(scale_mm: float, stored: str) -> Outcome:
     target = np.zeros((_SIDE, _SIDE), stored)
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
-    scores = score_sample(prediction, target)
+    scores = score.score_sample(prediction, target)
     outcomes = []
     for stats, where in ((scores.object, target > 0), (scores.background, ~(target > 0))):
         if where.any():
             exact = prediction[where].astype(np.float64) - target[where]
             outcomes.append(_compared(stats, _exact((exact, 1))))
         else:  # a target of 1e-160 mm is 0 in float32
-            outcomes.append(Outcome(0.0) if stats == EMPTY else wrong())
+            outcomes.append(Outcome(0.0) if stats == score.EMPTY else wrong())
     return max(outcomes, key=lambda outcome: outcome.ratio or 0.0)
 
 
@@ -257,11 +240,11 @@ def distribution(scale_mm: float) -> Outcome:
     errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (_SIDE, _SIDE)).astype(np.float64)
     target = np.full((_SIDE, _SIDE), 4096.0 * scale_mm)
     prediction = target + errors
-    measured = score_sample(prediction, target).distribution
+    measured = score.score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
     size = np.sort(np.abs(exact))
 
-    def quantile(values: NDArray[np.float64], level: float) -> float:
+    def quantile(values: Floats, level: float) -> float:
         place = level * (len(values) - 1)
         low = int(place)
         return float(values[low] + (values[low + 1] - values[low]) * (place - low))
@@ -270,7 +253,7 @@ def distribution(scale_mm: float) -> Outcome:
     expected = [quantile(size, 0.5), quantile(size, 0.95), float(size[-1]), math.fsum(exact.tolist()) / exact.size,
                 math.fsum(np.abs(exact - median).tolist()) / exact.size]  # fmt: skip
     computed = [measured.median_mm, measured.p95_mm, measured.max_mm, measured.bias_mm, measured.shift_free_mae_mm]
-    bound = gamma(BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
+    bound = gamma(score.BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
     return worst(np.array(computed, float) - np.array(expected), bound)
 
 
@@ -281,10 +264,10 @@ def cancelling(large_mm: float) -> Outcome:
     half = np.random.default_rng(7).uniform(0.5, 1.0, 100_000) * large_mm
     errors = np.concatenate([half, -half]) + 1e-3
     np.random.default_rng(8).shuffle(errors)
-    bias_mm = mean_of(errors)
+    bias_mm = score.mean_of(errors)
     exact = math.fsum(errors.tolist()) / errors.size
     # NumPy's pairwise sum: log2(n) + 16 roundings of sums no larger than the sum of magnitudes.
-    bound = gamma(math.log2(BLOCK) + 16) * float(np.abs(errors).mean())
+    bound = gamma(math.log2(score.BLOCK) + 16) * float(np.abs(errors).mean())
     return worst(math.inf if bias_mm is None else bias_mm - exact, bound, condition=large_mm / 1e-3)
 
 
@@ -292,18 +275,17 @@ def cancelling(large_mm: float) -> Outcome:
 def merged(order: str) -> Outcome:
     """200 states of 1e-30 to 1e30 mm merged; against all at once; bound: 6 sqrt(6 merges) u"""
     rng = np.random.default_rng(9)
-    parts = [
-        stats_of(10.0 ** rng.uniform(-30, 30) * rng.uniform(0.5, 1, int(rng.integers(1, 2000)))) for _ in range(200)
-    ]
-    whole = combine(*parts)
+    sized = [10.0 ** rng.uniform(-30, 30) * rng.uniform(0.5, 1, int(rng.integers(1, 2000))) for _ in range(200)]
+    parts = [score.stats_of(errors) for errors in sized]
+    whole = score.combine(*parts)
     if order == "one by one":
-        total = EMPTY
+        total = score.EMPTY
         for part in parts:
-            total = combine(total, part)
+            total = score.combine(total, part)
     else:
         level = parts[::-1]
         while len(level) > 1:
-            level = [combine(*level[i : i + 2]) for i in range(0, len(level), 2)]
+            level = [score.combine(*level[i : i + 2]) for i in range(0, len(level), 2)]
         total = level[0]
     if whole.mae_mm is None or whole.rmse_mm is None or total.pixels != whole.pixels:
         return wrong("pixels lost")
@@ -319,7 +301,7 @@ def not_a_number(value: float) -> Outcome:
     target = np.full((8, 8), 1800.0)
     prediction = target.copy()
     prediction[3, 4] = value
-    return Outcome(score_sample(prediction, target).overall.mae_mm)
+    return Outcome(score.score_sample(prediction, target).overall.mae_mm)
 
 
 @METRICS.family("perfect and empty", "mm")
@@ -327,8 +309,8 @@ def flawless() -> Outcome:
     """scores of a perfect prediction and of an empty set; against 0, and none; bound: exact"""
     target = np.zeros((64, 64), np.float32)
     target[10:40, 10:40] = 1234.567
-    scores = score_sample(target, target)
-    empty = score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
+    scores = score.score_sample(target, target)
+    empty = score.score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
     parts = scores.overall, scores.object, scores.background
-    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == EMPTY
+    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == score.EMPTY
     return Outcome(0.0) if good else wrong()

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import (
     U32,
     U64,
+    Floats,
     Group,
     Outcome,
     difference,
@@ -26,71 +28,50 @@ from fpp_ml_bench.baselines.stability.cases import (
 )
 from fpp_ml_bench.baselines.stability.phase_order import inside_pattern, plane_stack
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import (
-    Reason,
-    decode_stack,
-    depth_from_both,
-    depth_from_coordinate,
-    depth_noise_mm,
-)
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.loaders.render import Lighting, light_surface
-from fpp_ml_bench.optics import (
-    Direction,
-    Maps,
-    Pinhole,
-    Rig,
-    distort,
-    fold_radius_squared,
-    load_rig,
-    paper_rig,
-    rig_from_dict,
-    rotation_matrix,
-    save_rig,
-    undistort,
-)
 
 TRIANGULATION, RIG = Group("triangulation"), Group("rig")
 BASELINES = (160.0, 50.0, 10.0, 1.0, 0.1, 0.01)
-DIRECTIONS: tuple[Direction, ...] = ("vertical", "horizontal")
+DIRECTIONS: tuple[optics.Direction, ...] = ("vertical", "horizontal")
 _TURN = (0.05, -0.09, 0.12)
 _WEIGHTS = (0.7, 1.3)
 
 
-def scaled_baseline(baseline_mm: float, ahead: float = 0.0, turned: bool = False) -> Rig:
+def scaled_baseline(baseline_mm: float, ahead: float = 0.0, turned: bool = False) -> optics.Rig:
     """The paper's rig with a shorter baseline and the projector ``ahead`` of the camera by that share of it."""
-    rig = paper_rig(24)
+    rig = optics.paper_rig(24)
     t = np.array([*rig.translation_m[:2], -ahead * rig.baseline_m])
     t *= baseline_mm / MM_PER_M / np.linalg.norm(t)
-    turn = rotation_matrix(_TURN) if turned else np.eye(3)
+    turn = optics.rotation_matrix(_TURN) if turned else np.eye(3)
     return replace(rig, rotation=turn.tolist(), translation_m=(float(t[0]), float(t[1]), float(t[2])))
 
 
-def rays(count: int = 40) -> Maps:
+def rays(count: int = 40) -> optics.Maps:
     """Normalised coordinates of camera rays across the paper's field of view, seeded."""
     rng = np.random.default_rng(5)
     return rng.uniform(-0.2, 0.2, count), rng.uniform(-0.2, 0.2, count)
 
 
-def _optics(rig: Rig, axis: int) -> tuple[float, float]:
+def _optics(rig: optics.Rig, axis: int) -> tuple[float, float]:
     """Focal length and principal point of the projector in px, along an axis."""
     device = rig.projector
     return (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
 
 
-def _turned(mp: Any, rig: Rig, x: float, y: float) -> list:
+def _turned(mp: Any, rig: optics.Rig, x: float, y: float) -> list:
     """A ray in the projector's axes, in 50 digits."""
     ray = (mp.mpf(float(x)), mp.mpf(float(y)), mp.mpf(1))
     return [mp.fsum(mp.mpf(float(rig.R[i, j])) * ray[j] for j in range(3)) for i in range(3)]
 
 
-def _ideal(mp: Any, rig: Rig, coordinate: float, axis: int) -> Any:
+def _ideal(mp: Any, rig: optics.Rig, coordinate: float, axis: int) -> Any:
     """A projector coordinate without focal length and principal point, in 50 digits."""
     focal, centre = _optics(rig, axis)
     return (mp.mpf(float(coordinate)) - mp.mpf(centre)) / mp.mpf(focal)
 
 
-def exact_coordinates(ray_maps: Maps, depth_m: float, rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def exact_coordinates(ray_maps: optics.Maps, depth_m: float, rig: optics.Rig) -> tuple[Floats, Floats]:
     """Projector px of points at ``depth_m`` on the rays, in 50 digits, rounded once."""
     mp = high_precision()
     device, u, v = rig.projector, [], []
@@ -101,7 +82,7 @@ def exact_coordinates(ray_maps: Maps, depth_m: float, rig: Rig) -> tuple[NDArray
     return rounded(u), rounded(v)
 
 
-def _exact_depth(ray_maps: Maps, coordinate: NDArray, rig: Rig, axis: int) -> list:
+def _exact_depth(ray_maps: optics.Maps, coordinate: NDArray, rig: optics.Rig, axis: int) -> list:
     """Depth in mm of these float64 inputs in 50 digits, by the closed form."""
     mp = high_precision()
     depths = []
@@ -113,12 +94,12 @@ def _exact_depth(ray_maps: Maps, coordinate: NDArray, rig: Rig, axis: int) -> li
     return depths
 
 
-def relative(depth_mm: NDArray, exact: list) -> NDArray[np.float64]:
+def relative(depth_mm: NDArray, exact: list) -> Floats:
     """Relative error of depths, against high-precision numbers."""
     return difference(depth_mm, exact) / np.abs(rounded(exact))
 
 
-def conditioning(ray_maps: Maps, coordinate: NDArray, rig: Rig, axis: int) -> tuple[NDArray, NDArray]:
+def conditioning(ray_maps: optics.Maps, coordinate: NDArray, rig: optics.Rig, axis: int) -> tuple[NDArray, NDArray]:
     """Bound of the closed form's relative error, and its condition number: sum of magnitudes over |a - x_p a_2|.
 
     Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of magnitudes; the difference and the top
@@ -134,11 +115,11 @@ def conditioning(ray_maps: Maps, coordinate: NDArray, rig: Rig, axis: int) -> tu
     return U64 * (8 * condition + 5 * above + 4), condition
 
 
-def one_coordinate(baseline_mm: float, range_m: float, direction: Direction, turned: bool = False) -> Outcome:
+def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Direction, turned: bool = False) -> Outcome:
     rig = scaled_baseline(baseline_mm, 0.3 if turned else 0.0, turned)
     ray_maps, axis = rays(), DIRECTIONS.index(direction)
     coordinate = exact_coordinates(ray_maps, range_m, rig)[axis]
-    depth_mm = depth_from_coordinate(ray_maps, coordinate, rig, direction)
+    depth_mm = decoding.depth_from_coordinate(ray_maps, coordinate, rig, direction)
     bound, condition = conditioning(ray_maps, coordinate, rig, axis)
     error = relative(depth_mm, _exact_depth(ray_maps, coordinate, rig, axis))
     return worst(error, bound, np.isnan(depth_mm), condition=float(condition.max()))
@@ -166,7 +147,7 @@ TRIANGULATION.family(
 )(one_coordinate)  # fmt: skip
 
 
-def _least_squares(ray_maps: Maps, u: NDArray, v: NDArray, rig: Rig) -> tuple[list, NDArray, NDArray]:
+def _least_squares(ray_maps: optics.Maps, u: NDArray, v: NDArray, rig: optics.Rig) -> tuple[list, NDArray, NDArray]:
     """Depth mm that minimises the weighted misfit, by Newton in 50 digits; contraction of Gauss-Newton; its start's
     relative error."""
     mp = high_precision()
@@ -205,7 +186,7 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     rng = np.random.default_rng(6)
     u, v = (axis + noise_px * rng.standard_normal(axis.shape) for axis in exact_coordinates(ray_maps, 1.8, rig))
     exact, contraction, start = _least_squares(ray_maps, u, v, rig)
-    depth_mm = depth_from_both(ray_maps, u, v, rig, *_WEIGHTS).depth_mm
+    depth_mm = decoding.depth_from_both(ray_maps, u, v, rig, *_WEIGHTS).depth_mm
     in_front = rounded(exact) > 0
     bounds, conditions = zip(*(conditioning(ray_maps, axis, rig, i) for i, axis in enumerate((u, v))), strict=True)
     bound = 8 * np.maximum(*bounds) + start * (contraction + 4 * start) ** 3
@@ -215,7 +196,7 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
 
 
 @TRIANGULATION.family("noise law", "1", direction=DIRECTIONS, baseline_mm=BASELINES)
-def noise_law(baseline_mm: float, direction: Direction) -> Outcome:
+def noise_law(baseline_mm: float, direction: optics.Direction) -> Outcome:
     """rms depth error over sigma_u Z^2 / (f_p b), minus 1; or the share without depth, minus Phi; against rig.md's law;
     where noise is over a fifth of the depth, the normal law of inverse depth; bound: 4 standard errors of 20,000 draws,
     and 8 (sigma_Z / Z)^2 of second order"""
@@ -224,8 +205,8 @@ def noise_law(baseline_mm: float, direction: Direction) -> Outcome:
     coordinate = exact_coordinates((np.zeros(1), np.zeros(1)), depth_m, rig)[DIRECTIONS.index(direction)][0]
     sigma_px = rig.pitch(direction) * math.sqrt(2 / 18) / modulation / (2 * math.pi)
     noisy = coordinate + sigma_px * np.random.default_rng(8).standard_normal(count)
-    depths_mm = depth_from_coordinate((np.zeros(count), np.zeros(count)), noisy, rig, direction)
-    law = float(depth_noise_mm(rig, depth_m * MM_PER_M, direction, 18, modulation))
+    depths_mm = decoding.depth_from_coordinate((np.zeros(count), np.zeros(count)), noisy, rig, direction)
+    law = float(decoding.depth_noise_mm(rig, depth_m * MM_PER_M, direction, 18, modulation))
     share = law / (depth_m * MM_PER_M)
     if share < 0.2:
         rms = float(np.sqrt(np.mean((depths_mm - depth_m * MM_PER_M) ** 2)))
@@ -244,11 +225,11 @@ def near_parallel(shift_px: float) -> Outcome:
     """depth of a projector plane this many px from parallel; against the closed form on the same float64 inputs in 50
     digits; bound: u (8 kappa + 5 kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running error analysis;
     masked where it lies behind"""
-    rig, ray_maps = paper_rig(24), rays()
+    rig, ray_maps = optics.paper_rig(24), rays()
     focal, centre = _optics(rig, 0)
     coordinate = focal * ray_maps[0] + centre + shift_px  # depth f b / shift, up to a point at infinity
     exact = _exact_depth(ray_maps, coordinate, rig, 0)
-    depth_mm = depth_from_coordinate(ray_maps, coordinate, rig, "vertical")
+    depth_mm = decoding.depth_from_coordinate(ray_maps, coordinate, rig, "vertical")
     bound, condition = conditioning(ray_maps, coordinate, rig, 0)
     # Where the bound exceeds half of the depth, the number is round-off and must be masked, as behind the camera.
     nothing = ~(bound < 0.5) | ~(rounded(exact) > 0)
@@ -261,37 +242,37 @@ def near_parallel(shift_px: float) -> Outcome:
 @TRIANGULATION.family("point at infinity", "mm", expects="refusal")
 def point_at_infinity() -> Outcome:
     """depth where ray and projector plane are exactly parallel; against there is none; bound: must be masked"""
-    rig, ray_maps = paper_rig(24), (np.array([0.0, 0.125, -0.25]), np.zeros(3))  # where its coordinate is exact
+    rig, ray_maps = optics.paper_rig(24), (np.array([0.0, 0.125, -0.25]), np.zeros(3))  # where its coordinate is exact
     coordinate = rig.projector.fx * ray_maps[0] + rig.projector.cx
-    return masked(np.isnan(depth_from_coordinate(ray_maps, coordinate, rig, "vertical")))
+    return masked(np.isnan(decoding.depth_from_coordinate(ray_maps, coordinate, rig, "vertical")))
 
 
 @TRIANGULATION.family("far plane through the decoder", "mm", expects="refusal", range_m=(0.3, 1.0, 3.2, 20.0, 100.0))
 def decoded_far(range_m: float) -> Outcome:
     """decoded depth of a plane outside the working range; against the working range; bound: must be masked"""
-    rig = paper_rig(32)
+    rig = optics.paper_rig(32)
     frames, exact = plane_stack(rig, range_m)  # at the farthest its parallax is under a hundredth of a pixel
     inside = inside_pattern(rig, exact)
-    depth_mm = decode_stack(frames, rig, mask=inside).depth_mm[inside]
+    depth_mm = decoding.decode_stack(frames, rig, mask=inside).depth_mm[inside]
     return worst(depth_mm, 0.0, depth_mm == 0, 1.0)
 
 
 @TRIANGULATION.family("behind the projector", "mm", expects="refusal", ahead_m=(0.5, 1.0, 3.0))
 def behind_projector(ahead_m: float) -> Outcome:
     """depth of points that lie behind a projector ahead of the camera; against there is none; bound: must be masked"""
-    rig, ray_maps = replace(paper_rig(24), translation_m=(0.125, -0.1, -ahead_m)), rays()
+    rig, ray_maps = replace(optics.paper_rig(24), translation_m=(0.125, -0.1, -ahead_m)), rays()
     points = np.stack([*ray_maps, np.ones(len(ray_maps[0]))], axis=1) * (0.5 * ahead_m) + rig.t
     mirrored = rig.projector.fx * points[:, 0] / points[:, 2] + rig.projector.cx
-    return masked(np.isnan(depth_from_coordinate(ray_maps, mirrored, rig, "vertical")))
+    return masked(np.isnan(decoding.depth_from_coordinate(ray_maps, mirrored, rig, "vertical")))
 
 
 @TRIANGULATION.family("projector behind the surface", "grey", expects="refusal")
 def lit_from_behind() -> Outcome:
     """projector light on a surface lit from its far side; against none reaches the camera; bound: exactly 0, so the
     decoder masks it for want of modulation"""
-    turn = rotation_matrix((0.0, math.pi, 0.0))
+    turn = optics.rotation_matrix((0.0, math.pi, 0.0))
     centre = np.array([-0.125, 0.1, 3.0])
-    rig = replace(paper_rig(24), rotation=turn.tolist(), translation_m=tuple((-turn @ centre).tolist()))
+    rig = replace(optics.paper_rig(24), rotation=turn.tolist(), translation_m=tuple((-turn @ centre).tolist()))
     x, y = rays()
     points = np.stack([x, y, np.ones(len(x))], axis=1) * 1.8
     lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), rig, Lighting())
@@ -306,7 +287,7 @@ def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     kappa, kappa = u_p / (u_p - u_infinity); not checked where that is over 1/2"""
     rig, ray_maps = scaled_baseline(baseline_mm), rays()
     coordinate = exact_coordinates(ray_maps, range_m, rig)[0]
-    depth_mm = depth_from_coordinate(ray_maps, coordinate.astype(np.float32), rig, "vertical")
+    depth_mm = decoding.depth_from_coordinate(ray_maps, coordinate.astype(np.float32), rig, "vertical")
     focal, centre = _optics(rig, 0)
     slope = np.abs(coordinate) / focal / np.abs((coordinate - centre) / focal - ray_maps[0])
     shift = slope * U32
@@ -345,9 +326,10 @@ def single_layer(baseline_mm: float, range_m: float) -> Outcome:
 def overflowing(value: float) -> Outcome:
     """depth from coordinates that no projector has; against finite and positive, or masked; bound: must be masked where
     there is no depth"""
-    rig, ray_maps = paper_rig(24), rays()
+    rig, ray_maps = optics.paper_rig(24), rays()
     u = np.full(ray_maps[0].shape, value)
-    depths = depth_from_coordinate(ray_maps, u, rig, "vertical"), depth_from_both(ray_maps, u, u, rig).depth_mm
+    from_both = decoding.depth_from_both(ray_maps, u, u, rig).depth_mm
+    depths = decoding.depth_from_coordinate(ray_maps, u, rig, "vertical"), from_both
     legal = [np.isnan(depth) | (np.isfinite(depth) & (depth > 0)) for depth in depths]
     return worst(np.where(np.all(legal, axis=0), 0.0, np.inf), 0.0, np.isnan(depths).all(axis=0), 1.0)
 
@@ -355,12 +337,13 @@ def overflowing(value: float) -> Outcome:
 @TRIANGULATION.family("no weight", "mm", expects="refusal")
 def no_weight() -> Outcome:
     """depth from two directions without modulation; against there is none; bound: must be masked"""
-    rig, ray_maps = paper_rig(24), rays()
-    return masked(np.isnan(depth_from_both(ray_maps, *exact_coordinates(ray_maps, 1.8, rig), rig, 0.0, 0.0).depth_mm))
+    rig, ray_maps = optics.paper_rig(24), rays()
+    u, v = exact_coordinates(ray_maps, 1.8, rig)
+    return masked(np.isnan(decoding.depth_from_both(ray_maps, u, v, rig, 0.0, 0.0).depth_mm))
 
 
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:
-    camera = Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px)
+    camera = optics.Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px)
     u = np.linspace(-0.5, 959.5, 97)
     if not all(np.isfinite(axis).all() for axis in camera.rays()):
         return Outcome(math.inf, 1.0, note="rays that are not finite")
@@ -393,8 +376,8 @@ RIG.family(
 def off_orthonormal(off: float, kind: str) -> Outcome:
     """depth through this matrix; against depth through the rotation, 1800 mm; bound: 2 |R R^T - I| kappa + round-off;
     over 1e-6 a rig is refused"""
-    turn = rotation_matrix(_TURN)
-    base = replace(paper_rig(24), rotation=turn.tolist())
+    turn = optics.rotation_matrix(_TURN)
+    base = replace(optics.paper_rig(24), rotation=turn.tolist())
     if kind == "scaled":  # R R^T - I is (1 + s)^2 - 1
         matrix = turn * (1 + off / 2)
     else:  # R R^T - I is off between the first two rows
@@ -402,7 +385,7 @@ def off_orthonormal(off: float, kind: str) -> Outcome:
         matrix[0] += off * turn[1]
     rig, ray_maps = replace(base, rotation=matrix.tolist()), rays()
     coordinate = exact_coordinates(ray_maps, 1.8, base)[0]
-    depth_mm = depth_from_coordinate(ray_maps, coordinate, rig, "vertical")
+    depth_mm = decoding.depth_from_coordinate(ray_maps, coordinate, rig, "vertical")
     rounding, condition = conditioning(ray_maps, coordinate, base, 0)
     # Each row of R moves by off at most: the difference a - x_p a_2 by off times the condition number, twice.
     bound = rounding + 2 * off * condition
@@ -417,8 +400,8 @@ def rotation_vector(angle_rad: float) -> Outcome:
     """rotation matrix by Rodrigues' formula; against the same formula in 50 digits; bound: 8 u (1 + angle): the angle
     carries its own rounding; refused where that is over 1e-6"""
     vector = np.array([0.48, -0.6, 0.64]) * angle_rad
-    matrix = rotation_matrix(tuple(vector.tolist()))
-    replace(paper_rig(24), rotation=matrix.tolist())  # which may refuse it
+    matrix = optics.rotation_matrix(tuple(vector.tolist()))
+    replace(optics.paper_rig(24), rotation=matrix.tolist())  # which may refuse it
     mp = high_precision()
     x, y, z = (mp.mpf(float(value)) for value in vector)
     angle = mp.sqrt(x * x + y * y + z * z)
@@ -433,10 +416,10 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
     """ideal radius of distorted ones up to 1.6; against bisection in 50 digits below the fold; bound: 32 u / slope of
     the model: a residual of some roundings; masked where no point maps there"""
     coefficients = (k1, k2, 0.0, 0.0, k3)
-    fold = math.sqrt(fold_radius_squared(coefficients))
+    fold = math.sqrt(optics.fold_radius_squared(coefficients))
     radius = np.linspace(0.0, 1.6, 81)[1:]
     turn = 0.7
-    radii = np.hypot(*undistort(radius * math.cos(turn), radius * math.sin(turn), coefficients))
+    radii = np.hypot(*optics.undistort(radius * math.cos(turn), radius * math.sin(turn), coefficients))
     mp = high_precision()
 
     def forward(r: Any) -> Any:
@@ -472,9 +455,9 @@ def tangential(p1: float) -> Outcome:
     coefficients = (-0.2, 0.0, p1, -p1, 0.0)
     grid = np.linspace(-0.8, 0.8, 33)
     xd, yd = (axis.ravel() for axis in np.meshgrid(grid, grid))
-    x, y = undistort(xd, yd, coefficients)
+    x, y = optics.undistort(xd, yd, coefficients)
     finite = np.isfinite(x)
-    residual = np.hypot(*(a - b for a, b in zip(distort(x, y, coefficients), (xd, yd), strict=True)))
+    residual = np.hypot(*(a - b for a, b in zip(optics.distort(x, y, coefficients), (xd, yd), strict=True)))
     px, py = np.zeros_like(xd), np.zeros_like(yd)
     lost = np.zeros(xd.shape, bool)
     k1, _, q1, q2, _ = coefficients
@@ -489,7 +472,7 @@ def tangential(p1: float) -> Outcome:
             determinant = jxx * jyy - jxy * jxy
             lost |= ~(determinant > 1e-6)
             px, py = px - (jyy * fx - jxy * fy) / determinant, py - (jxx * fy - jxy * fx) / determinant
-    right = ~lost & (px * px + py * py < fold_radius_squared(coefficients))
+    right = ~lost & (px * px + py * py < optics.fold_radius_squared(coefficients))
     trace = jxx + jyy
     slope = (trace - np.sqrt(np.maximum(trace * trace - 4 * determinant, 0))) / 2  # the Jacobian is symmetric
     off = np.where(right, np.hypot(x - px, y - py), np.inf)  # no solution off that branch
@@ -500,13 +483,13 @@ def tangential(p1: float) -> Outcome:
 @RIG.family("lens without inverse at the corner", "mm", expects="either", k1=(-0.1, -0.5, -2.0, -10.0))
 def folding_camera(k1: float) -> Outcome:
     """decoded depth where the lens model has no inverse; against there is none; bound: must be masked"""
-    base = paper_rig(32)
+    base = optics.paper_rig(32)
     camera = replace(base.camera, fx=base.camera.fx / 4, fy=base.camera.fy / 4, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
     frames, _ = plane_stack(replace(base, camera=replace(camera, distortion=(0.0,) * 5)))
     x, y = camera.rays()
     without = np.isnan(x) | np.isnan(y)
-    decoded = decode_stack(frames, replace(base, camera=camera), direction="vertical")
-    given = without & ((decoded.depth_mm != 0) | (decoded.reason == Reason.DECODED))
+    decoded = decoding.decode_stack(frames, replace(base, camera=camera), direction="vertical")
+    given = without & ((decoded.depth_mm != 0) | (decoded.reason == decoding.Reason.DECODED))
     note = f"{without.mean():.0%} of the pixels have no ray; the corner {'has none' if without[0, 0] else 'has a ray'}"
     return worst(np.where(given, np.inf, 0.0), 0.0, decoded.depth_mm == 0, 1.0, note=note)
 
@@ -526,29 +509,29 @@ _IMPOSSIBLE: dict[str, tuple[tuple[Any, ...], Any]] = {
 @RIG.family("impossible rig", "1", expects="refusal", refuses=RigError, change=_IMPOSSIBLE)
 def impossible_rig(change: str) -> Outcome:
     """a rig from a file; against there is no such rig; bound: must be refused"""
-    data: Any = paper_rig(24).to_dict()
+    data: Any = optics.paper_rig(24).to_dict()
     (*way, last), value = _IMPOSSIBLE[change]
     part = data
     for key in way:
         part = part[key]
     part[last] = value
-    rig_from_dict(data)
+    optics.rig_from_dict(data)
     return Outcome(0.0)
 
 
 @RIG.family("file round trip", "bits", suffix=(".yaml", ".json"))
 def file_round_trip(suffix: str) -> Outcome:
     """a rig of awkward numbers, written and read; against the rig; bound: exact"""
-    base = paper_rig(24)
+    base = optics.paper_rig(24)
     awkward = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
     camera = replace(base.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward)
     rig = replace(
         base, camera=camera, translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
-        rotation=rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(), pitch_vertical_px=18 + 2**-48,
+        rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(), pitch_vertical_px=18 + 2**-48,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
-        save_rig(rig, path)
-        loaded = load_rig(path)
+        optics.save_rig(rig, path)
+        loaded = optics.load_rig(path)
     same = loaded == rig and json.dumps(loaded.to_dict()) == json.dumps(rig.to_dict())
     return Outcome(0.0) if same else wrong()

@@ -103,7 +103,7 @@ def naive_float32(errors):
 
 
 def break_metrics(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.scores.stats_of", naive_float32)
+    monkeypatch.setattr("fpp_ml_bench.evaluation.score.stats_of", naive_float32)
     return cases_of("metrics", "mixed magnitudes")
 
 
@@ -116,7 +116,7 @@ def break_arctangent(monkeypatch):
 
 
 def break_interval(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.phase_order.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    monkeypatch.setattr("fpp_ml_bench.decoding.minus_atan2", lambda y, x: -np.arctan2(y, x))
     return cases_of("order", "interval of the phase")
 
 
@@ -126,7 +126,7 @@ def break_triangulation(monkeypatch):
         bottom = u - np.float32(device.cx) - np.float32(device.fx) * x
         return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
 
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.triangulation_rig.depth_from_coordinate", in_single)
+    monkeypatch.setattr("fpp_ml_bench.decoding.depth_from_coordinate", in_single)
     return [member for member in cases_of("triangulation", "baseline") if member.parameters["direction"] == "vertical"]
 
 
