@@ -8,27 +8,14 @@ where it has the opposite sign and leaves 0 out, and is *within noise* otherwise
 
 import statistics
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from fpp_ml_bench.baselines.reproduce import (
-    MAIN_KEY,
-    MEAN,
-    PREDICTED,
-    AllFrames,
-    Folders,
-    Job,
-    Outcome,
-    ReproduceSettings,
-    Variant,
-    all_frames_that_hold,
-    current_weights,
-    file_sha256,
-    variants,
-)
+from fpp_ml_bench.baselines import reproduce
+from fpp_ml_bench.baselines.reproduce import MAIN_KEY, MEAN, PREDICTED, Folders, Job, Variant
 from fpp_ml_bench.baselines.training import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION
@@ -66,11 +53,6 @@ def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> En
         and result.protocol_version == PROTOCOL_VERSION
     )
     return entry if same else None
-
-
-def row_is_current(path: Path, opened: DatasetFolder, weights_sha256: str) -> bool:
-    """Whether `row_that_holds` finds the row."""
-    return row_that_holds(path, opened, weights_sha256) is not None
 
 
 def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
@@ -130,46 +112,43 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
             if row in reported
             else (_NOT_IN_THE_PAPER.get(row, row), None)
         )
-        weights = current_weights(recipe, folders)
+        weights = reproduce.current_weights(recipe, folders)
         if weights is None:
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
-        sha256 = file_sha256(weights)
-        main, *twin_variants = variants(recipe)
+        sha256 = reproduce.file_sha256(weights)
+        main, *twin_variants = reproduce.variants(recipe)
         entry = row_that_holds(folders.row(recipe, main), opened, sha256)
         twins = {
             twin.suffix: found
             for twin in twin_variants
             if (found := row_that_holds(folders.row(recipe, twin), opened, sha256)) is not None
         }
-        first = None if entry is None else scored_entry(entry)
+        first = None if entry is None else scored_result(entry.result)
         if table != "multi_frame" or len(opened.sequence.config(recipe.data_config)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
-        all_frames = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+        all_frames = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
         every = None if all_frames is None else scored_frames(all_frames)
         lines.append(Line(row, label, recipe, every, entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
 
 
-def scored_entry(entry: Entry) -> Scored:
-    """Scores of a row of the leaderboard."""
-    result = entry.result
-    return Scored(
-        {key: getattr(result.metrics, key) for key in HEADLINE},
-        result.intervals.of(MAIN_KEY),
-        {row.sample: (row.object, row.object_mae_mm) for row in result.per_sample},
-    )
+def scored_result(result: Result) -> Scored:
+    """Scores of a row's result."""
+    samples = {row.sample: (row.object, row.object_mae_mm) for row in result.per_sample}
+    return Scored(_headline(result.metrics), result.intervals.of(MAIN_KEY), samples)
 
 
-def scored_frames(all_frames: AllFrames) -> Scored:
+def scored_frames(scores: reproduce.AllFrames) -> Scored:
     """Scores over all frames."""
-    return Scored(
-        {key: getattr(all_frames.metrics, key) for key in HEADLINE},
-        all_frames.intervals.of(MAIN_KEY),
-        {row.sample: (row.object, row.metrics.object_mae_mm) for row in all_frames.per_sample},
-    )
+    samples = {row.sample: (row.object, row.metrics.object_mae_mm) for row in scores.per_sample}
+    return Scored(_headline(scores.metrics), scores.intervals.of(MAIN_KEY), samples)
+
+
+def _headline(metrics: object) -> dict[str, float | None]:
+    return {key: getattr(metrics, key) for key in HEADLINE}
 
 
 @dataclass(frozen=True)
@@ -231,12 +210,12 @@ def columns(preset: str) -> tuple[Column, ...]:
     return (
         Column("Row", "Row", lambda line: line.label, right=False),
         Column("Track", None, lambda line: "-" if line.entry is None else line.entry.result.track, right=False),
-        Column(f"Object MAE / RMSE, {measured}", "Object, here", lambda line: _pair(_errors_mm(line), "object")),
+        Column(f"Object MAE / RMSE, {measured}", "Object, here", lambda line: _here(line, "object")),
         Column(f"95% interval of the object MAE, {MEASURED_HERE}", "95% of MAE", _interval),
         Column(f"Object MAE / RMSE, {paper}", "Object, paper", lambda line: _pair(line.paper_mm, "object")),
-        Column(f"Overall MAE / RMSE, {measured}", "Overall, here", lambda line: _pair(_errors_mm(line), "overall")),
+        Column(f"Overall MAE / RMSE, {measured}", "Overall, here", lambda line: _here(line, "overall")),
         Column(f"Overall MAE / RMSE, {paper}", "Overall, paper", lambda line: _pair(line.paper_mm, "overall")),
-        Column(f"Background MAE / RMSE, {measured}", None, lambda line: _pair(_errors_mm(line), "background")),
+        Column(f"Background MAE / RMSE, {measured}", None, lambda line: _here(line, "background")),
         Column(f"Background MAE / RMSE, {paper}", None, lambda line: _pair(line.paper_mm, "background")),
         Column(f"Range predicted: {twin}", "Range predicted", lambda line: _twin(line, PREDICTED)),
         Column(f"Range of the training mean: {twin}", None, lambda line: _twin(line, MEAN)),
@@ -247,7 +226,7 @@ def columns(preset: str) -> tuple[Column, ...]:
     )
 
 
-def table_page(table: str, settings: ReproduceSettings, outcome: Outcome) -> str:
+def table_page(table: str, settings: reproduce.ReproduceSettings, outcome: reproduce.Outcome) -> str:
     """The page of a table as Markdown, from the rows that there are."""
     lines = table_lines(table, outcome.jobs, settings.folders, outcome.opened)
     return table_markdown(table, lines, settings.folders.preset, settings.command, outcome.failed)
@@ -353,19 +332,12 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
     parts = ["## The paper's orderings", "", orderings_sentence(judged), ""]
     if not judged:
         return parts
-    rows = [
-        [
-            markdown_text(ordering.better),
-            markdown_text(ordering.worse) + ("" if ordering.same_track else f" \\{_TRACKS_DIFFER}"),
-            f"{ordering.paper_gap_mm:+.2f}",
-            f"{ordering.gap_mm:+.2f}",
-            "-"
-            if ordering.interval_mm is None
-            else f"{ordering.interval_mm[0]:+.2f} to {ordering.interval_mm[1]:+.2f}",
-            ordering.verdict,
-        ]
-        for ordering in judged
-    ]
+    rows = []
+    for ordering in judged:
+        worse = markdown_text(ordering.worse) + ("" if ordering.same_track else f" \\{_TRACKS_DIFFER}")
+        gaps = f"{ordering.paper_gap_mm:+.2f}", f"{ordering.gap_mm:+.2f}"
+        interval = "-" if ordering.interval_mm is None else " to ".join(f"{end:+.2f}" for end in ordering.interval_mm)
+        rows.append([markdown_text(ordering.better), worse, *gaps, interval, ordering.verdict])
     titles = (
         "Better in the paper", "Worse in the paper", f"Worse minus better, mm, {BY_THE_PAPER}",
         f"Worse minus better, mm, {MEASURED_HERE}", "95% interval", "Here",
@@ -373,30 +345,29 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
     parts += [*markdown_rows(titles, (False, False, True, True, True, False), rows), ""]
     parts += ["Differences sample by sample; intervals by bootstrap over objects."]
     if not all(ordering.same_track for ordering in judged):
-        parts += [
-            "",
-            f"\\{_TRACKS_DIFFER} of different tracks: one of the two was given the test sample's range, which is part "
-            "of the difference.",
-        ]
+        told = "one of the two was given the test sample's range, which is part of the difference."
+        parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {told}"]
     return parts
 
 
-def _errors_mm(line: Line) -> dict[str, Any] | None:
-    return None if line.scored is None else line.scored.errors_mm
+def _mm(value: float | None) -> str:
+    """Millimetres with the paper's two decimals."""
+    return "-" if value is None else f"{value:.2f}"
 
 
-def _pair(errors_mm: Any, pixels: str) -> str:
-    """MAE and RMSE with the paper's two decimals."""
-    if errors_mm is None:
-        return "-"
-    values = (errors_mm[f"{pixels}_{error}_mm"] for error in ("mae", "rmse"))
-    return " / ".join("-" if value is None else f"{value:.2f}" for value in values)
+def _here(line: Line, pixels: str) -> str:
+    return _pair(None if line.scored is None else line.scored.errors_mm, pixels)
+
+
+def _pair(errors_mm: Mapping[str, float | None] | None, pixels: str) -> str:
+    """MAE and RMSE."""
+    return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
 
 
 def _interval(line: Line) -> str:
     if line.scored is None or line.scored.interval_mm is None:
         return "-"
-    return " - ".join(f"{end:.2f}" for end in line.scored.interval_mm)
+    return " - ".join(map(_mm, line.scored.interval_mm))
 
 
 def _twin(line: Line, variant: Variant) -> str:
@@ -404,9 +375,8 @@ def _twin(line: Line, variant: Variant) -> str:
     entry = line.twins.get(variant.suffix)
     if entry is None:
         return "-"
-    errors = (entry.value(key) for key in (MAIN_KEY, "object_valid_mae_mm"))
-    cells = ["-" if value is None else f"{value:.2f}" for value in errors]
-    return " / ".join([*cells, percent(entry.value("object_missing_share"))])
+    errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
+    return " / ".join([*errors, percent(entry.value("object_missing_share"))])
 
 
 def _setting(line: Line, key: str) -> str:

@@ -49,8 +49,8 @@ REASON_LENGTH = 400
 class Leaderboard(Protocol):
     """Keeps the rows, and shows them beside the paper's."""
 
-    def row_is_current(self, path: Path, opened: DatasetFolder, weights_sha256: str) -> bool:
-        """Whether ``path`` is a sound row of this dataset, these weights and today's protocol."""
+    def row_that_holds(self, path: Path, opened: DatasetFolder, weights_sha256: str) -> object:
+        """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
 
     def check_row_is_of(self, path: Path, opened: DatasetFolder) -> None:
         """Raises SubmissionError where ``path`` is a row on other data."""
@@ -161,14 +161,13 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
     model = load(finished_weights(recipe, run, opened, folders, settings.only_missing))
     if job.all_frames:
         _score_all_frames(recipe, model, settings, opened)
+    seconds = round(run.seconds, 1)
     about: dict[str, Setting] = {
-        "recipe_digest": recipe.digest,
-        "epochs_trained": run.epochs,
-        "training_seconds": round(run.seconds, 1),
-    }
+        "recipe_digest": recipe.digest, "epochs_trained": run.epochs, "training_seconds": seconds,
+    }  # fmt: skip
     for variant in variants(recipe):
         path = folders.row(recipe, variant)
-        if settings.only_missing and settings.leaderboard.row_is_current(path, opened, model.sha256):
+        if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
         with _restored_threads():

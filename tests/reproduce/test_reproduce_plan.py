@@ -21,7 +21,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
     Scored,
     orderings,
     orderings_sentence,
-    scored_entry,
+    scored_result,
     table_lines,
     table_markdown,
 )
@@ -172,7 +172,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     ]
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_entry(entry))
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_result(entry.result))
         for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
