@@ -115,7 +115,10 @@ def score_all_frames(
             scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
     rows = [_mean(scores[sample, frame] for frame in frames) for sample in samples]
     objects = [split_sample_name(sample)[0] for sample in samples]
-    ends = intervals_over_objects(rows, objects, HEADLINE)
+    ends: dict[str, list[float | None]] = {
+        key: [None, None] if interval is None else list(interval)
+        for key, interval in intervals_over_objects(rows, objects, HEADLINE).items()
+    }
     return AllFrames(
         schema_version="1.0.0",
         protocol_version=PROTOCOL_VERSION,
@@ -124,7 +127,7 @@ def score_all_frames(
         frames=list(frames),
         pairs=len(scores),
         metrics=Headline(**_mean(rows)),
-        intervals=Intervals(**{key: [None, None] if pair is None else list(pair) for key, pair in ends.items()}),
+        intervals=Intervals(**ends),
         per_frame=[
             FrameMean(frame=frame, metrics=Headline(**_mean(scores[sample, frame] for sample in samples)))
             for frame in frames

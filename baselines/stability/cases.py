@@ -26,7 +26,8 @@ Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
 Refusals = type[Exception] | tuple[type[Exception], ...]
 
-Floats, Mask = NDArray[np.float64], NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""

@@ -27,8 +27,10 @@ LEVELS = {
 }
 """What a square of the heat maps says, and its colour."""
 _DPI, _SQUARE_PX, _LINE_PX = 90, 15, 19
-_ACROSS, _LABEL, _COLUMN = 24, 15.5, 40.0
-"""Squares in a line; widths of its label and of a column of groups, in squares."""
+_ACROSS, _LABEL, _COLUMN, _KEY = 24, 15.5, 40.0, 2.0
+"""Squares in a line; widths of its label and of a column of groups in squares, height of the key in lines."""
+_FILLED = 0.86, 0.84
+"""Share of its place that a square fills, across and down."""
 _STYLE = """
 img.heat { max-width: none; display: block; background: #fff; border-radius: 4px; }
 details { margin: .5rem 0; }
@@ -141,14 +143,18 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
     from matplotlib.patches import Patch, Rectangle
 
     grouped = families(rows)
-    lines = {name: {f: -(-len(kind) // _ACROSS) for f, kind in kinds.items()} for name, kinds in grouped.items()}
-    half = sum(2 + sum(each.values()) for each in lines.values()) / 2
+    lines = {
+        group: 2 + sum(math.ceil(len(members) / _ACROSS) for members in kinds.values())
+        for group, kinds in grouped.items()
+    }
     figure = Figure(dpi=_DPI, facecolor="white")
     axes = figure.add_axes((0, 0, 1, 1))
-    ends, squares = [2.0, 2.0], []  # the line where each column goes on, below the key
+    squares, ends = [], [_KEY, _KEY]  # the line where each column goes on
     for group, kinds in grouped.items():
-        side = 0 if ends[0] - 2 + (2 + sum(lines[group].values())) / 2 <= half else 1  # the left until it holds half
-        left, y = side * _COLUMN + 0.3, ends[side]
+        column = (
+            0 if ends[0] - _KEY + lines[group] / 2 <= sum(lines.values()) / 2 else 1
+        )  # the left until it holds half
+        left, y = column * _COLUMN + 0.3, ends[column]
         axes.text(left, y + 1.0, group, fontsize=11, fontweight="bold", va="center")
         y += 1.6
         for family, members in kinds.items():
@@ -156,11 +162,12 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
             for place, row in enumerate(members):
                 down, across = divmod(place, _ACROSS)
                 corner = left + _LABEL + across, y + down
-                axes.add_patch(Rectangle(corner, 0.86, 0.84, color=LEVELS[level(row)], lw=0))
-                ends_px = (round(corner[0] * _SQUARE_PX), round(corner[1] * _LINE_PX))
-                squares.append((f"{ends_px[0]},{ends_px[1]},{ends_px[0] + 13},{ends_px[1] + 16}", row_text(row)))
-            y += lines[group][family]
-        ends[side] = y + 0.4
+                axes.add_patch(Rectangle(corner, *_FILLED, color=LEVELS[level(row)], lw=0))
+                opposite = corner[0] + _FILLED[0], corner[1] + _FILLED[1]
+                pixels = (f"{px * _SQUARE_PX:.0f},{line * _LINE_PX:.0f}" for px, line in (corner, opposite))
+                squares.append((",".join(pixels), row_text(row)))
+            y += down + 1
+        ends[column] = y + 0.4
     axes.set_xlim(0, 2 * _COLUMN)
     axes.set_ylim(max(ends), 0)
     axes.axis("off")

@@ -189,7 +189,7 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
 def magnitude(scale_mm: float) -> Outcome:
     """MAE and RMSE of 20,000 errors up to 999 x scale_mm; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
     in float64, random roundings; blocks are added exactly; squares above 1e308 refused"""
-    errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000)
+    errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000).astype(np.float64)
     return _compared(score.stats_of(errors), _exact((errors, 1)))
 
 
