@@ -27,7 +27,8 @@ PHASE, ORDER = Group("phase"), Group("order")
 MEAN, MODULATION = 127.5, 100.0
 MODULATIONS = (100.0, 30.0, 10.0, 5.0, 3.0, 1.0, 0.3, 0.1)
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-NOISE_GREY = 1.0
+NOISE = math.sqrt(2 / 18) * math.hypot(1.0, math.sqrt(1 / 12))
+"""Standard deviation of the modulation by noise and rounding of one grey level, 18 steps."""
 
 
 def phases(count: int = 720) -> Floats:
@@ -50,9 +51,9 @@ def grey(values: NDArray) -> NDArray[np.uint8]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def phase_error(frames: NDArray, phase: NDArray, deltas: NDArray | None = None) -> Floats:
-    """Error of the wrapped phase of frames in rad, on the circle."""
-    return np.angle(np.exp(1j * (decoding.wrapped_phase(frames, deltas).phase[0] - phase)))
+def phase_error(frames: NDArray, deltas: NDArray | None = None) -> Floats:
+    """Error in rad, on the circle, of the wrapped phase of frames of `phases`."""
+    return np.angle(np.exp(1j * (decoding.wrapped_phase(frames, deltas).phase[0] - phases())))
 
 
 def frame_gain(steps: int) -> float:
@@ -61,6 +62,10 @@ def frame_gain(steps: int) -> float:
     2/N times 2 / sin(pi/N) for even N and 1 / sin(pi/2N) for odd N, about 4/pi.
     """
     return 2 / steps * (2 / math.sin(math.pi / steps) if steps % 2 == 0 else 1 / math.sin(math.pi / (2 * steps)))
+
+
+ROUNDING = 0.5 * frame_gain(18)
+"""Largest change of the modulation by rounding 18 frames to whole grey levels."""
 
 
 def worst_angle(shift: float, modulation: float = MODULATION) -> float:
@@ -181,42 +186,37 @@ def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     return worst(difference(decoding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
-def _expects_modulation(modulation: float) -> Expects:
-    shift = 0.5 * frame_gain(18)
-    if modulation + shift < decoding.MIN_MODULATION:
+def _expects(modulation: float, spread: float) -> Expects:
+    """What is expected of a modulation that is measured within ``spread`` of its value."""
+    if modulation + spread < decoding.MIN_MODULATION:
         return "refusal"
-    return "number" if modulation - shift >= decoding.MIN_MODULATION else "either"
+    return "number" if modulation - spread >= decoding.MIN_MODULATION else "either"
 
 
-@PHASE.family("modulation, 8-bit frames", "rad", expects=_expects_modulation, modulation=MODULATIONS)
+@PHASE.family(
+    "modulation, 8-bit frames", "rad", expects=lambda modulation: _expects(modulation, ROUNDING), modulation=MODULATIONS
+)
 def modulation_8bit(modulation: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: asin(g /
     2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused"""
-    shift = 0.5 * frame_gain(18)
-    may_flag = 0.0 if modulation - shift >= decoding.MIN_MODULATION else 1.0
     error, flagged = _decoded_phase(modulation=modulation)
-    return worst(error, worst_angle(shift, modulation), flagged, may_flag)
+    may_flag = float(_expects(modulation, ROUNDING) != "number")
+    return worst(error, worst_angle(ROUNDING, modulation), flagged, may_flag)
 
 
-def _expects_noise(modulation: float) -> Expects:
-    sigma = math.sqrt(2 / 18) * math.hypot(NOISE_GREY, math.sqrt(1 / 12))
-    if modulation + 6 * sigma < decoding.MIN_MODULATION:
-        return "refusal"
-    return "number" if modulation - 6 * sigma > decoding.MIN_MODULATION else "either"
-
-
-@PHASE.family("modulation, noise of 1 grey level", "rad", expects=_expects_noise, modulation=MODULATIONS)
+@PHASE.family(
+    "modulation, noise of 1 grey level", "rad", expects=lambda modulation: _expects(modulation, 6 * NOISE),
+    modulation=MODULATIONS,
+)  # fmt: skip
 def noise(modulation: float) -> Outcome:
     """rms error of absolute phase, 20,000 pixels; against the phase that the frames were made from; bound: sqrt(2/N)
     sigma / B with sigma^2 = 1 + 1/12, second order 2 sigma_phi^2, 4 standard errors"""
-    error, flagged = _decoded_phase(modulation=modulation, count=20_000, noise_grey=NOISE_GREY)
-    sigma = math.sqrt(2 / 18) * math.hypot(NOISE_GREY, math.sqrt(1 / 12)) / modulation
-    unflagged = error[~flagged]
-    # Up to six sigma of noise above the limit of the modulation, pixels may be flagged.
-    may_flag = 0.0 if modulation > decoding.MIN_MODULATION + 6 * sigma * modulation else 1.0
+    error, flagged = _decoded_phase(modulation=modulation, count=20_000, noise_grey=1.0)
+    sigma, unflagged = NOISE / modulation, error[~flagged]
     if not unflagged.size:
         return Outcome(None, flagged=1.0, note="every pixel is masked: low modulation")
     bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * unflagged.size))
+    may_flag = float(_expects(modulation, 6 * NOISE) != "number")  # up to six sigma above the limit
     return Outcome(float(np.sqrt(np.mean(unflagged**2))), bound, float(flagged.mean()), may_flag)
 
 
@@ -247,11 +247,12 @@ def saturation_phase(share: float, steps: int) -> Outcome:
     leak = sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(steps, highest)) if share else 0.0
     rest = 8 / (math.pi * (steps * highest) * steps)  # of the tail: |coefficient| <= 4 / (pi order^2)
     bound = worst_angle(leak + (rest if share else 0.0), 1 - _clip_harmonic(1, alpha)) + 100 * U64
-    return worst(phase_error(frames, phases()), bound)
+    return worst(phase_error(frames), bound)
 
 
 def _expects_saturation(share: float) -> Expects:
-    return "refusal" if math.floor(18 * share) > 2 else "number" if math.floor(18 * share) + 1 <= 2 else "either"
+    clipped = math.floor(18 * share)  # frames, or one more
+    return "refusal" if clipped > 2 else "number" if clipped < 2 else "either"
 
 
 @PHASE.family("saturation, decoder", "rad", expects=_expects_saturation, share=SHARES)
@@ -262,8 +263,8 @@ def saturation_decoder(share: float) -> Outcome:
     alpha = math.pi * share
     left = MODULATION * (1 - _clip_harmonic(1, alpha))
     leak = MODULATION * sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(18, 500))
-    may_flag = 0.0 if math.floor(18 * share) + 1 <= 2 else 1.0
-    return worst(error, worst_angle(leak + 0.5 * frame_gain(18), left), flagged, may_flag)
+    may_flag = float(_expects_saturation(share) != "number")
+    return worst(error, worst_angle(leak + ROUNDING, left), flagged, may_flag)
 
 
 @PHASE.family("gamma", "rad", steps=(18, 4, 3), gamma=(1.0, 1.5, 2.2, 3.0))
@@ -274,7 +275,7 @@ def gamma_bend(gamma: float, steps: int) -> Outcome:
     theta = 2 * np.pi * np.arange(1 << 14) / (1 << 14)
     harmonics = np.abs(np.fft.rfft((0.5 + 120.0 / 255.0 * np.cos(theta)) ** gamma)) / theta.size
     leak = float(sum(harmonics[order] for order in _aliases(steps, 4000 // steps)))
-    return worst(phase_error(frames, phases()), worst_angle(leak, float(harmonics[1])) + 100 * U64)
+    return worst(phase_error(frames), worst_angle(leak, float(harmonics[1])) + 100 * U64)
 
 
 @PHASE.family("quantisation", "rad", steps=(18, 3), bits=(1, 2, 3, 4, 6, 8, 10, 12, 14, 16))
@@ -286,14 +287,14 @@ def quantisation(bits: int, steps: int) -> Outcome:
     bound = worst_angle(255.0 / levels / 2 * frame_gain(steps))
     if bits == 1:
         bound = min(bound, math.pi / steps)
-    return worst(phase_error(frames, phases()), bound + 100 * U64)
+    return worst(phase_error(frames), bound + 100 * U64)
 
 
 @PHASE.family("few steps", "rad", steps=(3, 4, 5, 6, 7, 9, 12, 18))
 def few_steps(steps: int) -> Outcome:
     """wrapped phase of 8-bit frames, B = 100; against the phase that the frames were made from; bound: asin(g / 2B), g
     = max (2/N) sum |sin|"""
-    return worst(phase_error(grey(sinusoids(phases(), shifts(steps))), phases()), worst_angle(0.5 * frame_gain(steps)))
+    return worst(phase_error(grey(sinusoids(phases(), shifts(steps)))), worst_angle(0.5 * frame_gain(steps)))
 
 
 @PHASE.family("unequal steps", "rad", chosen=(3, 4, 5, 7, 8, 11, 13, 17))
@@ -305,7 +306,7 @@ def uneven_steps(chosen: int) -> Outcome:
     solve = np.linalg.inv(model.T @ model) @ model.T
     turn = np.linspace(0, np.pi, 3601)
     shift = np.abs(np.cos(turn)[:, None] * solve[1] + np.sin(turn)[:, None] * solve[2]).sum(axis=1).max()
-    error = phase_error(grey(sinusoids(phases(), deltas)), phases(), deltas)
+    error = phase_error(grey(sinusoids(phases(), deltas)), deltas)
     return worst(error, worst_angle(0.5 * float(shift) * (1 + 1e-6)))
 
 
@@ -366,7 +367,7 @@ def repeated_frame(steps: int) -> Outcome:
     2 sin(pi/N)): one frame off by 2 B sin(pi/N) at most"""
     frames = sinusoids(phases(), shifts(steps))
     frames[1] = frames[0]
-    return worst(phase_error(frames, phases()), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
+    return worst(phase_error(frames), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
 
 
 @PHASE.family(
