@@ -12,8 +12,8 @@ from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import WITHIN
 from fpp_ml_bench.evaluation.result import mean_over_samples, median_over_samples, pooled
-from fpp_ml_bench.evaluation.score import error_stats
-from fpp_ml_bench.evaluation.score.scores import EMPTY, ErrorStats, combine, score_sample
+from fpp_ml_bench.evaluation.score import sample_scores
+from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, ErrorStats, combine, score_sample
 
 
 def reference(prediction, target):
@@ -94,7 +94,7 @@ def test_block_borders_and_empty_blocks(monkeypatch):
     prediction = target + np.random.default_rng(0).normal(0, 2, target.shape)
     expected = score_sample(prediction, target).metrics()
     for block in (1, 7, 52, 1000):
-        monkeypatch.setattr(error_stats, "BLOCK", block)
+        monkeypatch.setattr(sample_scores, "BLOCK", block)
         blocked = score_sample(prediction, target).metrics()
         for key, value in expected.items():
             assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
