@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import result, submission  # imported when used: pydantic takes long
-from fpp_ml_bench.evaluation.protocol import (
-    EDGE_BAND_PX, METRICS, MODES, PROTOCOL_VERSION, TARGETS, WIDE_BAND_PX, Mode, Units,
-)  # fmt: skip
+from fpp_ml_bench.evaluation import (
+    protocol,
+    result,
+    submission,
+)  # rooms: loaded when used, pydantic takes long
+from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
 from fpp_ml_bench.files import printable
@@ -67,7 +69,7 @@ def evaluate(
     dataset: ScoredDataset,
     split: str = "test",
     target: str = "depth",
-    edge_band_px: int = EDGE_BAND_PX,
+    edge_band_px: int = protocol.EDGE_BAND_PX,
     mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
 ) -> result.Result:
@@ -124,7 +126,7 @@ def evaluate(
     benchmark = benchmark_of(dataset.fingerprint)
     return result.result_from_rows(
         [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
-        protocol_version=PROTOCOL_VERSION,
+        protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=description,
         dataset={
@@ -147,10 +149,10 @@ def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode
     """The split's samples; refuses arguments that name no folder, target, mode or sample."""
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    if target not in TARGETS:
-        raise DatasetError(f"expected target {' or '.join(TARGETS)}, got {printable(target)!r}")
-    if mode not in MODES:
-        raise DatasetError(f"expected mode {' or '.join(MODES)}, got {printable(mode)!r}")
+    if target not in protocol.TARGETS:
+        raise DatasetError(f"expected target {' or '.join(protocol.TARGETS)}, got {printable(target)!r}")
+    if mode not in protocol.MODES:
+        raise DatasetError(f"expected mode {' or '.join(protocol.MODES)}, got {printable(mode)!r}")
     if target == "depth_exact" and not dataset.has_exact:
         raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
     samples = dataset.samples(split)
@@ -246,10 +248,10 @@ def differences(scored: result.Result, folder: Path, dataset: ScoredDataset) -> 
     Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
     `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute.
     """
-    if scored.protocol_version != PROTOCOL_VERSION:
+    if scored.protocol_version != protocol.PROTOCOL_VERSION:
         raise SubmissionError(
-            f"the result was scored by protocol {scored.protocol_version}, this is {PROTOCOL_VERSION}; verify it with "
-            "the version of fpp-ml-bench that its environment names, or score the predictions again"
+            f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
+            "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
         )
     if scored.dataset.fingerprint != dataset.fingerprint:
         return [
@@ -285,7 +287,7 @@ def _sample_differences(stored: result.SampleResult, recomputed: result.SampleRe
     exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
     object_mae_mm = recomputed.object_mae_mm or 0.0
-    for key in METRICS:
+    for key in protocol.METRICS:
         # Signed means and the error without an offset are small differences of large numbers.
         rounding_mm = 1e-9 * object_mae_mm if "bias" in key or "shift_free" in key else 0.0
         if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
@@ -318,7 +320,9 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     skipped = len(samples) * depth_mm.size - sum(boxes.values())
     unread_bytes = len(samples) * (frames + (depths - read) * depth_mm.itemsize) * depth_mm.size
     seconds = saved_by(
-        lambda: object_near_edges(depth_mm, (edge_band_px, WIDE_BAND_PX)), depth_mm.size - boxes[median], skipped
+        lambda: object_near_edges(depth_mm, (edge_band_px, protocol.WIDE_BAND_PX)),
+        depth_mm.size - boxes[median],
+        skipped,
     )
     lines = [
         LeftOut(

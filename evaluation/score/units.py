@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.evaluation.protocol import (
-    LARGEST_MM, METRES_AT_MOST, METRES_BELOW, MILLIMETRES_ABOVE, NORMALISED_AT_MOST, Mode, Units,
-)  # fmt: skip
+from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.protocol import Mode, Units
 
 Depth = NDArray[np.floating[Any]]
 
@@ -34,7 +33,7 @@ def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, un
             return problems
         prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
         low, high = float(prediction.min()), float(prediction.max())
-    largest = LARGEST_MM / MM_PER_UNIT[units]
+    largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
     if max(high, -low) > largest:
         problems.append(
             f"holds values up to {max(high, -low):.3g} {units} in magnitude; the limit is {largest:g}; write 0 where "
@@ -51,7 +50,7 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     normalised depth is declared, a single stray pixel must not decide, so the median over the object is compared.
     """
     if units == "mm":
-        if 0 < high < METRES_BELOW and target_max_mm > MILLIMETRES_ABOVE:
+        if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
             return (
                 f"looks like metres or normalised depth: its largest value is {high:.4g}, the target reaches "
                 f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
@@ -61,17 +60,17 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     if not depths.size:
         return None
     typical = float(np.median(depths))
-    if units == "m" and typical > METRES_AT_MOST:
+    if units == "m" and typical > protocol.METRES_AT_MOST:
         return (
             f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
             "mm in submission.yaml"
         )
-    if units == "m" and high < 1 and target_max_mm > MILLIMETRES_ABOVE:
+    if units == "m" and high < 1 and target_max_mm > protocol.MILLIMETRES_ABOVE:
         return (
             f"does not look like metres: its largest value is {high:.4g}, the target reaches "
             f"{target_max_mm / MM_PER_M:.2f} m; if it is normalised, declare units: normalised in submission.yaml"
         )
-    if units == "normalised" and typical > NORMALISED_AT_MOST:
+    if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
         return (
             f"does not look like normalised depth: its median over the object is {typical:.4g}, the target's is at "
             "most 1; if it is in m or mm, declare that in submission.yaml"
