@@ -7,10 +7,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pyarrow
+import pydantic
 
 from fpp_ml_bench import __version__, depth
-from fpp_ml_bench.evaluation.result.parts import Environment
-from fpp_ml_bench.evaluation.result.timing_block import HardwareInfo
+from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
 from fpp_ml_bench.machine import describe_hardware
 
 _EVALUATION = Path(__file__).resolve().parent.parent
@@ -19,16 +20,12 @@ _COMMIT = re.compile(r"[0-9a-f]{40,64}")
 
 def environment() -> Environment:
     """This machine and this code, for a result."""
-    import pyarrow
-    from pydantic import VERSION
-
-    packages = {"fpp_ml_bench": __version__, "numpy": np.__version__, "pyarrow": pyarrow.__version__,
-                "pydantic": VERSION}  # fmt: skip
+    modules = {"numpy": np, "pyarrow": pyarrow, "pydantic": pydantic}
     return Environment(
         python=platform.python_version(),
-        packages=packages,
+        packages={"fpp_ml_bench": __version__, **{name: module.__version__ for name, module in modules.items()}},
         git=checkout_commit(_EVALUATION.parent),
-        code_sha256=scoring_code(),
+        code_sha256=_scoring_code(),
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
     )
 
@@ -38,35 +35,31 @@ def checkout_commit(folder: Path) -> str | None:
 
     No ``git`` is run: starting it would take as long as scoring several samples, and it need not be installed.
     """
+
+    def text_of(path: Path) -> str:
+        return path.read_text(encoding="utf-8").strip()
+
     own_folder = folder / ".git"
     try:
         if own_folder.is_file():  # a worktree: the file holds the path of its own git folder
-            own_folder = folder / own_folder.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
-        head = (own_folder / "HEAD").read_text(encoding="utf-8").strip()
-        if not head.startswith("ref:"):
-            return head if _COMMIT.fullmatch(head) else None
-        name = head.removeprefix("ref:").strip()
-        common = own_folder / "commondir"
-        git_folders = [own_folder] + (
-            [own_folder / common.read_text(encoding="utf-8").strip()] if common.is_file() else []
-        )
-        for git_folder in git_folders:
-            if (git_folder / name).is_file():
-                commit = (git_folder / name).read_text(encoding="utf-8").strip()
-                return commit if _COMMIT.fullmatch(commit) else None
-        for git_folder in git_folders:
-            if (git_folder / "packed-refs").is_file():
-                for line in (git_folder / "packed-refs").read_text(encoding="utf-8").splitlines():
-                    commit, _, ref = line.partition(" ")
-                    if ref == name and _COMMIT.fullmatch(commit):
-                        return commit
+            own_folder = folder / text_of(own_folder).removeprefix("gitdir:").strip()
+        head = text_of(own_folder / "HEAD")
+        if head.startswith("ref:"):
+            name = head.removeprefix("ref:").strip()
+            common = own_folder / "commondir"
+            git_folders = [own_folder, *([own_folder / text_of(common)] if common.is_file() else [])]
+            commits = [text_of(git / name) for git in git_folders if (git / name).is_file()]
+            for packed in (git / "packed-refs" for git in git_folders if (git / "packed-refs").is_file()):
+                lines = (line.partition(" ") for line in text_of(packed).splitlines())
+                commits += [commit for commit, _, ref in lines if ref == name]
+            head = commits[0] if commits else ""
     except (OSError, UnicodeDecodeError):
         return None
-    return None
+    return head if _COMMIT.fullmatch(head) else None
 
 
 @cache
-def scoring_code() -> str:
+def _scoring_code() -> str:
     """SHA-256 over the source files that compute scores, 64 hex digits."""
     digest = hashlib.sha256()
     for path in (_EVALUATION / "protocol.py", *sorted((_EVALUATION / "score").glob("*.py")), Path(depth.__file__)):

@@ -1,15 +1,15 @@
-"""``submission.yaml``: the description of a submission, as a strict model."""
+"""``submission.yaml``: the description of a submission, read into a strict model and written from it."""
 
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
-from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
+from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, SparseModel, Text, validate
 from fpp_ml_bench.files import printable, strict_yaml
 
 SUBMISSION_FILE = "submission.yaml"
@@ -19,10 +19,7 @@ MAX_BYTES = 65536
 
 
 def read_plain(folder: Path) -> dict[Any, Any]:
-    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked.
-
-    SubmissionError names the file, what is wrong with it and what to do.
-    """
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
     path = folder / SUBMISSION_FILE
     if path.is_symlink() or not path.is_file():
         raise SubmissionError(
@@ -34,7 +31,7 @@ def read_plain(folder: Path) -> dict[Any, Any]:
 
 
 def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
-    """Keys and values of a YAML file, bounded and plain as this module says; ``example`` shows what a line looks like.
+    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
 
     SubmissionError names the file, what is wrong with it and what to do.
     """
@@ -57,7 +54,7 @@ def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
     return content
 
 
-class Submission(StrictModel):
+class Submission(SparseModel):
     """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
 
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
@@ -66,6 +63,8 @@ class Submission(StrictModel):
     black outside the object); false is never written, so that files without this key stay as they are.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
     """
+
+    SPARSE = ("uses_ground_truth_mask",)
 
     name: Text
     method: Text
@@ -99,19 +98,17 @@ class Submission(StrictModel):
             raise ValueError("timing.frames is not the number of frames_used; time this very method")
         return self
 
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content: dict[str, Any] = handler(self)
-        if not self.uses_ground_truth_mask:
-            content.pop("uses_ground_truth_mask", None)
-        return content
-
     @property
     def track(self) -> Track:
         """``metric``, or what of the test samples' ground truth the method was given: range, object mask or both."""
         if self.uses_ground_truth_range:
             return "oracle range + mask" if self.uses_ground_truth_mask else "oracle range"
         return "oracle mask" if self.uses_ground_truth_mask else "metric"
+
+    def to_yaml(self) -> str:
+        """The file's text: the keys that were given, in the model's order."""
+        content = self.model_dump(mode="json", exclude_unset=True)
+        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
 def read_submission(folder: Path) -> Submission:

@@ -1,12 +1,13 @@
-"""Result files on disk: written complete or not at all, and read strictly."""
+"""Result files on disk: written complete or not at all, read strictly; and the JSON Schema of all such files."""
 
 import json
 from pathlib import Path
 from typing import Any, get_args
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import SchemaVersion
-from fpp_ml_bench.evaluation.result.result_model import Result
+from fpp_ml_bench.evaluation import report, submission
+from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION, SchemaVersion
+from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.files import printable, write_atomically
 
@@ -20,25 +21,24 @@ def result_content(result: Result) -> dict[str, Any]:
     return content
 
 
+def _json_bytes(content: Any) -> bytes:
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
+
+
 def result_json(result: Result) -> bytes:
     """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
-    text = json.dumps(result_content(result), indent=1, allow_nan=False, ensure_ascii=False)
-    return text.encode("utf-8") + b"\n"
+    return _json_bytes(result_content(result))
 
 
 def write_result(result: Result, path: Path) -> None:
     """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
-    _write(path, result_json(result))
+    write_json(result_content(result), path)
 
 
 def write_json(content: Any, path: Path) -> None:
     """Write plain ``content`` as JSON to ``path``, as `write_result` does."""
-    _write(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n")
-
-
-def _write(path: Path, data: bytes) -> None:
     try:
-        write_atomically(path, data)
+        write_atomically(path, _json_bytes(content))
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
 
@@ -53,7 +53,8 @@ def read_json(path: Path) -> Any:
     file = printable(str(path), 500)
     try:
         if not path.is_file():
-            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {_kind(path)}")
+            kind = "a folder" if path.is_dir() else "no such file"
+            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {kind}")
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
@@ -96,5 +97,14 @@ def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no number a score can have")
 
 
-def _kind(path: Path) -> str:
-    return "a folder" if path.is_dir() else "no such file"
+def json_schema(name: str) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``.
+
+    It lists the keys and what each may hold. Whether averages follow from the samples is checked on reading.
+    """
+    models = {"result": Result, "submission": submission.Submission, "comparison": report.Comparison}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"fpp-ml-bench {name}, schema version {RESULT_SCHEMA_VERSION}",
+        **{key: value for key, value in models[name].model_json_schema().items() if key != "title"},
+    }
