@@ -1,10 +1,9 @@
-"""Predictions as ``.npy``: the header is checked before memory is taken, and nothing is ever unpickled."""
+"""Predictions as ``.npy`` and ``.npz``: the header is checked before memory is taken, and nothing is ever unpickled."""
 
 import hashlib
 import io
 import zipfile
 import zlib
-from io import BytesIO
 from pathlib import Path
 from threading import Lock
 from tokenize import TokenError
@@ -20,93 +19,73 @@ from fpp_ml_bench.files import fill, opened, printable, read_bounded
 HEADER_BYTES = 16384
 # NumPy parses a header through `ast`, whose recursion counter all threads share (CPython 3.11): two at once may fail.
 _PARSING = Lock()
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_NO_HEADER = (ValueError, TypeError, SyntaxError, TokenError, KeyError, RecursionError, MemoryError, OverflowError)
+_Layout = tuple[np.dtype[Any], bool, int]
+"""Type, whether in Fortran order, and the offset of the first value."""
 
 
-def read_prediction(path: Path, size: tuple[int, int], buffer: bytearray | None = None) -> tuple[NDArray[Any], str]:
+def read_prediction(path: Path, size: tuple[int, int], buffer: bytearray) -> tuple[NDArray[Any], str]:
     """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored.
 
-    ``size`` is the expected (H, W). ``buffer`` (see `buffer_for`) is reused when given: the array is a view of it and
-    valid until the next read. Raises PredictionError, without the file's name, for anything but a plain .npy of that
-    size and a real float dtype.
+    ``size`` is the expected (H, W). The array is a view of ``buffer`` (of `largest_npy` bytes), valid until the next
+    read. Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a real float
+    dtype.
     """
-    buffer = buffer_for(size) if buffer is None else buffer
     view = memoryview(buffer)
     with opened(path) as (stream, length):
         filled = fill(stream, view[: min(HEADER_BYTES, length)])
-        dtype, fortran, start = check_header(bytes(view[:filled]), size)
-        expected = start + size[0] * size[1] * dtype.itemsize
-        check_length(length, expected)
-        filled += fill(stream, view[filled:expected])
-        if filled != expected:
-            raise PredictionError(f"ended early: expected {expected} bytes, got {filled}; write it again")
-    digest = hashlib.sha256(view[:expected]).hexdigest()
-    return array_in(buffer, size, dtype, fortran, start), digest
-
-
-def buffer_for(size: tuple[int, int]) -> bytearray:
-    """A buffer for the largest accepted file of an (H, W) map: float64 and its header."""
-    return bytearray(largest_npy(size))
+        layout = _layout(bytes(view[:filled]), length, size)
+        filled += fill(stream, view[filled:length])
+        if filled != length:
+            raise PredictionError(f"ended early: expected {length} bytes, got {filled}; write it again")
+    digest = hashlib.sha256(view[:length]).hexdigest()
+    return _array_in(buffer, size, layout), digest
 
 
 def largest_npy(size: tuple[int, int]) -> int:
-    """Bytes of the largest accepted .npy of an (H, W) map."""
+    """Bytes of the largest accepted .npy of an (H, W) map: float64 and its header."""
     return HEADER_BYTES + size[0] * size[1] * 8
 
 
 def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
     """The array in the bytes of a .npy file; PredictionError as `read_prediction`."""
-    dtype, fortran, start = check_header(content[:HEADER_BYTES], size)
-    check_length(len(content), start + size[0] * size[1] * dtype.itemsize)
-    return array_in(content, size, dtype, fortran, start)
+    return _array_in(content, size, _layout(content[:HEADER_BYTES], len(content), size))
 
 
-def array_in(
-    content: bytes | bytearray, size: tuple[int, int], dtype: np.dtype[Any], fortran: bool, start: int
-) -> NDArray[Any]:
-    """The (H, W) array that begins at byte ``start``, a view."""
+def _array_in(content: bytes | bytearray, size: tuple[int, int], layout: _Layout) -> NDArray[Any]:
+    """The (H, W) array in a whole file's bytes, a view."""
+    dtype, fortran, start = layout
     flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
     return flat.reshape(size, order="F" if fortran else "C")
 
 
-def check_length(length: int, expected: int) -> None:
-    """Refuse a file that is shorter or longer than its header says."""
-    if length != expected:
-        problem = "is truncated" if length < expected else "has foreign bytes after the array"
-        raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
-
-
-def check_header(head: bytes, size: tuple[int, int]) -> tuple[np.dtype[Any], bool, int]:
-    """Dtype, Fortran order and data offset of a .npy file that begins with ``head``."""
+def _layout(head: bytes, length: int, size: tuple[int, int]) -> _Layout:
+    """Of a .npy file of ``length`` bytes that begins with ``head``; refuses what is not a map of ``size``."""
     if head[:4] == b"PK\x03\x04":
         raise PredictionError(
             "is a zip archive (np.savez?) under the name .npy; write it with np.save, or name it .npz"
         )
-    stream = BytesIO(head)
+    stream = io.BytesIO(head)
     try:
         version = npy.read_magic(stream)
-        if version not in ((1, 0), (2, 0)):
-            raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        with _PARSING:
-            shape, fortran, dtype = read(stream)
-    except (
-        ValueError,
-        TypeError,
-        SyntaxError,
-        TokenError,
-        KeyError,
-        RecursionError,
-        MemoryError,
-        OverflowError,
-    ) as error:
-        if isinstance(error, PredictionError):
-            raise
+        if (read := _HEADERS.get(version)) is not None:
+            with _PARSING:
+                shape, fortran, dtype = read(stream)
+    except _NO_HEADER:
         raise PredictionError("is no .npy file, or its header is damaged; write it with np.save") from None
-    check_array(dtype, shape, size)
-    return dtype, fortran, stream.tell()
+    if read is None:
+        raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
+    _check_array(dtype, shape, size)
+    start = stream.tell()
+    expected = start + size[0] * size[1] * dtype.itemsize
+    if length != expected:
+        problem = "is truncated" if length < expected else "has foreign bytes after the array"
+        raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
+    return dtype, fortran, start
 
 
-def check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
+def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
     """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers, other shapes."""
     if dtype.hasobject:
         raise PredictionError("holds pickled Python objects, which are never opened; save a float32 array")
@@ -144,9 +123,9 @@ def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             array = parse_npy(_unpacked(archive, largest), size)
+    except PredictionError:
+        raise
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, RuntimeError) as error:
-        if isinstance(error, PredictionError):
-            raise
         raise PredictionError(
             f"is no .npz archive, or damaged ({printable(str(error), 80)}); write it with np.savez"
         ) from None

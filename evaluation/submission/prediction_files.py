@@ -1,5 +1,6 @@
-"""Which prediction files a folder holds, in which of the accepted forms, and what is missing or extra."""
+"""Which prediction files a folder holds, in which of the accepted forms, what is missing or extra, and their reader."""
 
+import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,12 +11,12 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission.description import REPORTS_FILE, SUBMISSION_FILE
-from fpp_ml_bench.evaluation.submission.npy import buffer_for, read_prediction
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.evaluation.submission.npy import largest_npy, parse_npy, read_npz, read_prediction
+from fpp_ml_bench.files import printable, read_bounded
 
 PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
 TABLES = ("predictions.parquet", "predictions.arrow")
-FORMS = "{sample}.npy, .npz, .mat or .png, or one predictions.parquet or .arrow"
+_MAT_SPARE_BYTES = 1 << 20
 
 
 class Listing(NamedTuple):
@@ -32,49 +33,31 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split.
     """
     try:
-        names = sorted(entry.name for entry in os.scandir(folder))
+        names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
         raise PredictionError(
             f"the predictions folder {printable(str(folder))} can't be read: {error.strerror}"
         ) from None
-    form = _form(set(names), samples)
-    expected = {form} if form in TABLES else {f"{sample}{form}" for sample in samples}
-    problems = [
-        f"{name}: is missing; write one for each sample"
-        for name in _in_order(expected, samples, form)
-        if name not in names
-    ]
-    problems += [
-        f"{printable(name)}: is extra ({_hint(name, form, samples, split, split_of)})"
-        for name in names
-        if name not in expected and name not in (SUBMISSION_FILE, REPORTS_FILE)
-    ]
-    if form in TABLES:
-        return Listing(form, problems, list(samples))
-    present = set(names)
-    return Listing(form, problems, [sample for sample in samples if f"{sample}{form}" in present])
-
-
-def _form(names: set[str], samples: Sequence[str]) -> str:
     counts = {suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE}
-    best = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
-    if counts[best] == 0:
-        return next((table for table in TABLES if table in names), best)
-    return best
+    form = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
+    if counts[form] == 0:
+        form = next((table for table in TABLES if table in names), form)
+    files = {form: ""} if form in TABLES else {f"{sample}{form}": sample for sample in samples}
 
+    def hint(name: str) -> str:
+        stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
+        sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
+        if sample_split and stem not in samples:
+            return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
+        if sample_split or name in TABLES:
+            return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
+        return "remove it"
 
-def _in_order(expected: set[str], samples: Sequence[str], form: str) -> list[str]:
-    return list(expected) if form in TABLES else [f"{sample}{form}" for sample in samples]
-
-
-def _hint(name: str, form: str, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> str:
-    stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
-    sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
-    if sample_split and stem not in samples:
-        return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
-    if sample_split or name in TABLES:
-        return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
-    return "remove it"
+    problems = [f"{name}: is missing; write one for each sample" for name in files if name not in names]
+    extra = sorted(names - {*files, SUBMISSION_FILE, REPORTS_FILE})
+    problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
+    present = list(samples) if form in TABLES else [sample for name, sample in files.items() if name in names]
+    return Listing(form, problems, present)
 
 
 MapAndHash = tuple[NDArray[Any], str]
@@ -104,30 +87,40 @@ class _FilePerSample:
 def reader_for(
     form: str, folder: Path, samples: Sequence[str], size: tuple[int, int], png_mm_per_level: float | None
 ) -> Reader:
-    """The reader of ``form`` (of `fpp_ml_bench.evaluation.submission.prediction_files`) for maps of ``size`` (H, W).
+    """The reader of ``form`` (of `PER_SAMPLE` or `TABLES`) for maps of ``size`` (H, W).
 
-    Its calls raise PredictionError, without the file's name, for a file that is refused.
+    Its calls raise PredictionError, without the file's name, for a file that is refused. What only some forms need is
+    imported for these forms only.
     """
     if form in TABLES:
         from fpp_ml_bench.evaluation.submission.table import TablePredictions
 
         return TablePredictions(folder / form, samples, size)
     if form == ".npz":
-        from fpp_ml_bench.evaluation.submission.npy import read_npz
-
         return _FilePerSample(folder, form, lambda path, memory: read_npz(path, size))
     if form == ".mat":
-        from fpp_ml_bench.evaluation.submission.mat import read_mat
-
-        return _FilePerSample(folder, form, lambda path, memory: read_mat(path, size))
+        return _FilePerSample(folder, form, _mat_reader(size))
     if form == ".png":
         from fpp_ml_bench.evaluation.submission.png import read_png
 
         return _FilePerSample(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
-    return _FilePerSample(folder, form, lambda path, memory: _read_npy(path, size, memory))
+
+    def read_npy(path: Path, memory: local) -> MapAndHash:
+        if not hasattr(memory, "buffer"):
+            memory.buffer = bytearray(largest_npy(size))
+        return read_prediction(path, size, memory.buffer)
+
+    return _FilePerSample(folder, form, read_npy)
 
 
-def _read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
-    if not hasattr(memory, "buffer"):
-        memory.buffer = buffer_for(size)
-    return read_prediction(path, size, memory.buffer)
+def _mat_reader(size: tuple[int, int]) -> Callable[[Path, local], MapAndHash]:
+    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess
+
+    largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
+    matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest)
+
+    def read_mat(path: Path, memory: local) -> MapAndHash:
+        content = read_bounded(path, largest)
+        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
+
+    return read_mat
