@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock, local
-from typing import Any, NamedTuple, Protocol, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import (
-    protocol,
-    result,
-    submission,
-)  # rooms: loaded when used, pydantic takes long
+from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
@@ -27,31 +23,11 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import Sequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 WORKERS = 4
 Outcome = tuple[list[str], list[dict[str, Any]]]
 """Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
-
-
-class ScoredDataset(Protocol):
-    """What the evaluator needs of a dataset; `fpp_ml_bench.loaders.storage.DatasetFolder` has it."""
-
-    path: Path
-
-    @property
-    def fingerprint(self) -> str: ...
-    @property
-    def size(self) -> tuple[int, int]: ...
-    @property
-    def sequence(self) -> Sequence: ...
-    @property
-    def splits(self) -> dict[str, list[str]]: ...
-    @property
-    def has_exact(self) -> bool: ...
-    def samples(self, split: str) -> list[str]: ...
-    def target_mm(self, sample: str, column: str = ...) -> NDArray[np.float32]: ...
 
 
 class Rules(NamedTuple):
@@ -66,7 +42,7 @@ class Rules(NamedTuple):
 
 def evaluate(
     folder: str | Path,
-    dataset: ScoredDataset,
+    dataset: DatasetFolder,
     split: str = "test",
     target: str = "depth",
     edge_band_px: int = protocol.EDGE_BAND_PX,
@@ -93,24 +69,19 @@ def evaluate(
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
     listing = submission.list_folder(folder, samples, split, split_of)
     units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
-    # What is no number is refused with the description.
+    # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
+    # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
     rules = Rules(dataset.size, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
     problems, rows = list(listing.problems), []
-    release = getattr(dataset, "release", lambda sample: None)  # only a memory-mapped dataset has pages to release
-    outcomes = (
-        _scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target), release)
-        if units in get_args(Units)
-        else ()
-    )
+    outcomes = _scored(folder, listing, rules, dataset, target) if units in get_args(Units) else ()
     description: submission.Submission | None = None
     if content is not None:
-        # The description is checked while the first files are scored: pydantic takes long to import.
         try:
             description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
             description_error = error
-        _ = result.environment  # imported while the threads score
+        result.environment  # noqa: B018  imported while the threads score
         while_scoring()
     for file_problems, file_rows in outcomes:
         problems += file_problems
@@ -145,7 +116,7 @@ def evaluate(
     )
 
 
-def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode: str) -> list[str]:
+def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode: str) -> list[str]:
     """The split's samples; refuses arguments that name no folder, target, mode or sample."""
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
@@ -188,15 +159,9 @@ def _checked_submission(
 
 
 def _scored(
-    folder: Path,
-    listing: submission.Listing,
-    rules: Rules,
-    target_mm: Callable[[str], NDArray[np.float32]],
-    release: Callable[[str], None],
+    folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder, column: str
 ) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order.
-
-    ``target_mm`` gives a sample's target (H, W); ``release`` is called when it is not needed any more.
+    """Problems and row of each sample that has a prediction, in order; its target is the dataset's ``column``.
 
     Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
@@ -205,7 +170,7 @@ def _scored(
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = target_mm(sample)
+            target = dataset.target_mm(sample, column)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             raise DatasetError(
@@ -220,7 +185,7 @@ def _scored(
         except PredictionError as error:
             problems = [str(error)]
         with dataset_lock:
-            release(sample)
+            dataset.release(sample)
         if problems:
             return [f"{read.named(sample)}: {problem}" for problem in problems], []
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
@@ -242,7 +207,7 @@ _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
 """`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
 
 
-def differences(scored: result.Result, folder: Path, dataset: ScoredDataset) -> list[str]:
+def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> list[str]:
     """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
 
     Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what

@@ -118,7 +118,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _import_output() -> None:
-    from fpp_ml_bench.evaluation.report import terminal as table  # noqa: F401
+    from fpp_ml_bench.evaluation.report import terminal  # noqa: F401
 
 
 def _check_output(path: Path, folder: Path) -> None:
