@@ -1,3 +1,4 @@
+from .file import environment as environment
 from .file import json_schema as json_schema
 from .file import parse_result as parse_result
 from .file import read_json as read_json
@@ -23,4 +24,3 @@ from .parts import SampleResult as SampleResult
 from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
 from .parts import dataset_identity as dataset_identity
-from .provenance import environment as environment

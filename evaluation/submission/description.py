@@ -6,52 +6,10 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, SparseModel, Text, validate
-from fpp_ml_bench.files import printable, strict_yaml
-
-SUBMISSION_FILE = "submission.yaml"
-REPORTS_FILE = "per_sample.json"
-"""What a method may report of each sample beside its predictions; it is not scored."""
-MAX_BYTES = 65536
-
-
-def read_plain(folder: Path) -> dict[Any, Any]:
-    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
-    path = folder / SUBMISSION_FILE
-    if path.is_symlink() or not path.is_file():
-        raise SubmissionError(
-            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
-            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
-            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
-        )
-    return read_plain_file(path, "'name: My method'")
-
-
-def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
-    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
-
-    SubmissionError names the file, what is wrong with it and what to do.
-    """
-    file = printable(str(path), 500)
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; shorten names and settings")
-        content = strict_yaml(data.decode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SubmissionError(f"{file}: expected UTF-8 text") from None
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
-        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
-        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
-    if not isinstance(content, dict):
-        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
-    return content
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
 
 
 class Submission(SparseModel):

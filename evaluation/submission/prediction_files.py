@@ -1,4 +1,4 @@
-"""Which prediction files a folder holds, in which of the accepted forms, what is missing or extra, and their reader."""
+"""What a folder of predictions holds: the plain values of its description, and the files, their form and reader."""
 
 import hashlib
 import os
@@ -7,12 +7,54 @@ from pathlib import Path
 from threading import local
 from typing import Any, NamedTuple, Protocol
 
+import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission.description import REPORTS_FILE, SUBMISSION_FILE
-from fpp_ml_bench.evaluation.submission.npy import largest_npy, parse_npy, read_npz, read_prediction
-from fpp_ml_bench.files import printable, read_bounded
+from fpp_ml_bench.errors import PredictionError, SubmissionError
+from fpp_ml_bench.evaluation.submission.sample_files import largest_npy, parse_npy, read_npz, read_png, read_prediction
+from fpp_ml_bench.files import printable, read_bounded, strict_yaml
+
+SUBMISSION_FILE = "submission.yaml"
+REPORTS_FILE = "per_sample.json"
+"""What a method may report of each sample beside its predictions; it is not scored."""
+_MAX_BYTES = 65536
+
+
+def read_plain(folder: Path) -> dict[Any, Any]:
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
+    path = folder / SUBMISSION_FILE
+    if path.is_symlink() or not path.is_file():
+        raise SubmissionError(
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
+            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
+            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
+        )
+    return read_plain_file(path, "'name: My method'")
+
+
+def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
+    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
+
+    SubmissionError names the file, what is wrong with it and what to do.
+    """
+    file = printable(str(path), 500)
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            raise SubmissionError(f"{file}: expected at most {_MAX_BYTES} bytes; shorten names and settings")
+        content = strict_yaml(data.decode("utf-8"))
+    except OSError as error:
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{file}: expected UTF-8 text") from None
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
+        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
+    if not isinstance(content, dict):
+        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
+    return content
+
 
 PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
 TABLES = ("predictions.parquet", "predictions.arrow")
@@ -101,8 +143,6 @@ def reader_for(
     if form == ".mat":
         return _FilePerSample(folder, form, _mat_reader(size))
     if form == ".png":
-        from fpp_ml_bench.evaluation.submission.png import read_png
-
         return _FilePerSample(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
 
     def read_npy(path: Path, memory: local) -> MapAndHash:

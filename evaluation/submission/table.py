@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
@@ -62,8 +63,6 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
     """The table as an uncompressed Arrow stream of at most ``largest`` bytes; what `ReadingProcess` calls."""
     try:
         if content.startswith(_PARQUET_MAGIC):
-            import pyarrow.parquet as pq  # in the reading process only
-
             limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
             file = pq.ParquetFile(pa.py_buffer(content), **limits)
             groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
