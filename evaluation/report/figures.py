@@ -54,17 +54,11 @@ def histogram(values: Sequence[float], mean: float, label: str) -> SimpleNamespa
     def up(count: int) -> float:
         return round(base - (base - _TOP) * count / tallest, 1)
 
-    bars = [
-        (
-            across(low) + 1,
-            up(n),
-            round(across(high) - across(low) - 2, 1),
-            round(base - up(n), 1),
-            f"{low:.4g} to {high:.4g} mm: {n}",
-        )
-        for low, high, n in zip(edges, edges[1:], counts, strict=False)
-        if n
-    ]
+    bars = []
+    for low, high, count in zip(edges, edges[1:], counts, strict=False):
+        if count:
+            box = across(low) + 1, up(count), across(high) - across(low) - 2, base - up(count)
+            bars.append((*(round(number, 1) for number in box), f"{low:.4g} to {high:.4g} mm: {count}"))
     return SimpleNamespace(
         width=_WIDTH, height=_HEIGHT, left=_LEFT, right=_WIDTH - _RIGHT, top=_TOP, base=base, bars=bars,
         levels=[(up(count), count) for count in range(0, tallest + 1, max(1, math.ceil(tallest / 4)))],

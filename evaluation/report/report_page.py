@@ -1,13 +1,11 @@
 """The report of a result: a histogram of the errors, the scores, and samples from best to worst on an HTML page."""
 
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from threading import local
 
-import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, sheet_png
@@ -18,7 +16,6 @@ from fpp_ml_bench.evaluation.submission import list_folder, reader_for
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
-Pair = tuple[NDArray[np.floating], NDArray[np.floating]]
 REPORT_FILE = "index.html"
 _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.25), ("Upper quartile", 0.75))
 """The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
@@ -118,27 +115,12 @@ def _chosen_panels(
             f"{dataset.path}: fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was "
             "scored; give the dataset that the result names"
         )
-    read = _prediction_reader(result, dataset, folder)
-    # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
-    used = [index for index in sorted(result.submission.frames_used) if index < len(dataset.sequence)]
-    for place, row in chosen_samples(result.per_sample):
-        prediction_mm, target_mm = read(row)
-        try:
-            fringe = dataset.frame(row.sample, used[0] if used else 0)
-        except DatasetError:
-            fringe = dataset.frame(row.sample, 0)
-        yield place, row, sample_panels(fringe, target_mm, prediction_mm, row.sample)
-
-
-def _prediction_reader(result: Result, dataset: DatasetFolder, folder: Path) -> Callable[[SampleResult], Pair]:
-    """A function from a sample's row to its prediction and target as they were scored, (H, W) each, in mm."""
-    samples = [row.sample for row in result.per_sample]
+    submission, samples = result.submission, [row.sample for row in result.per_sample]
     form = list_folder(folder, samples, result.dataset.split, {}).form
-    submission = result.submission
-    read = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
-    memory = local()
-
-    def pair(row: SampleResult) -> Pair:
+    read, memory = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level), local()
+    # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
+    used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
+    for place, row in chosen_samples(result.per_sample):
         try:
             values, digest = read(row.sample, memory)
         except PredictionError as error:
@@ -146,10 +128,12 @@ def _prediction_reader(result: Result, dataset: DatasetFolder, folder: Path) -> 
         if digest != row.prediction_sha256:
             raise PredictionError(f"{read.named(row.sample)}: is not the file that was scored; score the folder again")
         target_mm = dataset.target_mm(row.sample, result.target)
-        prediction_mm, target_mm = scored_pair(values, target_mm, submission.units, result.mode, row.sample)
-        return np.asarray(prediction_mm), np.asarray(target_mm)
-
-    return pair
+        prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample)
+        try:
+            fringe = dataset.frame(row.sample, used[0] if used else 0)
+        except DatasetError:
+            fringe = dataset.frame(row.sample, 0)
+        yield place, row, sample_panels(fringe, target, prediction_mm, row.sample)
 
 
 def _text(key: str, value: float | None) -> str:

@@ -282,8 +282,8 @@ class Reliance(StrictModel):
     parts: RelianceParts
     units: Literal["mm", "normalised"]
     direction: Literal["horizontal", "vertical"]
-    samples: Annotated[int, Field(gt=0)]
-    objects: Annotated[int, Field(gt=0)]
+    samples: Whole
+    objects: Whole
     dataset_fingerprint: Sha256
     protocol_version: Text
     weights_sha256: Sha256 | None

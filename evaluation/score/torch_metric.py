@@ -122,7 +122,7 @@ def _root_mean_square(errors: Tensor) -> Tensor:
 
 
 def _quantile(ascending: Tensor, level: float) -> Tensor:
-    """Linear interpolation between order statistics, as in `scores`."""
+    """Linear interpolation between order statistics, as in `sample_scores`."""
     position = level * (ascending.numel() - 1)
     low = int(position)
     below, above = ascending[low], ascending[min(low + 1, ascending.numel() - 1)]

@@ -10,7 +10,6 @@ import resource
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable
 from importlib import import_module
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
@@ -31,12 +30,12 @@ class ReadingProcess:
     def __init__(self, module: str, largest: int, *limits: int) -> None:
         self._arguments = [module, *map(str, (largest, *limits))]
         self._lock = Lock()
-        self._end: Callable[[], object] | None = None
+        self._running = False
 
     def __call__(self, content: bytes) -> bytes:
         """What ``read`` returns; PredictionError as it raises, or where the process ended or took too long."""
         with self._lock:
-            if self._end is None:
+            if not self._running:
                 self._start()
             try:
                 self._connection.send_bytes(content)
@@ -46,12 +45,10 @@ class ReadingProcess:
                 answer = b"" if problem else self._connection.recv_bytes()
             except (OSError, EOFError) as error:
                 self._end()
-                self._end = None
-                late = isinstance(error, TimeoutError)
-                problem = (
-                    f"can't be read within {TIMEOUT_S} s" if late else "is damaged: it ended the process reading it"
-                )
-                raise PredictionError(f"{problem}; write it again") from None
+                self._running = False
+                late = f"can't be read within {TIMEOUT_S} s; write it again"
+                ended = "is damaged: it ended the process that read it; write it again"
+                raise PredictionError(late if isinstance(error, TimeoutError) else ended) from None
         if problem:
             raise PredictionError(problem)
         return answer
@@ -66,6 +63,7 @@ class ReadingProcess:
         )  # fmt: skip
         theirs.close()
         self._end = weakref.finalize(self, _end, self._process, self._connection)
+        self._running = True
 
 
 def _end(process: subprocess.Popen, connection: Connection) -> None:
