@@ -3,7 +3,6 @@
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from threading import local
 
 from markupsafe import Markup
 
@@ -117,16 +116,18 @@ def _chosen_panels(
         )
     submission, samples = result.submission, [row.sample for row in result.per_sample]
     form = list_folder(folder, samples, result.dataset.split, {}).form
-    read, memory = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level), local()
+    reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
     # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
     used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
     for place, row in chosen_samples(result.per_sample):
         try:
-            values, digest = read(row.sample, memory)
+            values, digest = reader.read(row.sample)
         except PredictionError as error:
-            raise PredictionError(f"{read.named(row.sample)}: {error}") from None
+            raise PredictionError(f"{reader.named(row.sample)}: {error}") from None
         if digest != row.prediction_sha256:
-            raise PredictionError(f"{read.named(row.sample)}: is not the file that was scored; score the folder again")
+            raise PredictionError(
+                f"{reader.named(row.sample)}: is not the file that was scored; score the folder again"
+            )
         target_mm = dataset.target_mm(row.sample, result.target)
         prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample)
         try:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import Lock, local
+from threading import Lock
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -165,8 +165,8 @@ def _scored(
 
     Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
-    read = submission.reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
-    memory, dataset_lock = local(), Lock()
+    reader = submission.reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
+    dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
@@ -177,7 +177,7 @@ def _scored(
                 f"{sample}: the target depth holds NaN, infinite or negative values; run: fpp-bench verify"
             )
         try:
-            values, digest = read(sample, memory)
+            values, digest = reader.read(sample)
             problems = value_problems(values, target, high, rules.units)
             if not problems:
                 pair = scored_pair(values, target, rules.units, rules.mode, sample)
@@ -187,7 +187,7 @@ def _scored(
         with dataset_lock:
             dataset.release(sample)
         if problems:
-            return [f"{read.named(sample)}: {problem}" for problem in problems], []
+            return [f"{reader.named(sample)}: {problem}" for problem in problems], []
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
         return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 

@@ -5,13 +5,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import local
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.submission.sample_files import largest_npy, parse_npy, read_npz, read_png, read_prediction
+from fpp_ml_bench.evaluation.submission.sample_files import parse_npy, read_npy, read_npz, read_png
 from fpp_ml_bench.files import printable, read_bounded, strict_yaml
 
 SUBMISSION_FILE = "submission.yaml"
@@ -105,61 +105,45 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
 MapAndHash = tuple[NDArray[Any], str]
 
 
-class Reader(Protocol):
-    """Called from several threads; ``memory`` is the calling thread's own, for buffers that it reuses."""
+class Reader(NamedTuple):
+    """``read(sample)`` gives a map (H, W), valid until the same thread reads again, and the SHA-256 of its file.
 
-    def __call__(self, sample: str, memory: local) -> MapAndHash: ...
+    It may be called from several threads, and raises PredictionError, without the file's name, for a file that is
+    refused. ``named(sample)`` is the name of the sample's prediction in messages: its file.
+    """
 
-    def named(self, sample: str) -> str:
-        """The name of the sample's prediction in messages: its file."""
-        ...
-
-
-class _FilePerSample:
-    def __init__(self, folder: Path, form: str, read: Callable[[Path, local], MapAndHash]) -> None:
-        self._folder, self._form, self._read = folder, form, read
-
-    def named(self, sample: str) -> str:
-        return f"{sample}{self._form}"
-
-    def __call__(self, sample: str, memory: local) -> MapAndHash:
-        return self._read(self._folder / self.named(sample), memory)
+    read: Callable[[str], MapAndHash]
+    named: Callable[[str], str]
 
 
 def reader_for(
     form: str, folder: Path, samples: Sequence[str], size: tuple[int, int], png_mm_per_level: float | None
 ) -> Reader:
-    """The reader of ``form`` (of `PER_SAMPLE` or `TABLES`) for maps of ``size`` (H, W).
-
-    Its calls raise PredictionError, without the file's name, for a file that is refused. What only some forms need is
-    imported for these forms only.
-    """
+    """The reader of ``form`` (of `PER_SAMPLE` or `TABLES`) for maps of ``size`` (H, W)."""
     if form in TABLES:
-        from fpp_ml_bench.evaluation.submission.table import TablePredictions
+        from fpp_ml_bench.evaluation.submission.table import depth_maps  # needs pyarrow, which other forms do not
 
-        return TablePredictions(folder / form, samples, size)
-    if form == ".npz":
-        return _FilePerSample(folder, form, lambda path, memory: read_npz(path, size))
+        maps = depth_maps(folder / form, samples, size)
+        return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
     if form == ".mat":
-        return _FilePerSample(folder, form, _mat_reader(size))
-    if form == ".png":
-        return _FilePerSample(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
+        read = _mat_reader(size)
+    else:
+        memory = local()
+        read = {
+            ".npy": lambda path: read_npy(path, size, memory),
+            ".npz": lambda path: read_npz(path, size),
+            ".png": lambda path: read_png(path, size, png_mm_per_level),
+        }[form]
+    return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
 
-    def read_npy(path: Path, memory: local) -> MapAndHash:
-        if not hasattr(memory, "buffer"):
-            memory.buffer = bytearray(largest_npy(size))
-        return read_prediction(path, size, memory.buffer)
 
-    return _FilePerSample(folder, form, read_npy)
-
-
-def _mat_reader(size: tuple[int, int]) -> Callable[[Path, local], MapAndHash]:
-    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess
+def _mat_reader(size: tuple[int, int]) -> Callable[[Path], MapAndHash]:
+    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
 
     largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
     matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest)
 
-    def read_mat(path: Path, memory: local) -> MapAndHash:
+    def read_mat(path: Path) -> MapAndHash:
         content = read_bounded(path, largest)
         return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
 

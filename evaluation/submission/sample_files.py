@@ -6,7 +6,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from threading import Lock
+from threading import Lock, local
 from tokenize import TokenError
 from typing import Any
 
@@ -26,31 +26,32 @@ _Layout = tuple[np.dtype[Any], bool, int]
 """Type, whether in Fortran order, and the offset of the first value."""
 
 
-def read_prediction(path: Path, size: tuple[int, int], buffer: bytearray) -> tuple[NDArray[Any], str]:
+def read_npy(path: Path, size: tuple[int, int], memory: local) -> tuple[NDArray[Any], str]:
     """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored.
 
-    ``size`` is the expected (H, W). The array is a view of ``buffer`` (of `largest_npy` bytes), valid until the next
-    read. Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a real float
-    dtype.
+    ``size`` is the expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until
+    its next read. Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a
+    real float dtype.
     """
-    view = memoryview(buffer)
+    if not hasattr(memory, "buffer"):
+        memory.buffer = bytearray(_largest_npy(size))
+    view = memoryview(memory.buffer)
     with opened(path) as (stream, length):
         filled = fill(stream, view[: min(HEADER_BYTES, length)])
         layout = _layout(bytes(view[:filled]), length, size)
         filled += fill(stream, view[filled:length])
         if filled != length:
             raise PredictionError(f"ended early: expected {length} bytes, got {filled}; write it again")
-    digest = hashlib.sha256(view[:length]).hexdigest()
-    return _array_in(buffer, size, layout), digest
+    return _array_in(memory.buffer, size, layout), hashlib.sha256(view[:length]).hexdigest()
 
 
-def largest_npy(size: tuple[int, int]) -> int:
+def _largest_npy(size: tuple[int, int]) -> int:
     """Bytes of the largest accepted .npy of an (H, W) map: float64 and its header."""
     return HEADER_BYTES + size[0] * size[1] * 8
 
 
 def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
-    """The array in the bytes of a .npy file; PredictionError as `read_prediction`."""
+    """The array in the bytes of a .npy file; PredictionError as `read_npy`."""
     return _array_in(content, size, _layout(content[:HEADER_BYTES], len(content), size))
 
 
@@ -114,12 +115,12 @@ _ENCRYPTED = 0x1
 
 
 def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
-    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_prediction`.
+    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`.
 
     The array may have any name. The size that the archive declares is checked before a byte is unpacked, and unpacking
     stops at the limit even where the archive declares a wrong size.
     """
-    largest = largest_npy(size)
+    largest = _largest_npy(size)
     content = read_bounded(path, largest + _ARCHIVE_BYTES)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -167,7 +168,7 @@ _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
 def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> tuple[NDArray[Any], str]:
-    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_prediction`.
+    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`.
 
     The header, every checksum and the unpacked length are checked before the image is decoded. A level of 65535 is
     refused: there a depth that does not fit was cut off.

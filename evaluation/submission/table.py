@@ -6,9 +6,8 @@ trusted.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Lock, local
 from typing import Any
 
 import numpy as np
@@ -27,36 +26,28 @@ _ROWS_AT_ONCE = 8
 _ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
-class TablePredictions:
-    """A reader (`fpp_ml_bench.evaluation.submission.prediction_files.Reader`) of a single file.
+def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Callable[[str], tuple[NDArray[Any], str]]:
+    """A function from a sample to its map (H, W) and the SHA-256 of the file; PredictionError with the file's name.
 
-    `__init__` raises PredictionError with the file's name. The whole file is held in memory: at most a float64 map per
-    sample.
+    The whole table is held in memory: at most a float64 map per sample.
     """
+    count, pixels = len(samples), size[0] * size[1]
+    largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
+    try:
+        content = read_bounded(path, largest)
+        # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
+        unpacked = ReadingProcess(__name__, 2 * largest, 2 * count * (pixels + 1))(content)
+        table = pa.ipc.open_stream(unpacked).read_all()
+        rows = _rows(table.column("sample").to_pylist(), samples)
+    except PredictionError as error:
+        raise PredictionError(f"{printable(str(path), 500)} {error}") from None
+    digest = hashlib.sha256(content).hexdigest()
 
-    def __init__(self, path: Path, samples: Sequence[str], size: tuple[int, int]) -> None:
-        self._file, self._size = path.name, size
-        self._lock = Lock()
-        count, pixels = len(samples), size[0] * size[1]
-        largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
-        try:
-            content = read_bounded(path, largest)
-            self._digest = hashlib.sha256(content).hexdigest()
-            # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
-            unpacked = ReadingProcess(__name__, 2 * largest, 2 * count * (pixels + 1))(content)
-            self._table = pa.ipc.open_stream(unpacked).read_all()
-            self._rows = _rows(self._table.column("sample").to_pylist(), samples)
-        except PredictionError as error:
-            raise PredictionError(f"{printable(str(path), 500)} {error}") from None
+    def depth_map(sample: str) -> tuple[NDArray[Any], str]:
+        column = table.column("depth").slice(rows[sample], 1).combine_chunks()
+        return _depth_map(column.chunk(0) if isinstance(column, pa.ChunkedArray) else column, size), digest
 
-    def named(self, sample: str) -> str:
-        return f"{self._file}, sample {printable(sample)}"
-
-    def __call__(self, sample: str, memory: local) -> tuple[NDArray[Any], str]:
-        with self._lock:
-            column = self._table.column("depth").slice(self._rows[sample], 1).combine_chunks()
-        values = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
-        return _depth_map(values, self._size), self._digest
+    return depth_map
 
 
 def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
