@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import pyarrow
 import pydantic
 
 from fpp_ml_bench import __version__, depth
@@ -127,6 +126,8 @@ _COMMIT = re.compile(r"[0-9a-f]{40,64}")
 
 def environment() -> Environment:
     """This machine and this code, for a result."""
+    import pyarrow  # loaded with any dataset, but not needed to read and compare results
+
     modules = {"numpy": np, "pyarrow": pyarrow, "pydantic": pydantic}
     return Environment(
         python=platform.python_version(),
