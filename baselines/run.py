@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method, software_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, check_submission
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
@@ -122,8 +122,6 @@ def _write_reports(path: Path, method: Any, reports: dict[str, dict[str, Any]]) 
 
 
 def _write_submission(path: Path, method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> None:
-    import yaml
-
     content: dict[str, Any] = {
         "name": method.title,
         "method": method.name,
@@ -139,7 +137,7 @@ def _write_submission(path: Path, method: Method, seconds_per_sample: float, sum
         **({"seeds": dict(seeds)} if (seeds := getattr(method, "seeds", {})) else {}),
     }
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    temporary.write_text(check_submission(path.parent, content).to_yaml(), encoding="utf-8")
     temporary.replace(path)
 
 

@@ -205,13 +205,9 @@ def write_timing(path: Path, timing: Timing) -> None:
         submission = Submission.model_validate({**result.submission.model_dump(mode="json"), **measured})
         write_result(result.model_copy(update={"submission": submission}), path)
         return
-    import yaml
-
-    content = {**_described(path).model_dump(mode="json"), **measured}
-    Submission.model_validate(content)
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    submission = Submission.model_validate({**_described(path).model_dump(mode="json"), **measured})
     try:
-        write_atomically(path, text.encode("utf-8"))
+        write_atomically(path, submission.to_yaml().encode("utf-8"))
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
 

@@ -29,16 +29,10 @@ HEADLINE = tuple(f"{pixels}_{error}_mm" for pixels in PIXEL_SETS for error in ("
 """The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
 
 BESIDE = (
-    "object_interior_mae_mm",
-    "object_interior_rmse_mm",
-    "object_edge_mae_mm",
-    "object_edge_rmse_mm",
-    "object_valid_mae_mm",
-    "object_interior_valid_mae_mm",
-    "object_edge_share",
-    "object_missing_share",
+    "object_interior_mae_mm", "object_interior_rmse_mm", "object_edge_mae_mm", "object_edge_rmse_mm",
+    "object_valid_mae_mm", "object_interior_valid_mae_mm", "object_edge_share", "object_missing_share",
     "object_interior_missing_share",
-)
+)  # fmt: skip
 """Reported beside the headline: the object away from and along depth edges, and the pixels that were not measured."""
 
 WITHIN_MM = (1, 2, 5, 10)
@@ -46,16 +40,9 @@ WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
 SIGNED = ("object_bias_mm", "object_valid_bias_mm")
 """The only scores that may be negative: the others are magnitudes or shares."""
 SPREAD_OF_ERROR = (
-    "object_median_mm",
-    "object_p95_mm",
-    "object_max_mm",
-    *WITHIN,
-    *SIGNED,
-    "object_shift_free_mae_mm",
-    "object_wide_band_mae_mm",
-    "object_wide_interior_mae_mm",
-    "object_wide_band_share",
-)
+    "object_median_mm", "object_p95_mm", "object_max_mm", *WITHIN, *SIGNED, "object_shift_free_mae_mm",
+    "object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share",
+)  # fmt: skip
 """How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset."""
 
 METRICS = HEADLINE + BESIDE + SPREAD_OF_ERROR

@@ -1,9 +1,17 @@
 """Building blocks of the strict file models: types of text and numbers, and readable errors."""
 
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.files import printable, text_problem
@@ -31,6 +39,20 @@ class StrictModel(BaseModel):
     """No unknown keys, no coercion (``"3"`` is no 3, ``true`` no 1), no NaN or infinity."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class SparseModel(StrictModel):
+    """Keys in ``SPARSE`` are not written where they hold their default, so that files without them stay as they are."""
+
+    SPARSE: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        for key in self.SPARSE:
+            if getattr(self, key) == type(self).model_fields[key].default:
+                content.pop(key, None)
+        return content
 
 
 def problems_of(error: ValidationError) -> list[str]:

@@ -5,17 +5,14 @@ own intervals overlap.
 """
 
 import statistics
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text as RichText
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
-from fpp_ml_bench.evaluation.report.numbers import interval_text, millimetres, signed
-from fpp_ml_bench.evaluation.result import DatasetInfo, Interval, Result
+from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
+from fpp_ml_bench.evaluation.result import Interval, Result
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text
 from fpp_ml_bench.evaluation.score import caution, object_interval
 from fpp_ml_bench.files import printable
@@ -45,10 +42,15 @@ class Difference(StrictModel):
     higher: Count
 
     @property
+    def interval(self) -> tuple[float, float] | None:
+        """The interval in mm; None where there is none."""
+        low, high = self.interval_mm
+        return None if low is None or high is None else (low, high)
+
+    @property
     def told_apart(self) -> bool:
         """Whether 0 is outside the interval."""
-        low, high = self.interval_mm
-        return low is not None and high is not None and not low <= 0 <= high
+        return self.interval is not None and not self.interval[0] <= 0 <= self.interval[1]
 
 
 class Comparison(StrictModel):
@@ -70,17 +72,12 @@ def compare(first: Result, second: Result) -> Comparison:
     """The paired comparison of two results. SubmissionError names everything in which their data differ."""
     _check_same_data(first, second)
     second_rows = {row.sample: row for row in second.per_sample}
-    paired = [
-        PairedSample(
-            sample=row.sample,
-            object=row.object,
-            differences={
-                key: _difference(getattr(row, key), getattr(second_rows[row.sample], key)) for key in HEADLINE
-            },
-        )
-        for row in first.per_sample
-    ]
-    differences = {key: _summary(paired, key) for key in HEADLINE}
+    paired = []
+    for row in first.per_sample:
+        pairs = {key: (getattr(row, key), getattr(second_rows[row.sample], key)) for key in HEADLINE}
+        differences = {key: None if None in pair else pair[1] - pair[0] for key, pair in pairs.items()}
+        paired.append(PairedSample(sample=row.sample, object=row.object, differences=differences))
+    summaries = {key: _summary(paired, key) for key in HEADLINE}
     names = printable(first.submission.name), printable(second.submission.name)
     if names[0] == names[1]:
         names = f"{names[0]} (first)", f"{names[1]} (second)"
@@ -92,44 +89,33 @@ def compare(first: Result, second: Result) -> Comparison:
         target=first.target,
         track=first.track,
         mode=first.mode,
-        differences=differences,
-        sentence=sentence(*names, differences[MAIN_KEY]),
+        differences=summaries,
+        sentence=sentence(*names, summaries[MAIN_KEY]),
         per_sample=paired,
     )
 
 
 def _check_same_data(first: Result, second: Result) -> None:
-    pairs: dict[str, tuple[Any, Any]] = {
-        "split": (first.dataset.split, second.dataset.split),
+    a, b = first.dataset, second.dataset
+    lines = []
+    if a.fingerprint != b.fingerprint or (a.benchmark and b.benchmark and a.benchmark != b.benchmark):
+        lines.append(f"dataset: {printable(a.identity)} against {printable(b.identity)}")
+    pairs = {
+        "split": (a.split, b.split),
         "target": (first.target, second.target),
         "track": (first.track, second.track),
         "mode": (first.mode, second.mode),
         "protocol": (first.protocol_version, second.protocol_version),
     }
-    lines = [f"{key}: {a} against {b}" for key, (a, b) in pairs.items() if a != b]
-    if not _same_dataset(first.dataset, second.dataset):
-        lines.insert(0, f"dataset: {printable(first.dataset.identity)} against {printable(second.dataset.identity)}")
-    if _samples(first) != _samples(second):
+    lines += [f"{key}: {one} against {other}" for key, (one, other) in pairs.items() if one != other]
+    samples = [sorted((row.sample, row.object_pixels) for row in result.per_sample) for result in (first, second)]
+    if samples[0] != samples[1]:
         lines.append("samples: the samples differ")
     if lines:
         raise SubmissionError(
             "the two results can't be compared, they were not scored on the same data by the same rules; score both "
             "with the same fpp-eval options:\n  " + "\n  ".join(lines)
         )
-
-
-def _same_dataset(first: DatasetInfo, second: DatasetInfo) -> bool:
-    """Whether both have the same fingerprint and do not name two different benchmarks."""
-    named = {info.benchmark for info in (first, second) if info.benchmark is not None}
-    return first.fingerprint == second.fingerprint and len(named) < 2
-
-
-def _samples(result: Result) -> list[tuple[str, int]]:
-    return sorted((row.sample, row.object_pixels) for row in result.per_sample)
-
-
-def _difference(first: float | None, second: float | None) -> float | None:
-    return None if first is None or second is None else second - first
 
 
 def _summary(paired: list[PairedSample], key: str) -> Difference:
@@ -156,13 +142,12 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     word = "lower" if difference.mean_mm < 0 else "higher"
     count = difference.lower if difference.mean_mm < 0 else difference.higher
     views = f"{word} in {count} of {difference.samples} samples"
-    low, high = difference.interval_mm
-    if low is None or high is None:
+    if difference.interval is None:
         return (
             f"{second} has an object MAE {size} {word} than {first} on average, {views}; with one object there is no "
             "interval, so nothing can be said beyond it."
         )
-    ends = f"{_signed(low)} to {_signed(high)} mm over {difference.objects} objects"
+    ends = f"{interval_text(difference.interval)} mm over {difference.objects} objects"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
     if difference.told_apart:
         return (
@@ -173,29 +158,3 @@ def sentence(first: str, second: str, difference: Difference) -> str:
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
         f"but the 95% interval, {ends}, holds 0.{few_objects}"
     )
-
-
-def _signed(value: float) -> str:
-    return ("-" if value < 0 else "") + millimetres(abs(value))
-
-
-def comparison_table(comparison: Comparison) -> Group:
-    """The comparison as rich tables; every text from a submission is shown as plain text, never as markup."""
-    table = Table(caption="mm; mean of second - first over samples, 95% interval over objects", caption_justify="left")
-    table.add_column("Error")
-    for heading in ("Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for key, row in comparison.differences.items():
-        low, high = row.interval_mm
-        ends = None if low is None or high is None else (low, high)
-        pixels, error = key.removesuffix("_mm").split("_")
-        table.add_row(
-            f"{pixels} {error.upper()}", signed(row.mean_mm), interval_text(ends), str(row.lower), str(row.higher),
-            str(row.samples), str(row.objects), style="bold" if row.told_apart else None,
-        )  # fmt: skip
-    title = RichText(
-        f"\nfirst:  {printable(comparison.first)}\nsecond: {printable(comparison.second)}\n"
-        f"{comparison.split} split ({comparison.fingerprint[:8]}), against {comparison.target}, "
-        f"{comparison.track} track\n"
-    )
-    return Group(title, table, RichText(f"{comparison.sentence}\n"))

@@ -1,18 +1,21 @@
-"""A histogram of per-sample errors as SVG, in the page's own colours."""
+"""Pictures of a report: the bars of a histogram of errors, the panels of a sample, a sheet of panels as one PNG."""
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.evaluation.report.html import data_uri, escaped, palette_png
-from fpp_ml_bench.evaluation.report.numbers import millimetres
+from fpp_ml_bench.evaluation.report.html import data_uri, millimetres
 
-WIDTH, HEIGHT = 720, 240
+_WIDTH, _HEIGHT = 720, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 22, 44
 _LEAST = 1e-30
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
@@ -40,48 +43,29 @@ def bins(values: Sequence[float]) -> tuple[list[float], list[int]]:
     return [step * (first + n) for n in range(last - first + 1)], counts
 
 
-def histogram_svg(values: Sequence[float], mean: float, label: str) -> str:
-    """Histogram of ``values`` (mm) with their mean marked; ``label`` says what they are."""
+def histogram(values: Sequence[float], mean: float, label: str) -> SimpleNamespace:
+    """What ``report.html`` draws: the bars of a histogram of ``values`` (mm), its axes and its mean, in px."""
     edges, counts = bins(values)
-    tallest = max(counts)
-    width, height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
-    base = _TOP + height
+    base, tallest = _HEIGHT - _BOTTOM, max(counts)
 
     def across(value: float) -> float:
-        return _LEFT + width * (value - edges[0]) / (edges[-1] - edges[0])
+        return round(_LEFT + (_WIDTH - _LEFT - _RIGHT) * (value - edges[0]) / (edges[-1] - edges[0]), 1)
 
-    parts = []
-    step = max(1, math.ceil(tallest / 4))
-    for count in range(0, tallest + 1, step):
-        y = base - height * count / tallest
-        parts.append(f'<path class="axis" d="M{_LEFT} {y:.1f}H{WIDTH - _RIGHT}"/>')
-        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end" font-size="12">{count}</text>')
-    for start, end, count in zip(edges, edges[1:], counts, strict=False):
+    def up(count: int) -> float:
+        return round(base - (base - _TOP) * count / tallest, 1)
+
+    bars = []
+    for low, high, count in zip(edges, edges[1:], counts, strict=False):
         if count:
-            x, tall = across(start) + 1, height * count / tallest
-            parts.append(
-                f'<rect class="bar" x="{x:.1f}" y="{base - tall:.1f}" width="{across(end) - x - 1:.1f}" '
-                f'height="{tall:.1f}"><title>{start:.4g} to {end:.4g} mm: {count}</title></rect>'
-            )
-    every = max(1, math.ceil(len(edges) / 9))
-    for edge in edges[::every]:
-        parts.append(
-            f'<text x="{across(edge):.1f}" y="{base + 18}" text-anchor="middle" font-size="12">{edge:.4g}</text>'
-        )
-    x = across(mean)
-    anchor = "end" if x > WIDTH / 2 else "start"
-    parts.append(f'<path class="mark" d="M{x:.1f} {_TOP - 6}V{base}" stroke-width="2" stroke-dasharray="4 3"/>')
-    parts.append(
-        f'<text class="name" x="{x + (-6 if anchor == "end" else 6):.1f}" y="{_TOP - 4}" text-anchor="{anchor}" '
-        f'font-size="12">mean {millimetres(mean)} mm</text>'
-    )
-    parts.append(
-        f'<text x="{_LEFT + width / 2:.1f}" y="{HEIGHT - 6}" text-anchor="middle" font-size="12">'
-        f"{escaped(label)}, mm</text>"
-    )
-    description = f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm"
-    attributes = f'class="histogram" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escaped(description)}"'
-    return f"<svg {attributes}>{''.join(parts)}</svg>"
+            box = across(low) + 1, up(count), across(high) - across(low) - 2, base - up(count)
+            bars.append((*(round(number, 1) for number in box), f"{low:.4g} to {high:.4g} mm: {count}"))
+    return SimpleNamespace(
+        width=_WIDTH, height=_HEIGHT, left=_LEFT, right=_WIDTH - _RIGHT, top=_TOP, base=base, bars=bars,
+        levels=[(up(count), count) for count in range(0, tallest + 1, max(1, math.ceil(tallest / 4)))],
+        edges=[(across(edge), f"{edge:.4g}") for edge in edges[:: max(1, math.ceil(len(edges) / 9))]],
+        mean=mean, mean_x=across(mean),
+        description=f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm",
+    )  # fmt: skip
 
 
 PANEL_PX = 320
@@ -91,7 +75,7 @@ CLIP_PERCENTILE = 95
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture: ``indices`` (0 is transparent) into the colour map ``colours``, a description, its scale."""
+    """A picture: ``indices`` (0 is transparent) into the colour map ``colours``; the ends of its scale as text."""
 
     title: str
     indices: NDArray[np.uint8]
@@ -105,10 +89,14 @@ class Panel:
         return palette_png(self.indices, colour_table(self.colours))
 
     @property
-    def scale_png(self) -> bytes | None:
-        """The colour bar; None for a panel without ends."""
+    def address(self) -> str:
+        return data_uri(self.png)
+
+    @property
+    def scale_address(self) -> str:
+        """The colour bar, of a panel whose scale has ends."""
         ramp = np.linspace(1, 255, 128).round().astype(np.uint8)[None].repeat(2, axis=0)
-        return palette_png(ramp, colour_table(self.colours)) if self.high else None
+        return data_uri(palette_png(ramp, colour_table(self.colours)))
 
 
 def sample_panels(
@@ -121,53 +109,30 @@ def sample_panels(
     low, high = float(object_depth.min()), float(object_depth.max())
     clip = float(np.percentile(np.abs(error_mm[inside if inside.any() else ...]), CLIP_PERCENTILE))
     predicted = np.asarray(prediction_mm) > 0
+    either = inside | predicted
     ends = f"{low:.0f}", f"{high:.0f} mm"
     limit = f"{millimetres(clip)} mm"
     return [
         Panel("Fringe", np.maximum(_subsampled(fringe), 1), "gray", f"{sample}: the captured fringe image"),
-        _coloured(
-            "Truth", target_mm, inside, "viridis", low, high, ends,
-            f"{sample}: true depth, {ends[0]} to {ends[1]}",
+        Panel(
+            "Truth", _levels(target_mm, inside, low, high), "viridis",
+            f"{sample}: true depth, {ends[0]} to {ends[1]}", *ends,
         ),
-        _coloured(
-            "Prediction", prediction_mm, predicted, "viridis", low, high, ends,
+        Panel(
+            "Prediction", _levels(prediction_mm, predicted, low, high), "viridis",
             f"{sample}: predicted depth on the same scale; {predicted.mean():.1%} of the image is predicted as object",
+            *ends,
         ),
-        _coloured(
-            "Absolute error", np.abs(error_mm), inside | predicted, "magma", 0.0, clip, ("0", limit),
-            f"{sample}: absolute error, clipped at its 95th percentile over the object, {limit}",
+        Panel(
+            "Absolute error", _levels(np.abs(error_mm), either, 0.0, clip), "magma",
+            f"{sample}: absolute error, clipped at its 95th percentile over the object, {limit}", "0", limit,
         ),
-        _coloured(
-            "Signed error", error_mm, inside | predicted, "coolwarm", -clip, clip, (f"-{limit}", f"+{limit}"),
+        Panel(
+            "Signed error", _levels(error_mm, either, -clip, clip), "coolwarm",
             f"{sample}: prediction minus truth, blue too near, red too far, clipped at {limit}",
+            f"-{limit}", f"+{limit}",
         ),
     ]  # fmt: skip
-
-
-def panels_html(panels: list[Panel]) -> str:
-    """The panels side by side; each picture has a description in words."""
-    figures = []
-    for panel in panels:
-        scale = ""
-        if panel.scale_png is not None:
-            bar = f'<img src="{data_uri(panel.scale_png)}" alt="" width="128" height="8">'
-            scale = (
-                f'<span class="scale"><span>{escaped(panel.low)}</span>{bar}<span>{escaped(panel.high)}</span></span>'
-            )
-        figures.append(
-            f'<figure><img src="{data_uri(panel.png)}" alt="{escaped(panel.description, 400)}">'
-            f"<figcaption>{escaped(panel.title)}{scale}</figcaption></figure>"
-        )
-    return f'<div class="panels">{"".join(figures)}</div>'
-
-
-@cache
-def colour_table(name: str, levels: int = 255) -> NDArray[np.uint8]:
-    """Index 0, which is transparent, and ``levels`` RGB colours of a matplotlib map, (levels + 1, 3)."""
-    import matplotlib
-
-    table = matplotlib.colormaps[name](np.linspace(0, 1, levels))[:, :3]
-    return np.vstack([np.zeros((1, 3)), 255 * table]).round().astype(np.uint8)
 
 
 def _subsampled(image: NDArray) -> NDArray:
@@ -175,18 +140,54 @@ def _subsampled(image: NDArray) -> NDArray:
     return image[::step, ::step]
 
 
-def _coloured(
-    title: str,
-    values: NDArray,
-    visible: NDArray[np.bool_],
-    colours: str,
-    low: float,
-    high: float,
-    ends: tuple[str, str],
-    description: str,
-) -> Panel:
-    """Values from ``low`` to ``high`` in colours, clipped at both ends, transparent where not ``visible``."""
+def _levels(values: NDArray, visible: NDArray[np.bool_], low: float, high: float) -> NDArray[np.uint8]:
+    """``low`` to ``high`` as 1 to 255, clipped at both ends; 0, which is transparent, where not ``visible``."""
     values, visible = _subsampled(np.asarray(values, np.float64)), _subsampled(visible)
     share = np.clip((values - low) / (high - low), 0, 1) if high > low else np.zeros_like(values)
-    indices = np.where(visible, 1 + np.round(254 * share), 0).astype(np.uint8)
-    return Panel(title, indices, colours, description, *ends)
+    return np.where(visible, 1 + np.round(254 * share), 0).astype(np.uint8)
+
+
+@cache
+def colour_table(name: str, levels: int = 255) -> NDArray[np.uint8]:
+    """Index 0, which is transparent, and ``levels`` RGB colours of a matplotlib map, (levels + 1, 3)."""
+    table = matplotlib.colormaps[name](np.linspace(0, 1, levels))[:, :3]
+    return np.vstack([np.zeros((1, 3)), 255 * table]).round().astype(np.uint8)
+
+
+def palette_png(indices: NDArray[np.uint8], colours: NDArray[np.uint8]) -> bytes:
+    """A PNG of ``indices`` (H, W) into ``colours`` (256, 3); index 0 is transparent."""
+    image = Image.fromarray(indices)
+    image.putpalette(colours.astype(np.uint8).tobytes())  # makes it an image of mode P
+    content = io.BytesIO()
+    image.save(content, "PNG", transparency=0, compress_level=9)
+    return content.getvalue()
+
+
+TILE_PX, GAP_PX = 160, 8
+_MAPS = ("gray", "viridis", "magma", "coolwarm")
+_SHEET_LEVELS = 63
+"""Colours per map: four maps and the transparent index fit into a PNG's palette of 256."""
+
+
+def sheet_png(rows: list[list[Panel]]) -> bytes:
+    """Panels in rows and columns as one PNG."""
+    palette = np.zeros((256, 3), np.uint8)
+    palette[1 : 1 + _SHEET_LEVELS * len(_MAPS)] = np.vstack([colour_table(name, _SHEET_LEVELS)[1:] for name in _MAPS])
+    lines = [np.hstack([_tile(panel) for panel in panels]) for panels in rows]
+    sheet = np.vstack(lines) if lines else np.zeros((TILE_PX, TILE_PX), np.uint8)
+    return palette_png(sheet[: sheet.shape[0] - GAP_PX, : sheet.shape[1] - GAP_PX], palette)
+
+
+def _tile(panel: Panel) -> NDArray[np.uint8]:
+    """The panel's indices into the common palette at the tile's size, with the gap right of it and below.
+
+    Pixels are left out or repeated, never averaged.
+    """
+    height, width = panel.indices.shape
+    side = max(height, width)
+    rows, columns = (np.arange(n * TILE_PX // side) * side // TILE_PX for n in (height, width))
+    small = panel.indices[np.ix_(rows, columns)]
+    levels = 1 + (small.astype(np.int64) - 1) * _SHEET_LEVELS // 255 + _SHEET_LEVELS * _MAPS.index(panel.colours)
+    tile = np.zeros((TILE_PX + GAP_PX, TILE_PX + GAP_PX), np.uint8)
+    tile[: small.shape[0], : small.shape[1]] = np.where(small > 0, levels, 0)
+    return tile

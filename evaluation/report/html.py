@@ -1,27 +1,53 @@
-"""Writing HTML pages in which text from a submission stays text, and which load nothing.
+"""Writing HTML pages in which text from a submission stays text, and which load nothing; how numbers are written.
 
 A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
 the given hashes: the page sends no request, and an injected script can't run.
 """
 
+from __future__ import annotations
+
 import hashlib
 import html
-import struct
-import zlib
 from base64 import b64encode
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
 
 from fpp_ml_bench.files import NAME_LIMIT, printable
 
 if TYPE_CHECKING:
     import jinja2
 
-_HERE = Path(__file__).resolve().parent
+
+def millimetres(value: float | None) -> str:
+    """An error in mm to three decimals, in powers of ten where very small or large, a dash for an empty pixel set."""
+    if value is None:
+        return "-"
+    if value == 0:
+        return "0"
+    return f"{value:.3f}" if 5e-4 <= value < 1e6 else f"{value:.2e}"
+
+
+def percent(share: float | None) -> str:
+    """A share as per cent with one decimal, a dash where there is none."""
+    return "-" if share is None else f"{100 * share:.1f}%"
+
+
+def seconds(value: float | None) -> str:
+    """A time in seconds to three significant digits, a dash when unknown."""
+    return "-" if value is None else f"{value:.3g}"
+
+
+def signed(value: float | None, plus: str = "+") -> str:
+    """A signed error in mm: `millimetres` with its sign, a dash where there is none."""
+    if value is None:
+        return "-"
+    return ("-" if value < 0 else plus if value > 0 else "") + millimetres(abs(value))
+
+
+def interval_text(ends: tuple[float, float] | None, between: str = " to ") -> str:
+    """The two ends of an interval in mm, a dash where there is none."""
+    return "-" if ends is None else between.join(signed(end, plus="") for end in ends)
 
 
 def escaped(value: object, limit: int = NAME_LIMIT) -> str:
@@ -29,77 +55,53 @@ def escaped(value: object, limit: int = NAME_LIMIT) -> str:
     return html.escape(printable(value, limit), quote=True)
 
 
-@cache
-def base_style() -> str:
-    """The style that every page shares: colours for light and dark, type, tables, focus."""
-    return (_HERE / "page.css").read_text(encoding="utf-8")
+def data_uri(png: bytes) -> str:
+    """A PNG as a data URI, which an ``img`` shows without a request."""
+    return "data:image/png;base64," + b64encode(png).decode("ascii")
 
 
 def page(title: str, body: str, style: str = "", script: str = "", description: str = "") -> str:
     """A whole HTML page. ``title`` and ``description`` are text; ``body`` is HTML, ``style`` and ``script`` our own."""
-    style = base_style() + style
-    allowed = ["default-src 'none'", "img-src data:", f"style-src {_source(style)}", "base-uri 'none'"]
-    allowed += ["form-action 'none'", *([f"script-src {_source(script)}"] if script else [])]
-    meta = f'<meta name="description" content="{escaped(description, 300)}">\n' if description else ""
-    code = f"<script>{script}</script>\n" if script else ""
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(allowed)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f'<title>{escaped(title)}</title>\n{meta}<link rel="icon" href="data:,">\n<style>{style}</style>\n</head>\n'
-        f'<body>\n<a class="skip" href="#main">Skip to the content</a>\n{body}\n{code}</body>\n</html>\n'
-    )
+    import markupsafe
+
+    own = {"body": body, "style": _base_style() + style, "script": script}
+    own = {name: markupsafe.Markup(text) for name, text in own.items()}
+    return render(__package__, "page.html", title=title, description=description, **own)
+
+
+@cache
+def _base_style() -> str:
+    """The style that every page shares: colours for light and dark, type, tables, focus."""
+    return Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 
 def render(package: str, template: str, **values: object) -> str:
     """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped.
 
     A template may include or import those of this package's own ``templates`` too. Filters: ``printable``, and the
-    numbers of `fpp_ml_bench.evaluation.report.numbers`. Wrap only HTML that this package made in ``markupsafe.Markup``.
+    numbers of this module. Wrap only HTML that this package made in ``markupsafe.Markup``.
     """
-    return str(_environment(package).get_template(template).render(values))
+    return _environment(package).get_template(template).render(values)
 
 
 @cache
-def _environment(package: str) -> "jinja2.Environment":
-    import jinja2
-
-    from fpp_ml_bench.evaluation.report import numbers
+def _environment(package: str) -> jinja2.Environment:
+    import jinja2  # plain `fpp-eval` writes no HTML
 
     environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p) for p in (package, "fpp_ml_bench.evaluation.report")]),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p) for p in (package, __package__)]),
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters["printable"] = printable
-    for name in ("millimetres", "percent", "seconds", "signed", "interval_text"):
-        environment.filters[name] = getattr(numbers, name)
+    environment.filters |= {
+        "printable": printable, "millimetres": millimetres, "percent": percent, "seconds": seconds, "signed": signed,
+        "interval_text": partial(interval_text, between=".."), "source": _source,
+    }  # fmt: skip
     return environment
 
 
 def _source(text: str) -> str:
-    return f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
+    """The source of a Content-Security-Policy that allows exactly ``text``."""
+    import markupsafe
 
-
-def data_uri(png: bytes) -> str:
-    """A PNG as a data URI, which an ``img`` shows without a request."""
-    return "data:image/png;base64," + b64encode(png).decode("ascii")
-
-
-def palette_png(indices: NDArray[np.uint8], colours: NDArray[np.uint8]) -> bytes:
-    """A PNG of ``indices`` (H, W) into ``colours`` (256, 3); index 0 is transparent. The same bytes every time."""
-    height, width = indices.shape
-    lines = np.zeros((height, width + 1), np.uint8)
-    lines[:, 1:] = indices
-    parts = (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", colours.astype(np.uint8).tobytes()),
-        (b"tRNS", b"\0"),
-        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    chunks = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    return markupsafe.Markup(f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'")

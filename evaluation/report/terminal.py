@@ -1,75 +1,83 @@
-"""What `fpp-eval` prints: the three pixel sets, edges and missing pixels, the samples of largest error."""
+"""What `fpp-eval` prints: a result's pixel sets and samples of largest error, and the comparison of two results.
 
-from typing import Any
+Every text from a submission is shown as plain text, never as markup.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
-from fpp_ml_bench.evaluation.report.numbers import interval_text, millimetres, percent, seconds, signed
-from fpp_ml_bench.evaluation.result import Result, SampleResult
+from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, percent, seconds, signed
+from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import caution
 from fpp_ml_bench.files import printable
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.report.comparison import Comparison
 
 WORST = 5
 
 
+def _table(first: str, titles: list[str], **options: str) -> Table:
+    """A table whose first column is text, and all others are numbers."""
+    table = Table(caption_justify="left", title_justify="left", **options)  # type: ignore[arg-type]
+    table.add_column(first)
+    for title in titles:
+        table.add_column(title, justify="right", no_wrap=True)
+    return table
+
+
+def _interval(ends: tuple[float, float] | None) -> str:
+    return interval_text(ends, between="..")
+
+
 def result_table(result: Result) -> Group:
-    """The result as rich tables; every text from the submission is shown as plain text, never as markup."""
-    return Group(*(part for part in (_title(result), _scores(result), _notes(result), _worst(result)) if part))
-
-
-def _title(result: Result) -> Text:
+    """The result as rich tables."""
     info = result.dataset
-    return Text(
+    title = Text(
         f"\n{printable(result.submission.name)}\n"
         f"{info.split} split of {printable(info.name)} ({printable(info.identity)}),\n{info.samples} samples of "
         f"{info.size[1]}x{info.size[0]} px, against {result.target}, {result.track} track"
         f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )
+    return Group(*(part for part in (title, _scores(result), _notes(result), _worst(result)) if part))
 
 
 def _scores(result: Result) -> Table:
-    objects = len(result.per_object)
-    table = Table(
+    objects, errors = len(result.per_object), ("mae", "rmse")
+    table = _table(
+        "Pixel set",
+        [f"{error.upper()}\n{title}" for error in errors for title in ("mean", "95% interval", "median", "pooled")],
         caption="mm; mean and median over samples, pooled over all pixels; 95% intervals of the means from a bootstrap "
         f"over {objects} {'object' if objects == 1 else 'objects'}",
-        caption_justify="left",
     )
-    table.add_column("Pixel set")
-    for error in ("MAE", "RMSE"):
-        for title in ("mean", "95% interval", "median", "pooled"):
-            table.add_column(f"{error}\n{title}", justify="right", no_wrap=True)
-    for pixels in PIXEL_SETS:
+    titles = {
+        **{pixels: pixels for pixels in PIXEL_SETS},
+        "object_interior": f"object, {result.edge_band_px} px or more from edges",
+        "object_edge": "object, nearer",
+    }
+    for pixels, title in titles.items():
         cells = []
-        for error in ("mae", "rmse"):
-            key = f"{pixels}_{error}_mm"
-            mean, median, pooled = (
-                millimetres(getattr(part, key)) for part in (result.metrics, result.median, result.pooled)
+        for key in (f"{pixels}_{error}_mm" for error in errors):
+            mean, median = (millimetres(getattr(part, key)) for part in (result.metrics, result.median))
+            headline = pixels in PIXEL_SETS
+            interval, pooled = (
+                (_interval(result.intervals.of(key)), millimetres(getattr(result.pooled, key)))
+                if headline
+                else ("", "")
             )
-            cells += [mean, interval_text(result.intervals.of(key)), median, pooled]
-        table.add_row(pixels, *cells, style="bold" if pixels == "object" else None)
-    for pixels, title in (
-        ("interior", f"object, {result.edge_band_px} px or more from edges"),
-        ("edge", "object, nearer"),
-    ):
-        cells = [
-            cell
-            for error in ("mae", "rmse")
-            for cell in (
-                millimetres(getattr(result.metrics, f"object_{pixels}_{error}_mm")),
-                "",
-                millimetres(getattr(result.median, f"object_{pixels}_{error}_mm")),
-                "",
-            )
-        ]
-        table.add_row(title, *cells)
+            cells += [mean, interval, median, pooled]
+        table.add_row(title, *cells, style="bold" if pixels == "object" else None)
     return table
 
 
 def _notes(result: Result) -> Text:
-    scores = result.metrics
+    scores, submission = result.metrics, result.submission
     shares = ((limit, getattr(scores, f"object_within_{limit}mm_share")) for limit in WITHIN_MM)
     within = ", ".join(f"{limit} mm {percent(share)}" for limit, share in shares)
     lines = [
@@ -89,21 +97,16 @@ def _notes(result: Result) -> Text:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
     if result.samples_without_background:
         lines.append(f"{result.samples_without_background} samples without background: left out of its scores.")
-    if result.submission.uses_ground_truth_range:
+    if submission.uses_ground_truth_range:
         lines.append("Oracle range: the method was given depth_min and depth_max of the scored samples.")
-    if result.submission.uses_ground_truth_mask:
+    if submission.uses_ground_truth_mask:
         lines.append("Oracle mask: the method was given which pixels of the scored samples are object.")
-    few_objects = caution(len(result.per_object))
-    if few_objects:
+    if few_objects := caution(len(result.per_object)):
         lines.append(few_objects)
-    sample_seconds = result.submission.seconds_per_sample
-    frames = len(result.submission.frames_used)
-    time = (
-        "unknown time"
-        if sample_seconds is None
-        else f"{seconds(sample_seconds)} s ({result.submission.seconds_source})"
-    )
-    lines.append(f"Frames used: {frames}; {time} per sample.")
+    time = f"{seconds(submission.seconds_per_sample)} s ({submission.seconds_source})"
+    if submission.seconds_per_sample is None:
+        time = "unknown time"
+    lines.append(f"Frames used: {len(submission.frames_used)}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
 
@@ -111,16 +114,29 @@ def _worst(result: Result) -> Table | None:
     rows = [row for row in result.per_sample if row.object_mae_mm is not None]
     if not rows:
         return None
-    table = Table(title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples", title_justify="left")
-    table.add_column("Sample")
-    for title in ("Object MAE", "Object RMSE", "Background MAE", "Near edges", "Not measured"):
-        table.add_column(title.replace(" ", "\n"), justify="right", no_wrap=True)
-    for row in sorted(rows, key=_largest_error_first)[:WORST]:
-        cells: list[Any] = [millimetres(row.object_mae_mm), millimetres(row.object_rmse_mm)]
-        cells += [millimetres(row.background_mae_mm), percent(row.object_edge_share), percent(row.object_missing_share)]
-        table.add_row(Text(printable(row.sample)), *cells)
+    titles = ["Object\nMAE", "Object\nRMSE", "Background\nMAE", "Near\nedges", "Not\nmeasured"]
+    table = _table("Sample", titles, title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples")
+    for row in sorted(rows, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))[:WORST]:
+        errors = (row.object_mae_mm, row.object_rmse_mm, row.background_mae_mm)
+        shares = (row.object_edge_share, row.object_missing_share)
+        table.add_row(Text(printable(row.sample)), *map(millimetres, errors), *map(percent, shares))
     return table
 
 
-def _largest_error_first(row: SampleResult) -> tuple[float, str]:
-    return -(row.object_mae_mm or 0.0), row.sample
+def comparison_table(compared: Comparison) -> Group:
+    """The comparison as rich tables."""
+    titles = ["Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"]
+    table = _table("Error", titles, caption="mm; mean of second - first over samples, 95% interval over objects")
+    for key, row in compared.differences.items():
+        pixels, error = key.removesuffix("_mm").split("_")
+        counts = (row.lower, row.higher, row.samples, row.objects)
+        table.add_row(
+            f"{pixels} {error.upper()}", signed(row.mean_mm), _interval(row.interval), *map(str, counts),
+            style="bold" if row.told_apart else None,
+        )  # fmt: skip
+    title = Text(
+        f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"
+        f"{compared.split} split ({compared.fingerprint[:8]}), against {compared.target}, "
+        f"{compared.track} track\n"
+    )
+    return Group(title, table, Text(f"{compared.sentence}\n"))

@@ -1,16 +1,16 @@
-"""The parts of ``result.json`` as strict models: scores, samples, objects, data, and what was scored with what."""
+"""The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from fpp_ml_bench.evaluation.protocol import METRICS
-from fpp_ml_bench.evaluation.result.timing_block import HardwareInfo
-from fpp_ml_bench.evaluation.schema import Count, NonNegative, Share, StrictModel, Text
+from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
 
@@ -74,7 +74,7 @@ class ObjectResult(StrictModel):
     """An object: mean and spread (sample standard deviation, n - 1) of every metric over its views."""
 
     object: Text
-    samples: Annotated[int, Field(gt=0)]
+    samples: Whole
     metrics: Metrics
     spread: dict[Text, NonNegative | None]
 
@@ -90,8 +90,7 @@ class Intervals(StrictModel):
     background_rmse_mm: Interval
 
     def __getitem__(self, key: str) -> list[float | None]:
-        ends: list[float | None] = getattr(self, key)
-        return ends
+        return getattr(self, key)  # type: ignore[no-any-return]
 
     def of(self, key: str) -> tuple[float, float] | None:
         """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
@@ -104,7 +103,7 @@ class Bootstrap(StrictModel):
 
     method: Literal["expanded percentile"]
     over: Literal["objects"]
-    resamples: Annotated[int, Field(gt=0)]
+    resamples: Whole
     confidence: Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -115,26 +114,21 @@ class BenchmarkInfo(StrictModel):
     version: Count
 
 
-class DatasetInfo(StrictModel):
+class DatasetInfo(SparseModel):
     """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
 
     ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version that this package knows
     with another fingerprint, or a fingerprint that it knows under another name or version, is refused.
     """
 
+    SPARSE = ("benchmark",)
+
     name: Text
     fingerprint: Sha256
     benchmark: BenchmarkInfo | None = None
     split: Literal["train", "validation", "test", "all"]
-    size: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)]
-    samples: Annotated[int, Field(gt=0)]
-
-    @model_serializer(mode="wrap")
-    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content: dict[str, Any] = handler(self)
-        if self.benchmark is None:
-            content.pop("benchmark", None)
-        return content
+    size: Annotated[list[Whole], Field(min_length=2, max_length=2)]
+    samples: Whole
 
     @model_validator(mode="after")
     def _consistent(self) -> "DatasetInfo":
@@ -165,6 +159,16 @@ def dataset_identity(fingerprint: str) -> str:
     return f"{benchmark.title if benchmark else 'no named benchmark'}, fingerprint {fingerprint[:8]}"
 
 
+class HardwareInfo(StrictModel):
+    """The machine a time was measured on, as `fpp_ml_bench.machine.describe_hardware` puts it."""
+
+    cpu: Text
+    cores: Count
+    memory_gib: NonNegative
+    gpu: Text | None
+    platform: Text
+
+
 class Environment(StrictModel):
     """Where and with what the scores were computed (not where the predictions were made: see ``submission``).
 
@@ -177,3 +181,120 @@ class Environment(StrictModel):
     git: Annotated[str, Field(pattern=r"^[0-9a-f]{40,64}$")] | None
     code_sha256: Sha256
     hardware: HardwareInfo
+
+
+class Timing(StrictModel):
+    """How long a method takes on images of ``image_size`` (H, W) px, and what it needs.
+
+    Latency is that of one image at batch 1 after warm-up, frames in memory: the median, 5th and 95th percentile over
+    ``repeats`` runs, in ms. Throughput is in images per second with ``batch`` images at once (``batched`` says whether
+    the method takes them together or one after another). ``peak_memory_mib`` is the largest resident set of the whole
+    process, ``working_memory_mib`` what predicting one image adds to it, ``gpu_memory_mib`` the most that was allocated
+    on the GPU; null where unknown. ``frames`` is the number of captures that one depth map costs.
+    """
+
+    provenance: Literal["measured", "self-reported"]
+    latency_median_ms: Positive
+    latency_p5_ms: Positive
+    latency_p95_ms: Positive
+    repeats: Whole
+    batch: Whole
+    batched: bool
+    throughput_per_s: Positive
+    peak_memory_mib: NonNegative | None
+    working_memory_mib: NonNegative | None
+    gpu_memory_mib: NonNegative | None
+    parameters: Count
+    frames: Count
+    image_size: Annotated[list[Whole], Field(min_length=2, max_length=2)]
+    device: Text
+    hardware: HardwareInfo
+    software: dict[Text, Text] = Field(default_factory=dict, max_length=100)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Timing":
+        if not self.latency_p5_ms <= self.latency_median_ms <= self.latency_p95_ms:
+            raise ValueError("expected latency_p5_ms <= latency_median_ms <= latency_p95_ms")
+        return self
+
+
+RelianceVersion = Literal["1.0.0"]
+RELIANCE_VERSION: RelianceVersion = "1.0.0"
+"""Version of the score's definition and of the scenes; scores of different versions are not compared."""
+
+
+class RelianceParts(StrictModel):
+    """The parts of the score, and further measurements; means over samples, null where a part can't be measured.
+
+    ``follows_*``: how far the answer follows, in [0, 1], when a surface moves within its outline. ``phase``: only the
+    phase is that of the moved surface, every pixel keeps its brightness (part of the score). ``light``: only the
+    brightness is. ``both``: both, as a camera would see it. ``constant``: the phase alone, moved by a constant.
+    ``change_*``: how much the answer changes, relative to the change that the phase asks for: with another outline
+    (part of the score), without fringes inside or outside the object, with fringes of the other direction or of
+    another pitch. ``answered_*``: share of the object's pixels that have an answer in that case. ``order_free_*``:
+    the same, allowing whole periods.
+    """
+
+    follows_phase: Share | None
+    follows_light: Share | None
+    follows_both: Share | None
+    follows_constant: Share | None
+    change_outline: NonNegative | None
+    change_no_fringe_inside: NonNegative | None
+    change_no_fringe_outside: NonNegative | None
+    change_other_direction: NonNegative | None
+    change_other_pitch: NonNegative | None
+    answered_no_fringe_inside: Share | None
+    answered_no_fringe_outside: Share | None
+    order_free_follows_phase: Share | None
+    order_free_change_outline: NonNegative | None
+
+
+PART_TITLES = {
+    "follows_phase": "follows the phase, within the object, brightness unchanged",
+    "follows_light": "follows the brightness, phase unchanged",
+    "follows_both": "follows a moved surface as it would be photographed",
+    "follows_constant": "follows the phase when all of the object moves",
+    "change_outline": "changes with another outline",
+    "change_no_fringe_inside": "changes without fringes inside the object",
+    "change_no_fringe_outside": "changes without fringes outside the object",
+    "change_other_direction": "changes with fringes of the other direction",
+    "change_other_pitch": "changes with fringes of another pitch",
+    "answered_no_fringe_inside": "share answered without fringes inside",
+    "answered_no_fringe_outside": "share answered without fringes outside",
+    "order_free_follows_phase": "follows the phase, whole periods aside",
+    "order_free_change_outline": "changes with another outline, whole periods aside",
+}
+"""Each part in words."""
+
+
+class Reliance(StrictModel):
+    """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below two objects).
+
+    ``order_free_score`` allows whole periods and is null where the answer is not in mm. ``units`` are those of the
+    answer that was held against the truth; ``weights_sha256`` of a network is that of its weights file.
+    """
+
+    version: RelianceVersion
+    score: Share
+    interval: Interval
+    order_free_score: Share | None
+    parts: RelianceParts
+    units: Literal["mm", "normalised"]
+    direction: Literal["horizontal", "vertical"]
+    samples: Whole
+    objects: Whole
+    dataset_fingerprint: Sha256
+    protocol_version: Text
+    weights_sha256: Sha256 | None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Reliance":
+        low, high = self.interval
+        if (low is None) != (high is None):
+            raise ValueError("interval: expected two numbers or two nulls")
+        if low is not None and high is not None and not 0 <= low <= high <= 1:
+            raise ValueError("interval: expected 0 <= low <= high <= 1")
+        if self.objects > self.samples:
+            raise ValueError("objects is above samples")
+        return self

@@ -1,193 +1,29 @@
 """Scoring a folder of predictions against one split of a dataset: everything is checked, every problem is named."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import Lock, local
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
+from threading import Lock
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import edge_jump_mm
+from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, PROTOCOL_VERSION, TARGETS, Mode, Units
-from fpp_ml_bench.evaluation.score.scores import score_sample
+from fpp_ml_bench.evaluation import protocol, result, submission
+from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Listing, list_folder, read_plain, reader_for
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import Sequence
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.result import Result
-    from fpp_ml_bench.evaluation.submission import Submission
-
-
-class ScoredDataset(Protocol):
-    """What the evaluator needs of a dataset; `fpp_ml_bench.loaders.storage.store.DatasetFolder` has it."""
-
-    path: Path
-
-    @property
-    def fingerprint(self) -> str: ...
-    @property
-    def size(self) -> tuple[int, int]: ...
-    @property
-    def sequence(self) -> Sequence: ...
-    @property
-    def splits(self) -> dict[str, list[str]]: ...
-    @property
-    def has_exact(self) -> bool: ...
-    def samples(self, split: str) -> list[str]: ...
-    def target_mm(self, sample: str, column: str = ...) -> NDArray[np.float32]: ...
-
-
-def evaluate(
-    folder: str | Path,
-    dataset: ScoredDataset,
-    split: str = "test",
-    target: str = "depth",
-    edge_band_px: int = EDGE_BAND_PX,
-    mode: str = "standard",
-    while_scoring: Callable[[], object] = lambda: None,
-) -> "Result":
-    """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
-
-    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
-    or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
-    of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once while threads
-    score: a command uses it to import what it needs afterwards.
-
-    Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
-    and DatasetError for a target that is not a depth map.
-    """
-    folder = Path(folder)
-    samples = _samples(folder, dataset, split, target, mode)
-    content, description_error = None, None
-    try:
-        content = read_plain(folder)
-    except SubmissionError as error:
-        description_error = error
-    split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
-    listing = list_folder(folder, samples, split, split_of)
-    units, mm_per_level = _declared_units(content or {})
-    rules = Rules(dataset.size, units, mm_per_level, mode, edge_band_px)  # type: ignore[arg-type]
-    problems, rows = list(listing.problems), []
-    # The description is checked while the first files are scored: pydantic takes long to import.
-    release = getattr(dataset, "release", lambda sample: None)  # only a memory-mapped dataset has pages to release
-    outcomes = (
-        scored(folder, listing, rules, lambda sample: dataset.target_mm(sample, target), release)
-        if units in get_args(Units)
-        else ()
-    )
-    submission: Submission | None = None
-    if content is not None:
-        try:
-            submission = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
-        except SubmissionError as error:
-            description_error = error
-        from fpp_ml_bench.evaluation.result import provenance  # noqa: F401  imported while the threads score
-
-        while_scoring()
-    for file_problems, file_rows in outcomes:
-        problems += file_problems
-        rows += file_rows
-    if problems:
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        description_problems = [str(description_error)] if description_error else []
-        raise PredictionError(
-            f"{printable(str(folder), 500)} can't be scored, {count}:", description_problems + problems
-        )
-    if description_error or submission is None:
-        raise description_error or SubmissionError(f"{printable(str(folder), 500)} has no description")
-    return _result(rows, dataset, split, target, mode, edge_band_px, submission)
-
-
-def _samples(folder: Path, dataset: ScoredDataset, split: str, target: str, mode: str) -> list[str]:
-    """The split's samples; refuses arguments that name no folder, target, mode or sample."""
-    if not folder.is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    if target not in TARGETS:
-        raise DatasetError(f"expected target {' or '.join(TARGETS)}, got {printable(target)!r}")
-    if mode not in MODES:
-        raise DatasetError(f"expected mode {' or '.join(MODES)}, got {printable(mode)!r}")
-    if target == "depth_exact" and not dataset.has_exact:
-        raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
-    samples = dataset.samples(split)
-    if not samples:
-        raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
-    return samples
-
-
-def _declared_units(content: dict[Any, Any]) -> tuple[Any, float | None]:
-    """Units and PNG scale as declared; `submission` refuses values that are neither."""
-    units, scale = content.get("units", "mm"), content.get("png_mm_per_level")
-    return units, float(scale) if isinstance(scale, int | float) and not isinstance(scale, bool) else None
-
-
-def _checked_submission(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> "Submission":
-    """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
-    from fpp_ml_bench.evaluation.submission import check_submission
-
-    submission = check_submission(folder, content)
-    file = printable(str(folder / SUBMISSION_FILE), 500)
-    outside = [index for index in submission.frames_used if index >= frames]
-    if outside:
-        raise SubmissionError(
-            f"{file}: frames_used: expected indices from 0 to {frames - 1} of "
-            f"this dataset's sequence, got {printable(str(outside), 100)}"
-        )
-    if (form == ".png") != (submission.png_mm_per_level is not None):
-        raise SubmissionError(
-            f"{file}: png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
-            if form == ".png"
-            else f"{file}: png_mm_per_level is given, but the predictions are {form}; remove the key"
-        )
-    if mode == "paper-individual" and submission.units != "normalised":
-        raise SubmissionError(
-            f"{file}: --mode paper-individual scores normalised depth (units: normalised), these are in "
-            f"{submission.units}; score them with --mode standard"
-        )
-    return submission
-
-
-def _result(
-    rows: list[dict[str, Any]],
-    dataset: ScoredDataset,
-    split: str,
-    target: str,
-    mode: str,
-    edge_band_px: int,
-    submission: "Submission",
-) -> "Result":
-    from fpp_ml_bench.evaluation.result import environment, result_from_rows
-    from fpp_ml_bench.loaders.storage import benchmark_of
-
-    height, width = dataset.size
-    benchmark = benchmark_of(dataset.fingerprint)
-    return result_from_rows(
-        [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
-        protocol_version=PROTOCOL_VERSION,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        submission=submission,
-        dataset={
-            "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
-            "fingerprint": dataset.fingerprint,
-            "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
-            "split": split,
-            "size": [height, width],
-            "samples": len(rows),
-        },
-        target=target,
-        mode=mode,
-        edge_band_px=edge_band_px,
-        edge_jump_mm=edge_jump_mm(width),
-        environment=environment(),
-    )
-
+from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 WORKERS = 4
 Outcome = tuple[list[str], list[dict[str, Any]]]
@@ -204,32 +40,144 @@ class Rules(NamedTuple):
     edge_band_px: int
 
 
-def scored(
-    folder: Path,
-    listing: Listing,
-    rules: Rules,
-    target_mm: Callable[[str], NDArray[np.float32]],
-    release: Callable[[str], None] = lambda sample: None,
-) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order.
+def evaluate(
+    folder: str | Path,
+    dataset: DatasetFolder,
+    split: str = "test",
+    target: str = "depth",
+    edge_band_px: int = protocol.EDGE_BAND_PX,
+    mode: str = "standard",
+    while_scoring: Callable[[], object] = lambda: None,
+) -> result.Result:
+    """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
-    ``target_mm`` gives a sample's target (H, W); ``release`` is called when it is not needed any more.
+    ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
+    or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
+    of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once while threads
+    score: a command uses it to import what it needs afterwards.
+
+    Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
+    and DatasetError for a target that is not a depth map.
+    """
+    folder = Path(folder)
+    samples = _samples(folder, dataset, split, target, mode)
+    content, description_error = None, None
+    try:
+        content = submission.read_plain(folder)
+    except SubmissionError as error:
+        description_error = error
+    split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
+    listing = submission.list_folder(folder, samples, split, split_of)
+    units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
+    # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
+    # takes long to import: `result` and `submission` are packages that load what is used of them.
+    level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
+    rules = Rules(dataset.size, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
+    problems, rows = list(listing.problems), []
+    outcomes = _scored(folder, listing, rules, dataset, target) if units in get_args(Units) else ()
+    description: submission.Submission | None = None
+    if content is not None:
+        try:
+            description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
+        except SubmissionError as error:
+            description_error = error
+        result.environment  # noqa: B018  imported while the threads score
+        while_scoring()
+    for file_problems, file_rows in outcomes:
+        problems += file_problems
+        rows += file_rows
+    if problems:
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        description_problems = [str(description_error)] if description_error else []
+        raise PredictionError(
+            f"{printable(str(folder), 500)} can't be scored, {count}:", description_problems + problems
+        )
+    if description_error or description is None:
+        raise description_error or SubmissionError(f"{printable(str(folder), 500)} has no description")
+    benchmark = benchmark_of(dataset.fingerprint)
+    return result.result_from_rows(
+        [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
+        protocol_version=protocol.PROTOCOL_VERSION,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        submission=description,
+        dataset={
+            "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
+            "fingerprint": dataset.fingerprint,
+            "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
+            "split": split,
+            "size": list(dataset.size),
+            "samples": len(rows),
+        },
+        target=target,
+        mode=mode,
+        edge_band_px=edge_band_px,
+        edge_jump_mm=edge_jump_mm(dataset.size[1]),
+        environment=result.environment(),
+    )
+
+
+def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode: str) -> list[str]:
+    """The split's samples; refuses arguments that name no folder, target, mode or sample."""
+    if not folder.is_dir():
+        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+    if target not in protocol.TARGETS:
+        raise DatasetError(f"expected target {' or '.join(protocol.TARGETS)}, got {printable(target)!r}")
+    if mode not in protocol.MODES:
+        raise DatasetError(f"expected mode {' or '.join(protocol.MODES)}, got {printable(mode)!r}")
+    if target == "depth_exact" and not dataset.has_exact:
+        raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
+    samples = dataset.samples(split)
+    if not samples:
+        raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
+    return samples
+
+
+def _checked_submission(
+    folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str
+) -> submission.Submission:
+    """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
+    description = submission.check_submission(folder, content)
+    file = printable(str(folder / submission.SUBMISSION_FILE), 500)
+    outside = [index for index in description.frames_used if index >= frames]
+    if outside:
+        raise SubmissionError(
+            f"{file}: frames_used: expected indices from 0 to {frames - 1} of "
+            f"this dataset's sequence, got {printable(str(outside), 100)}"
+        )
+    if (form == ".png") != (description.png_mm_per_level is not None):
+        raise SubmissionError(
+            f"{file}: png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
+            if form == ".png"
+            else f"{file}: png_mm_per_level is given, but the predictions are {form}; remove the key"
+        )
+    if mode == "paper-individual" and description.units != "normalised":
+        raise SubmissionError(
+            f"{file}: --mode paper-individual scores normalised depth (units: normalised), these are in "
+            f"{description.units}; score them with --mode standard"
+        )
+    return description
+
+
+def _scored(
+    folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder, column: str
+) -> Iterator[Outcome]:
+    """Problems and row of each sample that has a prediction, in order; its target is the dataset's ``column``.
 
     Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
-    read = reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
-    memory, dataset_lock = local(), Lock()
+    reader = submission.reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
+    dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = target_mm(sample)
+            target = dataset.target_mm(sample, column)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             raise DatasetError(
                 f"{sample}: the target depth holds NaN, infinite or negative values; run: fpp-bench verify"
             )
         try:
-            values, digest = read(sample, memory)
+            values, digest = reader.read(sample)
             problems = value_problems(values, target, high, rules.units)
             if not problems:
                 pair = scored_pair(values, target, rules.units, rules.mode, sample)
@@ -237,18 +185,11 @@ def scored(
         except PredictionError as error:
             problems = [str(error)]
         with dataset_lock:
-            release(sample)
+            dataset.release(sample)
         if problems:
-            return [f"{read.named(sample)}: {problem}" for problem in problems], []
-        return [], [
-            {
-                "sample": sample,
-                "prediction_sha256": digest,
-                "object_pixels": scores.object.pixels,
-                "background_pixels": scores.background.pixels,
-                **scores.metrics(),
-            }
-        ]
+            return [f"{reader.named(sample)}: {problem}" for problem in problems], []
+        pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
+        return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 
     pool = ThreadPoolExecutor(min(WORKERS, usable_cores()))
     return _results(pool, [pool.submit(work, sample) for sample in listing.present])
@@ -260,3 +201,115 @@ def _results(pool: ThreadPoolExecutor, futures: list[Future[Outcome]]) -> Iterat
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+_TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
+"""`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
+
+
+def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> list[str]:
+    """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
+
+    Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
+    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute.
+    """
+    if scored.protocol_version != protocol.PROTOCOL_VERSION:
+        raise SubmissionError(
+            f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
+            "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
+        )
+    if scored.dataset.fingerprint != dataset.fingerprint:
+        return [
+            f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, "
+            f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
+        ]
+    again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
+    described, description = scored.submission.model_dump(), again.submission.model_dump()
+    pairs = [
+        ("dataset.size", scored.dataset.size, again.dataset.size, "recomputed"),
+        ("dataset.samples", scored.dataset.samples, again.dataset.samples, "recomputed"),
+        ("edge_jump_mm", scored.edge_jump_mm, again.edge_jump_mm, "recomputed"),
+        *(
+            (f"submission.{key}", described.get(key), description.get(key), f"in {submission.SUBMISSION_FILE}")
+            for key in dict.fromkeys((*described, *description))
+            if key not in _TIME_KEYS
+        ),
+    ]
+    problems = [
+        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} {origin}"
+        for name, stored, value, origin in pairs
+        if stored != value
+    ]
+    stored_rows = {row.sample: row for row in scored.per_sample}
+    if set(stored_rows) != {row.sample for row in again.per_sample}:
+        return [*problems, "per_sample: other samples than the split has"]
+    for row in again.per_sample:
+        problems += _sample_differences(stored_rows[row.sample], row)
+    return problems
+
+
+def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
+    exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
+    keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
+    object_mae_mm = recomputed.object_mae_mm or 0.0
+    for key in protocol.METRICS:
+        # Signed means and the error without an offset are small differences of large numbers.
+        rounding_mm = 1e-9 * object_mae_mm if "bias" in key or "shift_free" in key else 0.0
+        if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
+            keys.append(key)
+    return [
+        f"{recomputed.sample}: {key}: {_value_text(getattr(stored, key))} in the result, "
+        f"{_value_text(getattr(recomputed, key))} recomputed"
+        for key in keys
+    ]
+
+
+def _value_text(value: object) -> str:
+    return printable(value if isinstance(value, str) else repr(value), 80)
+
+
+def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
+    """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
+
+    Reads the split's targets again.
+    """
+    samples, (height, width) = dataset.samples(split), dataset.size
+    boxes = {}
+    for sample in samples:
+        boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
+        dataset.release(sample)
+    frames, depths = len(stored_frames(dataset.sequence, dataset.manifest.stored)), 1 + dataset.has_exact
+    read = 1 + (target != "depth")
+    median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
+    depth_mm = dataset.target_mm(median, target)
+    skipped = len(samples) * depth_mm.size - sum(boxes.values())
+    unread_bytes = len(samples) * (frames + (depths - read) * depth_mm.itemsize) * depth_mm.size
+    seconds = saved_by(
+        lambda: object_near_edges(depth_mm, (edge_band_px, protocol.WIDE_BAND_PX)),
+        depth_mm.size - boxes[median],
+        skipped,
+    )
+    lines = [
+        LeftOut(
+            "columns that no score needs", "images", len(samples) * read, len(samples) * (frames + depths - read),
+            unread_bytes, None, "not read; seconds not measured, they depend on the disk",
+        ),
+        LeftOut(
+            "depth edges far from the object", "pixels", sum(boxes.values()), skipped, None, seconds,
+            f"processor seconds of one sample ({median}) without skipping minus with it, measured now, scaled to the "
+            "pixels that all samples skipped",
+        ),
+    ]  # fmt: skip
+    return explained("fpp-eval", f"{len(samples)} samples of {width}x{height} px", lines)
+
+
+def _box_px(inside: NDArray[np.bool_]) -> int:
+    """Pixels of the box around the object, and one pixel around it, in which `object_near_edges` searches."""
+    rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return 0
+    height, width = (
+        min(int(line[-1]) + 2, limit) - max(int(line[0]) - 1, 0)
+        for line, limit in zip((rows, columns), inside.shape, strict=True)
+    )
+    return height * width

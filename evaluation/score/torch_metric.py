@@ -18,20 +18,12 @@ from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, WITHIN, WITHIN_MM
-from fpp_ml_bench.evaluation.score.error_stats import NOT_FINITE
+from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
 
 KEYS = (
-    *HEADLINE,
-    "object_valid_mae_mm",
-    "object_missing_share",
-    "object_median_mm",
-    "object_p95_mm",
-    "object_max_mm",
-    *WITHIN,
-    "object_bias_mm",
-    "object_valid_bias_mm",
-    "object_shift_free_mae_mm",
-)
+    *HEADLINE, "object_valid_mae_mm", "object_missing_share", "object_median_mm", "object_p95_mm", "object_max_mm",
+    *WITHIN, "object_bias_mm", "object_valid_bias_mm", "object_shift_free_mae_mm",
+)  # fmt: skip
 
 SQUARES_VANISH = 1e-140
 """Errors below this have squares below the smallest normal float64."""
@@ -64,11 +56,10 @@ class DepthScores(Metric):
         """Add a batch. Raises PredictionError for other shapes or dtypes, and for errors that are not finite."""
         prediction, target = _maps(prediction_mm, target_mm)
         for predicted, truth in zip(prediction, target, strict=True):
-            scores = sample_scores(predicted, truth)
-            present = torch.tensor([scores[key] is not None for key in KEYS], device=self.sums.device)
-            values = torch.stack([_or_zero(scores[key], predicted.device) for key in KEYS]).to(self.sums.device)
-            self.sums += values
-            self.counts += present.to(torch.float64)
+            scores = _sample_scores(predicted, truth)
+            values = [predicted.new_zeros(()) if (score := scores[key]) is None else score for key in KEYS]
+            self.sums += torch.stack(values).to(self.sums.device)
+            self.counts += torch.tensor([scores[key] is not None for key in KEYS], device=self.counts.device)
 
     def compute(self) -> dict[str, Tensor]:
         """Mean over the samples so far, of all processes, of every key."""
@@ -94,7 +85,7 @@ def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
     return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
 
 
-def sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:
+def _sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:
     """Scores of one sample, float64 (H, W) in mm each: the keys of `KEYS`, None for an empty pixel set."""
     error = prediction - target
     if not bool(torch.isfinite(error.square().sum())):
@@ -131,12 +122,8 @@ def _root_mean_square(errors: Tensor) -> Tensor:
 
 
 def _quantile(ascending: Tensor, level: float) -> Tensor:
-    """Linear interpolation between order statistics, as in `scores`."""
+    """Linear interpolation between order statistics, as in `sample_scores`."""
     position = level * (ascending.numel() - 1)
     low = int(position)
     below, above = ascending[low], ascending[min(low + 1, ascending.numel() - 1)]
     return below + (above - below) * (position - low)
-
-
-def _or_zero(value: Tensor | None, device: torch.device) -> Tensor:
-    return torch.zeros((), dtype=torch.float64, device=device) if value is None else value

@@ -8,48 +8,69 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.evaluation.protocol import (
-    LARGEST_MM,
-    METRES_AT_MOST,
-    METRES_BELOW,
-    MILLIMETRES_ABOVE,
-    NORMALISED_AT_MOST,
-    Mode,
-    Units,
-)
+from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.protocol import Mode, Units
 
 Depth = NDArray[np.floating[Any]]
 
 
-def unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
+"""Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
+
+
+def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, units: Units) -> list[str]:
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list.
+
+    ``target_max_mm`` is the largest value of ``target_mm`` (H, W).
+    """
+    low, high = float(prediction.min()), float(prediction.max())
+    problems = []
+    if not np.isfinite([low, high]).all():  # min and max carry NaN through
+        nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
+        counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
+        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; write 0 where nothing was measured")
+        if nans + infinities == prediction.size:
+            return problems
+        prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
+        low, high = float(prediction.min()), float(prediction.max())
+    largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
+    if max(high, -low) > largest:
+        problems.append(
+            f"holds values up to {max(high, -low):.3g} {units} in magnitude; the limit is {largest:g}; write 0 where "
+            "nothing was measured"
+        )
+    wrong_unit = _unit_problem(prediction, target_mm, units, high, target_max_mm)
+    return [*problems, wrong_unit] if wrong_unit else problems
+
+
+def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
     """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can.
 
     Where mm are declared, the largest value shows whether the values are metres or shares of the range. Where m or
     normalised depth is declared, a single stray pixel must not decide, so the median over the object is compared.
     """
     if units == "mm":
-        if 0 < high < METRES_BELOW and target_max_mm > MILLIMETRES_ABOVE:
+        if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
             return (
                 f"looks like metres or normalised depth: its largest value is {high:.4g}, the target reaches "
                 f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
             )
         return None
-    depths = values[object_mask(target_mm)]
-    depths = depths[depths > 0]
+    depths = values[object_mask(target_mm) & (values > 0)]
     if not depths.size:
         return None
     typical = float(np.median(depths))
-    if units == "m" and typical > METRES_AT_MOST:
+    if units == "m" and typical > protocol.METRES_AT_MOST:
         return (
             f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
             "mm in submission.yaml"
         )
-    if units == "m" and high < 1 and target_max_mm > MILLIMETRES_ABOVE:
+    if units == "m" and high < 1 and target_max_mm > protocol.MILLIMETRES_ABOVE:
         return (
             f"does not look like metres: its largest value is {high:.4g}, the target reaches "
             f"{target_max_mm / MM_PER_M:.2f} m; if it is normalised, declare units: normalised in submission.yaml"
         )
-    if units == "normalised" and typical > NORMALISED_AT_MOST:
+    if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
         return (
             f"does not look like normalised depth: its median over the object is {typical:.4g}, the target's is at "
             "most 1; if it is in m or mm, declare that in submission.yaml"
@@ -92,36 +113,3 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
             "with --mode standard"
         )
     return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)
-
-
-MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
-"""Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
-
-
-def value_problems(
-    prediction: NDArray[np.floating[Any]], target_mm: NDArray[np.floating[Any]], target_max_mm: float, units: Units
-) -> list[str]:
-    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list.
-
-    ``target_max_mm`` is the largest value of ``target_mm`` (H, W).
-    """
-    low, high = float(prediction.min()), float(prediction.max())
-    problems = []
-    finite = prediction
-    if not np.isfinite([low, high]).all():  # min and max carry NaN through
-        nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
-        counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
-        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; write 0 where nothing was measured")
-        finite_pixels = np.isfinite(prediction)
-        if not finite_pixels.any():
-            return problems
-        finite = np.where(finite_pixels, prediction, prediction.dtype.type(0))
-        low, high = float(finite.min()), float(finite.max())
-    largest = LARGEST_MM / MM_PER_UNIT[units]
-    if max(high, -low) > largest:
-        problems.append(
-            f"holds values up to {max(high, -low):.3g} {units} in magnitude; the limit is {largest:g}; write 0 where "
-            "nothing was measured"
-        )
-    wrong_unit = unit_problem(finite, target_mm, units, high, target_max_mm)
-    return [*problems, wrong_unit] if wrong_unit else problems

@@ -1,63 +1,18 @@
-"""``submission.yaml``: the description of a submission, as a strict model."""
+"""``submission.yaml``: the description of a submission, read into a strict model and written from it."""
 
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
-from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
-from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, StrictModel, Text, validate
-from fpp_ml_bench.files import printable, strict_yaml
-
-SUBMISSION_FILE = "submission.yaml"
-REPORTS_FILE = "per_sample.json"
-"""What a method may report of each sample beside its predictions; it is not scored."""
-MAX_BYTES = 65536
+from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, SparseModel, Text, validate
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
 
 
-def read_plain(folder: Path) -> dict[Any, Any]:
-    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked.
-
-    SubmissionError names the file, what is wrong with it and what to do.
-    """
-    path = folder / SUBMISSION_FILE
-    if path.is_symlink() or not path.is_file():
-        raise SubmissionError(
-            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
-            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
-            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
-        )
-    return read_plain_file(path, "'name: My method'")
-
-
-def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
-    """Keys and values of a YAML file, bounded and plain as this module says; ``example`` shows what a line looks like.
-
-    SubmissionError names the file, what is wrong with it and what to do.
-    """
-    file = printable(str(path), 500)
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; shorten names and settings")
-        content = strict_yaml(data.decode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SubmissionError(f"{file}: expected UTF-8 text") from None
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
-        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
-        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
-    if not isinstance(content, dict):
-        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
-    return content
-
-
-class Submission(StrictModel):
+class Submission(SparseModel):
     """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
 
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
@@ -66,6 +21,8 @@ class Submission(StrictModel):
     black outside the object); false is never written, so that files without this key stay as they are.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
     """
+
+    SPARSE = ("uses_ground_truth_mask",)
 
     name: Text
     method: Text
@@ -99,19 +56,17 @@ class Submission(StrictModel):
             raise ValueError("timing.frames is not the number of frames_used; time this very method")
         return self
 
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content: dict[str, Any] = handler(self)
-        if not self.uses_ground_truth_mask:
-            content.pop("uses_ground_truth_mask", None)
-        return content
-
     @property
     def track(self) -> Track:
         """``metric``, or what of the test samples' ground truth the method was given: range, object mask or both."""
         if self.uses_ground_truth_range:
             return "oracle range + mask" if self.uses_ground_truth_mask else "oracle range"
         return "oracle mask" if self.uses_ground_truth_mask else "metric"
+
+    def to_yaml(self) -> str:
+        """The file's text: the keys that were given, in the model's order."""
+        content = self.model_dump(mode="json", exclude_unset=True)
+        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
 def read_submission(folder: Path) -> Submission:

@@ -1,21 +1,64 @@
-"""Which prediction files a folder holds, in which of the accepted forms, and what is missing or extra."""
+"""What a folder of predictions holds: the plain values of its description, and the files, their form and reader."""
 
+import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import local
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
+import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission.description import REPORTS_FILE, SUBMISSION_FILE
-from fpp_ml_bench.evaluation.submission.npy import buffer_for, read_prediction
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.errors import PredictionError, SubmissionError
+from fpp_ml_bench.evaluation.submission.sample_files import parse_npy, read_npy, read_npz, read_png
+from fpp_ml_bench.files import printable, read_bounded, strict_yaml
+
+SUBMISSION_FILE = "submission.yaml"
+REPORTS_FILE = "per_sample.json"
+"""What a method may report of each sample beside its predictions; it is not scored."""
+_MAX_BYTES = 65536
+
+
+def read_plain(folder: Path) -> dict[Any, Any]:
+    """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
+    path = folder / SUBMISSION_FILE
+    if path.is_symlink() or not path.is_file():
+        raise SubmissionError(
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
+            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
+            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
+        )
+    return read_plain_file(path, "'name: My method'")
+
+
+def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
+    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
+
+    SubmissionError names the file, what is wrong with it and what to do.
+    """
+    file = printable(str(path), 500)
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            raise SubmissionError(f"{file}: expected at most {_MAX_BYTES} bytes; shorten names and settings")
+        content = strict_yaml(data.decode("utf-8"))
+    except OSError as error:
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{file}: expected UTF-8 text") from None
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
+        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
+    if not isinstance(content, dict):
+        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
+    return content
+
 
 PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
 TABLES = ("predictions.parquet", "predictions.arrow")
-FORMS = "{sample}.npy, .npz, .mat or .png, or one predictions.parquet or .arrow"
+_MAT_SPARE_BYTES = 1 << 20
 
 
 class Listing(NamedTuple):
@@ -32,102 +75,76 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split.
     """
     try:
-        names = sorted(entry.name for entry in os.scandir(folder))
+        names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
         raise PredictionError(
             f"the predictions folder {printable(str(folder))} can't be read: {error.strerror}"
         ) from None
-    form = _form(set(names), samples)
-    expected = {form} if form in TABLES else {f"{sample}{form}" for sample in samples}
-    problems = [
-        f"{name}: is missing; write one for each sample"
-        for name in _in_order(expected, samples, form)
-        if name not in names
-    ]
-    problems += [
-        f"{printable(name)}: is extra ({_hint(name, form, samples, split, split_of)})"
-        for name in names
-        if name not in expected and name not in (SUBMISSION_FILE, REPORTS_FILE)
-    ]
-    if form in TABLES:
-        return Listing(form, problems, list(samples))
-    present = set(names)
-    return Listing(form, problems, [sample for sample in samples if f"{sample}{form}" in present])
-
-
-def _form(names: set[str], samples: Sequence[str]) -> str:
     counts = {suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE}
-    best = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
-    if counts[best] == 0:
-        return next((table for table in TABLES if table in names), best)
-    return best
+    form = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
+    if counts[form] == 0:
+        form = next((table for table in TABLES if table in names), form)
+    files = {form: ""} if form in TABLES else {f"{sample}{form}": sample for sample in samples}
 
+    def hint(name: str) -> str:
+        stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
+        sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
+        if sample_split and stem not in samples:
+            return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
+        if sample_split or name in TABLES:
+            return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
+        return "remove it"
 
-def _in_order(expected: set[str], samples: Sequence[str], form: str) -> list[str]:
-    return list(expected) if form in TABLES else [f"{sample}{form}" for sample in samples]
-
-
-def _hint(name: str, form: str, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> str:
-    stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
-    sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
-    if sample_split and stem not in samples:
-        return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
-    if sample_split or name in TABLES:
-        return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
-    return "remove it"
+    problems = [f"{name}: is missing; write one for each sample" for name in files if name not in names]
+    extra = sorted(names - {*files, SUBMISSION_FILE, REPORTS_FILE})
+    problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
+    present = list(samples) if form in TABLES else [sample for name, sample in files.items() if name in names]
+    return Listing(form, problems, present)
 
 
 MapAndHash = tuple[NDArray[Any], str]
 
 
-class Reader(Protocol):
-    """Called from several threads; ``memory`` is the calling thread's own, for buffers that it reuses."""
+class Reader(NamedTuple):
+    """``read(sample)`` gives a map (H, W), valid until the same thread reads again, and the SHA-256 of its file.
 
-    def __call__(self, sample: str, memory: local) -> MapAndHash: ...
+    It may be called from several threads, and raises PredictionError, without the file's name, for a file that is
+    refused. ``named(sample)`` is the name of the sample's prediction in messages: its file.
+    """
 
-    def named(self, sample: str) -> str:
-        """The name of the sample's prediction in messages: its file."""
-        ...
-
-
-class _FilePerSample:
-    def __init__(self, folder: Path, form: str, read: Callable[[Path, local], MapAndHash]) -> None:
-        self._folder, self._form, self._read = folder, form, read
-
-    def named(self, sample: str) -> str:
-        return f"{sample}{self._form}"
-
-    def __call__(self, sample: str, memory: local) -> MapAndHash:
-        return self._read(self._folder / self.named(sample), memory)
+    read: Callable[[str], MapAndHash]
+    named: Callable[[str], str]
 
 
 def reader_for(
     form: str, folder: Path, samples: Sequence[str], size: tuple[int, int], png_mm_per_level: float | None
 ) -> Reader:
-    """The reader of ``form`` (of `fpp_ml_bench.evaluation.submission.prediction_files`) for maps of ``size`` (H, W).
-
-    Its calls raise PredictionError, without the file's name, for a file that is refused.
-    """
+    """The reader of ``form`` (of `PER_SAMPLE` or `TABLES`) for maps of ``size`` (H, W)."""
     if form in TABLES:
-        from fpp_ml_bench.evaluation.submission.table import TablePredictions
+        from fpp_ml_bench.evaluation.submission.table import depth_maps  # needs pyarrow, which other forms do not
 
-        return TablePredictions(folder / form, samples, size)
-    if form == ".npz":
-        from fpp_ml_bench.evaluation.submission.npy import read_npz
-
-        return _FilePerSample(folder, form, lambda path, memory: read_npz(path, size))
+        maps = depth_maps(folder / form, samples, size)
+        return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
     if form == ".mat":
-        from fpp_ml_bench.evaluation.submission.mat import read_mat
+        read = _mat_reader(size)
+    else:
+        memory = local()
+        read = {
+            ".npy": lambda path: read_npy(path, size, memory),
+            ".npz": lambda path: read_npz(path, size),
+            ".png": lambda path: read_png(path, size, png_mm_per_level),
+        }[form]
+    return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
 
-        return _FilePerSample(folder, form, lambda path, memory: read_mat(path, size))
-    if form == ".png":
-        from fpp_ml_bench.evaluation.submission.png import read_png
 
-        return _FilePerSample(folder, form, lambda path, memory: read_png(path, size, png_mm_per_level))
-    return _FilePerSample(folder, form, lambda path, memory: _read_npy(path, size, memory))
+def _mat_reader(size: tuple[int, int]) -> Callable[[Path], MapAndHash]:
+    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
 
+    largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
+    matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest)
 
-def _read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
-    if not hasattr(memory, "buffer"):
-        memory.buffer = buffer_for(size)
-    return read_prediction(path, size, memory.buffer)
+    def read_mat(path: Path) -> MapAndHash:
+        content = read_bounded(path, largest)
+        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
+
+    return read_mat

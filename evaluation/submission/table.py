@@ -1,88 +1,92 @@
 """Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (floats).
 
 Each row of ``depth`` holds H lists of W values, one list of H W values, or a tensor; float16, float32 or float64. The
-unpacked size is checked before anything is unpacked: compressed Arrow buffers are refused, and the sizes of a Parquet
-file's pages are added up first (`fpp_ml_bench.evaluation.submission.parquet_pages`).
+file is unpacked in a process with a memory limit (`isolated`), for a file's own word for its unpacked size can't be
+trusted.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Lock, local
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission.arrow_messages import check_uncompressed
-from fpp_ml_bench.evaluation.submission.parquet_pages import check_pages
+from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess
 from fpp_ml_bench.files import printable, read_bounded
 
 _ARROW_MAGIC, _PARQUET_MAGIC = b"ARROW1\0\0", b"PAR1"
 _FLOATS = {pa.float16(): np.float16, pa.float32(): np.float32, pa.float64(): np.float64}
 _SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
+_ROWS_AT_ONCE = 8
 _ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
-class TablePredictions:
-    """A reader (`fpp_ml_bench.evaluation.submission.prediction_files.Reader`) of a single file.
+def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Callable[[str], tuple[NDArray[Any], str]]:
+    """A function from a sample to its map (H, W) and the SHA-256 of the file; PredictionError with the file's name.
 
-    `__init__` raises PredictionError with the file's name. The whole file is held in memory: at most a float64 map per
-    sample.
+    The whole table is held in memory: at most a float64 map per sample.
     """
-
-    def __init__(self, path: Path, samples: Sequence[str], size: tuple[int, int]) -> None:
-        self._file, self._size = path.name, size
-        self._lock = Lock()
-        try:
-            self._table, self._digest = _read(path, len(samples), size)
-            self._rows = _rows(self._table, samples)
-        except PredictionError as error:
-            raise PredictionError(f"{printable(str(path), 500)} {error}") from None
-
-    def named(self, sample: str) -> str:
-        return f"{self._file}, sample {printable(sample)}"
-
-    def __call__(self, sample: str, memory: local) -> tuple[NDArray[Any], str]:
-        with self._lock:
-            column = self._table.column("depth").slice(self._rows[sample], 1).combine_chunks()
-        values = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
-        return _depth_map(values, self._size), self._digest
-
-
-def _read(path: Path, samples: int, size: tuple[int, int]) -> tuple[pa.Table, str]:
-    largest = samples * (size[0] * size[1] * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
-    content = read_bounded(path, largest)
+    count, pixels = len(samples), size[0] * size[1]
+    largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
+    try:
+        content = read_bounded(path, largest)
+        # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
+        unpacked = ReadingProcess(__name__, 2 * largest, 2 * count * (pixels + 1))(content)
+        table = pa.ipc.open_stream(unpacked).read_all()
+        rows = _rows(table.column("sample").to_pylist(), samples)
+    except PredictionError as error:
+        raise PredictionError(f"{printable(str(path), 500)} {error}") from None
     digest = hashlib.sha256(content).hexdigest()
+
+    def depth_map(sample: str) -> tuple[NDArray[Any], str]:
+        column = table.column("depth").slice(rows[sample], 1).combine_chunks()
+        return _depth_map(column.chunk(0) if isinstance(column, pa.ChunkedArray) else column, size), digest
+
+    return depth_map
+
+
+def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
+    """The table as an uncompressed Arrow stream of at most ``largest`` bytes; what `ReadingProcess` calls."""
     try:
         if content.startswith(_PARQUET_MAGIC):
-            table = _parquet(content, largest, samples, size)
+            limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
+            file = pq.ParquetFile(pa.py_buffer(content), **limits)
+            groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
+            chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
+            total, values = sum(c.total_uncompressed_size for c in chunks), sum(c.num_values for c in chunks)
+            if total > largest or values > most_values:
+                raise PredictionError(
+                    f"would unpack to {total} bytes and {values} values, expected at most {largest} and "
+                    f"{most_values} for this split; write one float32 map per sample"
+                )
+            schema, batches = file.schema_arrow, file.iter_batches(_ROWS_AT_ONCE, use_threads=False)
         else:
-            body = pa.py_buffer(content)
             # An IPC file is an IPC stream between a mark and a footer.
-            body = body.slice(len(_ARROW_MAGIC)) if content.startswith(_ARROW_MAGIC) else body
-            check_uncompressed(body)
-            table = pa.ipc.open_stream(body).read_all()
-        table.validate(full=True)
-    except (pa.ArrowException, OSError, EOFError, IndexError, KeyError) as error:
-        if isinstance(error, PredictionError):
-            raise
+            body = pa.py_buffer(content.removeprefix(_ARROW_MAGIC))
+            batches = pa.ipc.open_stream(body, options=pa.ipc.IpcReadOptions(use_threads=False))
+            schema = batches.schema
+        _check_columns(schema)
+        unpacked = pa.BufferOutputStream()
+        with pa.ipc.new_stream(unpacked, schema) as stream:
+            for batch in batches:
+                batch.validate(full=True)
+                stream.write_batch(batch)
+                if unpacked.tell() > largest:
+                    raise PredictionError(
+                        f"unpacks to more than {largest} bytes, which this split can't need; write one float32 map per "
+                        "sample"
+                    )
+        return unpacked.getvalue()
+    except (PredictionError, MemoryError):
+        raise
+    except (pa.ArrowException, OSError, EOFError, IndexError, KeyError, ValueError) as error:
         reason = printable(str(error).split("\n")[0], 120)
         raise PredictionError(f"can't be read as Arrow or Parquet ({reason}); {_ADVICE}") from None
-    return table, digest
-
-
-def _parquet(content: bytes, largest: int, samples: int, size: tuple[int, int]) -> pa.Table:
-    import pyarrow.parquet as pq
-
-    limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
-    file = pq.ParquetFile(pa.py_buffer(content), **limits)
-    # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
-    check_pages(file.metadata, content, 2 * largest, 2 * samples * (size[0] * size[1] + 1))
-    _check_columns(file.schema_arrow)
-    return file.read(use_threads=False)
 
 
 def _check_columns(schema: pa.Schema) -> None:
@@ -111,9 +115,8 @@ def _item_type(value: pa.DataType) -> pa.DataType | None:
     return None
 
 
-def _rows(table: pa.Table, samples: Sequence[str]) -> dict[str, int]:
-    _check_columns(table.schema)
-    names = table.column("sample").to_pylist()
+def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
+    """The row of each sample; refuses a table of other samples."""
     rows = {name: row for row, name in enumerate(names)}
     problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
     problems += [

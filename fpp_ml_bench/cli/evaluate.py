@@ -1,15 +1,21 @@
 """``fpp-eval``: score a folder of predictions against one split of a dataset; its subcommands work on results."""
 
 import argparse
+import json
 import sys
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple, cast
 
-from fpp_ml_bench.cli import run_command
+from fpp_ml_bench.cli import CHECK_FAILED, OK, run_command
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import report, result, score
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import prepare_process
 
 SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background."
 EXAMPLES = (
@@ -19,8 +25,6 @@ EXAMPLES = (
     "fpp-eval verify result.json predictions --dataset data/mini",
     "fpp-eval schema",
 )
-SUBCOMMANDS = {"compare": "eval_compare", "verify": "eval_verify", "schema": "eval_schema"}
-"""First words that select a subcommand. A folder of such a name is given as ./compare."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,47 +82,36 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.machine import prepare_process
-
     prepare_process()
-    from fpp_ml_bench.evaluation.score import evaluate
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-
     if args.json is not None:
         _check_output(args.json, args.folder)
     if args.report is not None:
         _check_report(args.report, args.folder)
-    dataset = DatasetFolder(args.dataset)
-    result = evaluate(args.folder, dataset, args.split, args.target, args.edge_band, args.mode, _import_output)
+    dataset = storage.DatasetFolder(args.dataset)
+    scored = score.evaluate(
+        args.folder,
+        dataset,
+        args.split,
+        args.target,
+        args.edge_band,
+        args.mode,
+        while_scoring=lambda: report.result_table,
+    )
     if args.json is not None:
-        from fpp_ml_bench.evaluation.result import write_result
+        result.write_result(scored, args.json)
+    from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
 
-        write_result(result, args.json)
-    from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.evaluation.report import result_table
-
-    show(result_table(result))
+    show(report.result_table(scored))
     if args.report is not None:
-        from fpp_ml_bench.evaluation.report import write_report
-
-        write_report(result, dataset, args.folder, args.report)
+        report.write_report(scored, dataset, args.folder, args.report)
     for written in (args.json, args.report):
         if written is not None:
             print(f"Written: {written}")
-    from fpp_ml_bench.loaders.storage import benchmark_sentence
-
-    has_expected_bytes, sentence = benchmark_sentence(dataset.manifest)
+    has_expected_bytes, sentence = storage.benchmark_sentence(dataset.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
-    if args.explain or args.explain_json:
-        from fpp_ml_bench.evaluation.score import explain_eval
-
-        explain(args, lambda: explain_eval(dataset, args.split, args.target, args.edge_band))
-    return 0
-
-
-def _import_output() -> None:
-    from fpp_ml_bench.evaluation.report import terminal as table  # noqa: F401
+    explain(args, lambda: score.explain_eval(dataset, args.split, args.target, args.edge_band))
+    return OK
 
 
 def _check_output(path: Path, folder: Path) -> None:
@@ -142,10 +135,104 @@ def _check_report(path: Path, folder: Path) -> None:
         )
 
 
+class Subcommand(NamedTuple):
+    """What `run_command` needs of a command."""
+
+    SUMMARY: str
+    EXAMPLES: tuple[str, ...]
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def _compare_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
+    parser.add_argument(
+        "second",
+        type=Path,
+        metavar="B.json",
+        help="a result of another method on the same data, split, target and track",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Print the table and the sentence. Raises SubmissionError for results that can't be compared."""
+    from fpp_ml_bench.cli.console import show
+
+    comparison = report.compare(result.read_result(args.first), result.read_result(args.second))
+    if args.json is not None:
+        result.write_json(comparison.model_dump(mode="json"), args.json)
+    show(report.comparison_table(comparison))
+    return OK
+
+
+def _schema_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "file",
+        nargs="?",
+        choices=("result", "submission", "comparison"),
+        default="result",
+        help="result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
+    )
+
+
+def _schema(args: argparse.Namespace) -> int:
+    print(json.dumps(result.json_schema(args.file), indent=1))
+    return OK
+
+
+LISTED = 20
+"""Differences that ``verify`` prints."""
+
+
+def _verify_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT.json", help="a result of fpp-eval --json")
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the predictions it was made from")
+    parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
+
+
+def _verify(args: argparse.Namespace) -> int:
+    """Say verified or not, and what differs. Raises FppBenchError where nothing can be recomputed at all."""
+    scored = result.read_result(args.result)
+    problems = score.differences(scored, args.folder, storage.DatasetFolder(args.dataset))
+    file = printable(str(args.result), 500)
+    if not problems:
+        print(f"verified: {file} is what {len(scored.per_sample)} predictions give")
+        return OK
+    print(f"not verified: {file} differs from what the predictions give in {len(problems)} places")
+    for line in problems[:LISTED]:
+        print(f"  {line}")
+    if len(problems) > LISTED:
+        print(f"  ... and {len(problems) - LISTED} more")
+    return CHECK_FAILED
+
+
+SUBCOMMANDS = {
+    "compare": Subcommand(
+        "Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence.",
+        ("fpp-eval compare a.json b.json", "fpp-eval compare a.json b.json --json difference.json"),
+        _compare_arguments,
+        _compare,
+    ),
+    "verify": Subcommand(
+        "Score the predictions again and say whether the result is verified (exit status 0) or not (1).",
+        ("fpp-eval verify result.json predictions --dataset data/mini",),
+        _verify_arguments,
+        _verify,
+    ),
+    "schema": Subcommand(
+        "Print the JSON Schema (2020-12) of result.json or of submission.yaml.",
+        ("fpp-eval schema > result.schema.json", "fpp-eval schema submission"),
+        _schema_arguments,
+        _schema,
+    ),
+}
+"""First words that select a subcommand. A folder of such a name is given as ./compare."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``fpp-eval``: exit status 0, 1 where ``verify`` finds a difference, 2 with the error on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in SUBCOMMANDS:
-        module = import_module(f"fpp_ml_bench.cli.{SUBCOMMANDS[words[0]]}")
-        return run_command(module, f"fpp-eval {words[0]}", words[1:])
+        return run_command(cast(ModuleType, SUBCOMMANDS[words[0]]), f"fpp-eval {words[0]}", words[1:])
     return run_command(sys.modules[__name__], "fpp-eval", words)

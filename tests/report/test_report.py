@@ -16,10 +16,15 @@ from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.report.figures import CLIP_PERCENTILE, bins, nice_step, sample_panels
-from fpp_ml_bench.evaluation.report.html import palette_png
-from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report
-from fpp_ml_bench.evaluation.report.sheet import TILE_PX, write_sheet
+from fpp_ml_bench.evaluation.report.figures import (
+    CLIP_PERCENTILE,
+    TILE_PX,
+    bins,
+    nice_step,
+    palette_png,
+    sample_panels,
+)
+from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report, write_sheet
 from fpp_ml_bench.evaluation.score import evaluate
 
 

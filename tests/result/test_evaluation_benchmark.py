@@ -8,7 +8,7 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result.result_file import read_result, result_json, write_result
+from fpp_ml_bench.evaluation.result import read_result, result_json, write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.storage import Benchmark
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks

@@ -13,7 +13,7 @@ from fpp_ml_bench import machine as hardware
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS
-from fpp_ml_bench.evaluation.result.result_file import read_result, write_result
+from fpp_ml_bench.evaluation.result import read_result, write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -235,7 +235,7 @@ def test_number_too_large_for_a_float_is_refused(dataset, predictions, tmp_path)
 
 
 def test_unwritable_result_is_an_error(dataset, predictions, tmp_path, monkeypatch):
-    from fpp_ml_bench.evaluation.result import result_file as result_io
+    from fpp_ml_bench.evaluation.result import file as result_io
 
     def full(path, content):
         raise OSError(28, "No space left on device")

@@ -9,9 +9,15 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result.json_schemas import json_schema
-from fpp_ml_bench.evaluation.result.reliance_block import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
-from fpp_ml_bench.evaluation.result.result_file import read_result, result_json
+from fpp_ml_bench.evaluation.result import (
+    PART_TITLES,
+    RELIANCE_VERSION,
+    Reliance,
+    RelianceParts,
+    json_schema,
+    read_result,
+    result_json,
+)
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.readme_block import readme_block

@@ -8,7 +8,7 @@ from scipy import ndimage
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED
-from fpp_ml_bench.evaluation.score.scores import score_sample
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 LONG = np.longdouble
 

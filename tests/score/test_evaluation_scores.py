@@ -11,9 +11,9 @@ from scored_dataset import disk_depth
 from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import WITHIN
-from fpp_ml_bench.evaluation.result import mean_over_samples, median_over_samples, pooled
-from fpp_ml_bench.evaluation.score import error_stats
-from fpp_ml_bench.evaluation.score.scores import EMPTY, ErrorStats, combine, score_sample
+from fpp_ml_bench.evaluation.result.model import mean_over_samples, median_over_samples, pooled
+from fpp_ml_bench.evaluation.score import sample_scores
+from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, ErrorStats, combine, score_sample
 
 
 def reference(prediction, target):
@@ -94,7 +94,7 @@ def test_block_borders_and_empty_blocks(monkeypatch):
     prediction = target + np.random.default_rng(0).normal(0, 2, target.shape)
     expected = score_sample(prediction, target).metrics()
     for block in (1, 7, 52, 1000):
-        monkeypatch.setattr(error_stats, "BLOCK", block)
+        monkeypatch.setattr(sample_scores, "BLOCK", block)
         blocked = score_sample(prediction, target).metrics()
         for key, value in expected.items():
             assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
@@ -240,10 +240,12 @@ def test_averages_over_samples_and_pixels_differ_as_documented():
     samples = [score_sample(small + 4 * (small > 0), small), score_sample(large + 1 * (large > 0), large)]
     without_object = score_sample(np.ones((10, 10)), np.zeros((10, 10)))
     rows = [s.metrics() for s in (*samples, without_object)]
+    inside, outside = (combine(*(getattr(s, pixels) for s in samples)) for pixels in ("object", "background"))
+    pool = pooled(inside, combine(outside, without_object.background))
     assert mean_over_samples(rows)["object_mae_mm"] == 2.5
     assert median_over_samples(rows)["object_mae_mm"] == 2.5
-    assert pooled([*samples, without_object])["object_mae_mm"] == pytest.approx((10 * 4 + 90 * 1) / 100, rel=1e-15)
-    assert pooled(samples)["object_rmse_mm"] == pytest.approx(math.sqrt((10 * 16 + 90) / 100), rel=1e-15)
+    assert pool["object_mae_mm"] == pytest.approx((10 * 4 + 90 * 1) / 100, rel=1e-15)
+    assert pool["object_rmse_mm"] == pytest.approx(math.sqrt((10 * 16 + 90) / 100), rel=1e-15)
     assert mean_over_samples(rows)["background_mae_mm"] == pytest.approx(1 / 3, rel=1e-15)
     assert mean_over_samples([without_object.metrics()])["object_mae_mm"] is None
 

@@ -9,7 +9,7 @@ from scored_dataset import disk_depth
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result import mean_over_samples
-from fpp_ml_bench.evaluation.score.scores import score_sample
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.torch_metric import KEYS, DepthScores
 
 SIZE, SAMPLES = (40, 48), 11

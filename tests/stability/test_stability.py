@@ -10,7 +10,7 @@ from fpp_ml_bench.baselines.stability.cases import MODULES, Case, Group, Outcome
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import stability as command
 from fpp_ml_bench.errors import DecodeError, StabilityError
-from fpp_ml_bench.evaluation.score import error_stats
+from fpp_ml_bench.evaluation.score import ErrorStats
 
 QUICK = {
     "phase": ("modulation, real frames", "gamma", "quantisation", "dead frame", "steps close together"),
@@ -99,7 +99,7 @@ def test_a_refusal_that_the_case_names_is_flagged():
 def naive_float32(errors):
     """MAE and RMSE by a running float32 sum."""
     total, squares = np.cumsum(np.abs(errors), dtype=np.float32)[-1], np.cumsum(errors**2, dtype=np.float32)[-1]
-    return error_stats.ErrorStats(errors.size, float(total) / errors.size, float(np.sqrt(squares / errors.size)))
+    return ErrorStats(errors.size, float(total) / errors.size, float(np.sqrt(squares / errors.size)))
 
 
 def break_metrics(monkeypatch):

@@ -18,6 +18,8 @@ from scipy.io import savemat
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.submission import isolated
 
 SIZE = (32, 40)
 SAMPLE = "power_drill_A60"
@@ -136,6 +138,9 @@ FORMS = {
         f, "predictions.parquet", parquet_bytes(table(m, pa.list_(pa.float64())), compression="zstd", row_group_size=1)
     ),
     "arrow file": lambda f, m: write_table(f, "predictions.arrow", arrow_bytes(table(m, NESTED_DOUBLE))),
+    "arrow compressed": lambda f, m: write_table(
+        f, "predictions.arrow", arrow_bytes(table(m, NESTED_DOUBLE), compression="zstd")
+    ),
     "arrow stream": lambda f, m: write_table(
         f, "predictions.arrow", arrow_bytes(table(m, pa.list_(pa.float64(), 1280)), pa.ipc.new_stream)
     ),
@@ -340,30 +345,52 @@ def test_tables_that_would_unpack_to_more_than_a_split_can_need(capsys, dataset,
     write_table(folder, "predictions.parquet", b"PAR1" + b"\0" * 60 + b"PAR1")
     assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
     (folder / "predictions.parquet").unlink()
-    write_table(folder, "predictions.arrow", arrow_bytes(table(maps(dataset)), compression="zstd"))
-    assert "is compressed Arrow; write it with compression='uncompressed'" in refused(capsys, dataset, folder)
     for cut in (100, 700, 5000):
         write_table(folder, "predictions.arrow", arrow_bytes(table(maps(dataset)))[:cut])
         assert "predictions.arrow" in refused(capsys, dataset, folder)
 
 
-def test_page_headers_that_contradict_the_footer_count():
-    """A page that says it unpacks to 8 kB, in a file whose footer says 5 kB."""
-    from fpp_ml_bench.errors import PredictionError
-    from fpp_ml_bench.evaluation.submission.parquet_pages import check_pages
+@pytest.mark.parametrize("megabytes", [8, 400])
+def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, capsys, dataset, tmp_path):
+    """The larger one is stopped while it is unpacked, before it has taken as much memory as it asks for."""
+    zeros = np.zeros(megabytes * 10**6 // 4, np.float32)
+    large = pa.table({"sample": ["a"], "depth": pa.ListArray.from_arrays([0, zeros.size], zeros)})
+    folder = write_table(tmp_path / "p", "predictions.arrow", arrow_bytes(large, compression="zstd"))
+    assert (folder / "predictions.arrow").stat().st_size < 100_000
+    error = refused(capsys, dataset, folder)
+    expected = "unpacks to more than" if megabytes < 100 else "takes more memory than|out of memory|malloc"
+    assert re.search(rf"predictions.arrow .*({expected})", error), error
 
+
+def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
+    """A page that says it unpacks to 8 kB, in a file whose footer says 5 kB."""
     content = parquet_bytes(table({"a": DEPTH}, FLAT), compression="snappy", use_dictionary=False)
-    metadata = pq.read_metadata(io.BytesIO(content))
-    check_pages(metadata, content, 7_000, 1281)
-    chunk = metadata.row_group(0).column(1)
-    place = chunk.data_page_offset
+    place = pq.read_metadata(io.BytesIO(content)).row_group(0).column(1).data_page_offset
     assert content[place : place + 3] == b"\x15\x00\x15"  # field 1 is the page type, field 2 the unpacked size
     assert content[place + 3] >= 0x80 > content[place + 4]  # a number of two bytes; the largest such is 8191
-    wrong = content[: place + 3] + b"\xfe\x7f" + content[place + 5 :]
-    with pytest.raises(PredictionError, match="would unpack to"):
-        check_pages(metadata, wrong, 7_000, 1281)
-    with pytest.raises(PredictionError, match="damaged page header"):
-        check_pages(metadata, content[:place] + b"\x1b" * (len(content) - place), 7_000, 1281)
+    for wrong in (
+        content[: place + 3] + b"\xfe\x7f" + content[place + 5 :],
+        content[:place] + b"\x1b" * (len(content) - place),
+    ):
+        folder = write_table(tmp_path / "p", "predictions.parquet", wrong)
+        assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
+
+
+@pytest.mark.parametrize("answer", ["os.abort()", "time.sleep(60)", "bytearray(10**9)"])
+def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_path, monkeypatch):
+    (tmp_path / "reader_of_test.py").write_text(
+        f"import os, time\ndef read(content, largest):\n    return content or bytes({answer})\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(isolated, "TIMEOUT_S", 5)
+    reader = isolated.ReadingProcess("reader_of_test", 1000)
+    assert reader(b"good") == b"good"
+    with pytest.raises(PredictionError, match=r"it ended the process|within 5 s|more memory than 1000 bytes"):
+        reader(b"")
+    assert reader(b"good") == b"good"  # by the same process, or by a new one
+    process = reader._process
+    del reader
+    assert process.returncode is not None
 
 
 def test_forms_cannot_be_mixed_and_links_are_refused(capsys, dataset, tmp_path):

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scored_dataset import make_dataset, write_description, write_predictions
+import yaml
+from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.evaluation.submission import Submission, read_submission
 
 SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"
@@ -258,6 +260,15 @@ def test_description_that_is_no_description(case, capsys, tmp_path, dataset, pre
     error = refused(capsys, tmp_path, dataset, predictions)
     assert "submission.yaml" in error
     assert re.search(message, error), error
+
+
+def test_description_is_written_as_it_is_read(predictions):
+    """Only the keys that were given, and false never for a mask that was not; so `predict` writes what it knows."""
+    read = read_submission(predictions)
+    (predictions / "submission.yaml").write_text(read.to_yaml(), encoding="utf-8")
+    assert read_submission(predictions) == read
+    assert yaml.safe_load(read.to_yaml()) == DESCRIPTION
+    assert "mask" not in Submission(**{**DESCRIPTION, "uses_ground_truth_mask": False}).to_yaml()
 
 
 def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predictions):

@@ -1,0 +1,175 @@
+"""Result files on disk: written whole, read strictly; what they say of code and machine; JSON Schemas."""
+
+import hashlib
+import json
+import platform
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pydantic
+
+from fpp_ml_bench import __version__, depth
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import report, submission
+from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION, SchemaVersion
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
+from fpp_ml_bench.evaluation.schema import validate
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.machine import describe_hardware
+
+MAX_BYTES = 64 * 1024 * 1024
+
+
+def result_content(result: Result) -> dict[str, Any]:
+    """The file's content as plain values, keys in the model's order, each sample's name first."""
+    content = result.model_dump(mode="json")
+    content["per_sample"] = [{"sample": row.pop("sample"), **row} for row in content["per_sample"]]
+    return content
+
+
+def _json_bytes(content: Any) -> bytes:
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode("utf-8") + b"\n"
+
+
+def result_json(result: Result) -> bytes:
+    """The file's bytes: UTF-8 JSON, no NaN, keys in the model's order."""
+    return _json_bytes(result_content(result))
+
+
+def write_result(result: Result, path: Path) -> None:
+    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
+    write_json(result_content(result), path)
+
+
+def write_json(content: Any, path: Path) -> None:
+    """Write plain ``content`` as JSON to ``path``, as `write_result` does."""
+    try:
+        write_atomically(path, _json_bytes(content))
+    except OSError as error:
+        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+
+
+def read_result(path: Path) -> Result:
+    """The result in ``path``; SubmissionError names the file and what is wrong with it."""
+    return parse_result(read_json(path), path)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file: of bounded size, no key twice, no NaN. SubmissionError names file and problem."""
+    file = printable(str(path), 500)
+    try:
+        if not path.is_file():
+            kind = "a folder" if path.is_dir() else "no such file"
+            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {kind}")
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
+    try:
+        return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{file}: expected UTF-8 text; write it again with fpp-eval --json") from None
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
+        raise SubmissionError(f"{file} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+
+
+def parse_result(content: Any, path: Path) -> Result:
+    """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
+    file = printable(str(path), 500)
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version not in get_args(SchemaVersion):
+        given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
+        raise SubmissionError(
+            f"{file}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}; "
+            "score the predictions again with this version's fpp-eval"
+        )
+    result: Result = validate(Result, content, path, "result of fpp-eval")
+    return result
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"key {printable(key, 60)!r} is given twice")
+        content[key] = value
+    return content
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number a score can have")
+
+
+def json_schema(name: str) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``.
+
+    It lists the keys and what each may hold. Whether averages follow from the samples is checked on reading.
+    """
+    models = {"result": Result, "submission": submission.Submission, "comparison": report.Comparison}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"fpp-ml-bench {name}, schema version {RESULT_SCHEMA_VERSION}",
+        **{key: value for key, value in models[name].model_json_schema().items() if key != "title"},
+    }
+
+
+_EVALUATION = Path(__file__).resolve().parent.parent
+_COMMIT = re.compile(r"[0-9a-f]{40,64}")
+
+
+def environment() -> Environment:
+    """This machine and this code, for a result."""
+    import pyarrow  # loaded with any dataset, but not needed to read and compare results
+
+    modules = {"numpy": np, "pyarrow": pyarrow, "pydantic": pydantic}
+    return Environment(
+        python=platform.python_version(),
+        packages={"fpp_ml_bench": __version__, **{name: module.__version__ for name, module in modules.items()}},
+        git=checkout_commit(_EVALUATION.parent),
+        code_sha256=_scoring_code(),
+        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+    )
+
+
+def checkout_commit(folder: Path) -> str | None:
+    """The commit of the checkout in ``folder``, read from its ``.git``; None where there is none.
+
+    No ``git`` is run: starting it would take as long as scoring several samples, and it need not be installed.
+    """
+
+    def text_of(path: Path) -> str:
+        return path.read_text(encoding="utf-8").strip()
+
+    own_folder = folder / ".git"
+    try:
+        if own_folder.is_file():  # a worktree: the file holds the path of its own git folder
+            own_folder = folder / text_of(own_folder).removeprefix("gitdir:").strip()
+        head = text_of(own_folder / "HEAD")
+        if head.startswith("ref:"):
+            name = head.removeprefix("ref:").strip()
+            common = own_folder / "commondir"
+            git_folders = [own_folder, *([own_folder / text_of(common)] if common.is_file() else [])]
+            commits = [text_of(git / name) for git in git_folders if (git / name).is_file()]
+            for packed in (git / "packed-refs" for git in git_folders if (git / "packed-refs").is_file()):
+                lines = (line.partition(" ") for line in text_of(packed).splitlines())
+                commits += [commit for commit, _, ref in lines if ref == name]
+            head = commits[0] if commits else ""
+    except (OSError, UnicodeDecodeError):
+        return None
+    return head if _COMMIT.fullmatch(head) else None
+
+
+@cache
+def _scoring_code() -> str:
+    """SHA-256 over the source files that compute scores, 64 hex digits."""
+    digest = hashlib.sha256()
+    for path in (_EVALUATION / "protocol.py", *sorted((_EVALUATION / "score").glob("*.py")), Path(depth.__file__)):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()

@@ -1,0 +1,244 @@
+"""``result.json``: the scores of a submission on a split, as a strict model that checks itself.
+
+A result that was edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample
+scores whenever a file is read, and overall is checked against object and background in every sample.
+"""
+
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+
+from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
+from fpp_ml_bench.evaluation.result.parts import (
+    Bootstrap,
+    DatasetInfo,
+    Environment,
+    Headline,
+    Intervals,
+    Metrics,
+    ObjectResult,
+    Reliance,
+    SampleResult,
+    Timing,
+)
+from fpp_ml_bench.evaluation.schema import Count, SparseModel, Text
+from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
+from fpp_ml_bench.evaluation.submission import Submission
+
+AGREES = 1e-9
+"""Relative difference up to which two computations of an average count as the same number."""
+
+Scores = dict[str, float | None]
+
+
+class Result(SparseModel):
+    """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
+
+    SPARSE = ("reliance",)
+
+    schema_version: SchemaVersion
+    protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
+    created: str
+    submission: Submission
+    dataset: DatasetInfo
+    target: Target
+    mode: Mode
+    edge_band_px: Annotated[int, Field(ge=0, le=1000)]
+    edge_jump_mm: Annotated[float, Field(gt=0)]
+    metrics: Metrics
+    intervals: Intervals
+    median: Metrics
+    pooled: Headline
+    samples_without_object: Count
+    samples_without_background: Count
+    per_object: list[ObjectResult] = Field(max_length=100_000)
+    per_sample: list[SampleResult] = Field(max_length=100_000)
+    bootstrap: Bootstrap
+    seeds: dict[Text, Count]
+    environment: Environment
+    reliance: Reliance | None = None
+
+    @property
+    def track(self) -> Track:
+        return self.submission.track
+
+    @property
+    def timing(self) -> Timing | None:
+        """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
+        return self.submission.timing
+
+    @field_validator("created")
+    @classmethod
+    def _is_a_time(cls, value: str) -> str:
+        if len(value) > 40 or datetime.fromisoformat(value).tzinfo is None:
+            raise ValueError("expected an ISO 8601 time with its offset, like 2026-01-31T12:00:00+00:00")
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Result":
+        height, width = self.dataset.size
+        if len(self.per_sample) != self.dataset.samples:
+            raise ValueError(
+                f"per_sample holds {len(self.per_sample)} samples, dataset.samples says {self.dataset.samples}"
+            )
+        if len({row.sample for row in self.per_sample}) != len(self.per_sample):
+            raise ValueError("per_sample names a sample twice")
+        if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
+            raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
+        if self.reliance is not None:
+            _check_reliance(self.reliance, self.submission)
+        for row in self.per_sample:
+            _check_sample(row, height * width)
+        stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
+        for key, computed in derived.items():
+            _check_same(key, stored[key], computed)
+        return self
+
+
+def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
+    """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
+    per_sample = [SampleResult(**row) for row in rows]
+    return Result(
+        schema_version=protocol.RESULT_SCHEMA_VERSION, per_sample=per_sample, **_derived(per_sample), **fields
+    )
+
+
+def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
+    """Every key of `Result` that follows from the per-sample scores."""
+    rows, objects = [row.scores() for row in per_sample], [row.object for row in per_sample]
+    inside = combine(*(row.stats("object") for row in per_sample))
+    outside = combine(*(row.stats("background") for row in per_sample))
+    intervals = intervals_over_objects(rows, objects, protocol.HEADLINE)
+    return {
+        "metrics": mean_over_samples(rows),
+        "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
+        "median": median_over_samples(rows),
+        "pooled": pooled(inside, outside),
+        "samples_without_object": sum(row.object_pixels == 0 for row in per_sample),
+        "samples_without_background": sum(row.background_pixels == 0 for row in per_sample),
+        "per_object": [
+            {
+                "object": name,
+                "samples": len(views := [row for row, owner in zip(rows, objects, strict=True) if owner == name]),
+                "metrics": mean_over_samples(views),
+                "spread": _over_samples(views, _deviation),
+            }
+            for name in dict.fromkeys(objects)
+        ],
+        "bootstrap": {
+            "method": "expanded percentile",
+            "over": "objects",
+            "resamples": protocol.BOOTSTRAP_RESAMPLES,
+            "confidence": protocol.CONFIDENCE,
+        },
+        "seeds": {"bootstrap": protocol.BOOTSTRAP_SEED},
+    }
+
+
+def mean_over_samples(rows: Sequence[Scores]) -> Scores:
+    """Plain mean of each metric over the samples that have it (paper Section 5.3.2); None where no sample has."""
+    return _over_samples(rows, statistics.fmean)
+
+
+def median_over_samples(rows: Sequence[Scores]) -> Scores:
+    """Median of each metric over the samples that have it; None where no sample has."""
+    return _over_samples(rows, statistics.median)
+
+
+def _over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
+    columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
+    return {key: statistic(values) if values else None for key, values in columns.items()}
+
+
+def _deviation(values: list[float]) -> float | None:
+    """Sample standard deviation (n - 1); None for fewer than two values."""
+    if len(values) < 2:
+        return None
+    mean = statistics.fmean(values)
+    largest = max(abs(value - mean) for value in values)
+    if largest == 0:
+        return 0.0
+    # Scaled, so that deviations of 1e-200 or 1e200 mm can be squared.
+    squares = math.fsum(((value - mean) / largest) ** 2 for value in values)
+    return largest * math.sqrt(squares / (len(values) - 1))
+
+
+def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
+    """Headline keys of one object set and one background set, every pixel with the same weight."""
+    sets = {"overall": combine(inside, outside), "object": inside, "background": outside}
+    return {f"{name}_{key}": getattr(stats, key) for name, stats in sets.items() for key in ("mae_mm", "rmse_mm")}
+
+
+def _check_sample(row: SampleResult, pixels: int) -> None:
+    """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
+    if row.object_pixels + row.background_pixels != pixels:
+        raise ValueError(f"{row.sample}: object and background pixels do not add up to the image's {pixels}")
+    for name in ("object", "background"):
+        stats = row.stats(name)
+        if (stats.pixels == 0) != (stats.mae_mm is None) or (stats.pixels == 0) != (stats.rmse_mm is None):
+            raise ValueError(f"{row.sample}: {name} scores must be null exactly when the set is empty")
+        if stats.mae_mm is not None and stats.rmse_mm is not None and stats.rmse_mm < stats.mae_mm * (1 - AGREES):
+            raise ValueError(f"{row.sample}: {name} RMSE is below its MAE, which no error has")
+    overall = combine(row.stats("object"), row.stats("background"))
+    if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
+        raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
+    names = ("mae", "median", "p95", "max", "bias", "shift_free_mae", "rmse")
+    values = [getattr(row, f"object_{name}_mm") for name in names]
+    if any(value is None for value in values):
+        if any(value is not None for value in values):
+            raise ValueError(f"{row.sample}: the object's scores must be null all together, when the set is empty")
+        return
+    mae, median, p95, largest, bias, shift_free, rmse = values
+    loose = 1 + AGREES
+    if not (median <= p95 * loose and p95 <= largest * loose and rmse <= largest * loose):
+        raise ValueError(f"{row.sample}: object median, 95th percentile, RMSE and maximum are out of order")
+    if abs(bias) > mae * loose or shift_free > mae * loose:
+        raise ValueError(f"{row.sample}: object bias or shift-free MAE is above the MAE, which no error has")
+
+
+def _check_reliance(reliance: Reliance, submission: Submission) -> None:
+    """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
+    weights = submission.settings.get("weights_sha256")
+    if weights != reliance.weights_sha256:
+        raise ValueError(
+            f"reliance was measured on weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}; "
+            "measure it again"
+        )
+    if (reliance.units == "normalised") != (submission.units == "normalised"):
+        raise ValueError(
+            f"reliance is that of an answer in {reliance.units}, scored was one in {submission.units}; measure it again"
+        )
+
+
+def _check_same(name: str, stored: Any, computed: Any) -> None:
+    """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
+    if isinstance(computed, Mapping):
+        if not isinstance(stored, Mapping) or set(stored) != set(computed):
+            raise ValueError(f"{name} does not hold the keys {', '.join(map(str, computed))}")
+        for key in computed:
+            _check_same(f"{name}.{key}", stored[key], computed[key])
+    elif isinstance(computed, list):
+        if len(stored) != len(computed):
+            raise ValueError(f"{name} holds {len(stored)} entries, per_sample makes {len(computed)}")
+        for index, (stored_item, computed_item) in enumerate(zip(stored, computed, strict=True)):
+            _check_same(f"{name}.{index}", stored_item, computed_item)
+    elif isinstance(computed, float) or computed is None:
+        # A mean of signed values may cancel to rounding errors, which depend on the machine.
+        if not same(stored, computed, rounding=1e-9 if name.endswith("bias_mm") else 0.0):
+            raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+    elif stored != computed:
+        if name.startswith("samples_without_"):
+            raise ValueError(f"{name} is not the number of such samples, {computed}")
+        raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+
+
+def same(first: float | None, second: float | None, rounding: float = 0.0) -> bool:
+    """Whether two numbers differ by at most `AGREES` relatively, or ``rounding``; None equals None only."""
+    if first is None or second is None:
+        return first is second
+    return math.isclose(first, second, rel_tol=AGREES, abs_tol=rounding)
