@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.loaders.render import BuildSettings, Exposure, Lighting, Noise, Studio, light_surface, solid_mesh
-from fpp_ml_bench.loaders.storage import Row
 from fpp_ml_bench.optics import Rig, paper_rig
 
 RIG = paper_rig(480)
@@ -21,7 +20,7 @@ FIRST = {"horizontal": 0, "vertical": 18}
 
 
 @cache
-def photograph(name: str, view: str, rig: Rig = RIG) -> Row:
+def photograph(name: str, view: str, rig: Rig = RIG):
     """An object of the benchmark, anywhere in the working range."""
     studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied"))
     row = studio.photograph(solid_mesh(name), view)
