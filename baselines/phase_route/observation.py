@@ -112,7 +112,7 @@ class Question:
     """K candidates a pixel on the grid (h, w), nearest order first: ``residual_rad``, ``depth_mm``, ``exists`` and
     ``irradiance`` (1/m^2) are (K, h, w); ``brightness``: measured, in the same 1/m^2; ``trust`` 0 to 1: weight of the
     brightness there (small at rims and on dark slopes); ``inside``: object; ``stride``: image px a grid step;
-    ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree, None for everywhere.
+    ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree.
     """
 
     residual_rad: Image
@@ -124,8 +124,8 @@ class Question:
     inside: Mask
     stride: int
     period_px: float
-    smooth_x: Image | None = None
-    smooth_y: Image | None = None
+    smooth_x: Image | float
+    smooth_y: Image | float
 
 
 @dataclass(frozen=True)

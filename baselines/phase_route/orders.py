@@ -75,7 +75,7 @@ def question_of(
     trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * np.clip(brightness * rig.standoff_m**2, 0.02, 1) ** 2
     exists = np.stack([k < count for k in steps])
     # Jumps between neighbours show where every pixel has a phase of its own.
-    smooth = _smooth_links(residual[0], brightness, stride) if capture.pixelwise else (None, None)
+    smooth = _smooth_links(residual[0], brightness, stride) if capture.pixelwise else (1.0, 1.0)
     return Question(
         residual, depth, exists, light, brightness, trust.astype(np.float32), inside[grid], stride, capture.period_px,
         *smooth,
@@ -155,9 +155,8 @@ def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) 
     cost *= question.stride**2
     cost = np.where(question.inside, np.where(question.exists, cost, LARGE), np.float32(0)).astype(np.float32)
     link_x, link_y = links_between(question.inside)
-    if question.smooth_x is not None and question.smooth_y is not None:
-        link_x, link_y = link_x * question.smooth_x, link_y * question.smooth_y
-    choice, margin = least_energy(cost, question.residual_rad, link_x, link_y, settings.jump_rad)
+    links = link_x * question.smooth_x, link_y * question.smooth_y
+    choice, margin = least_energy(cost, question.residual_rad, *links, settings.jump_rad)
     return choice, np.minimum(margin / np.float32(settings.jump_rad), _evidence(proof, choice, question))
 
 

@@ -5,12 +5,11 @@ What depends on the rig alone is computed once.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import confidence, orders
+from fpp_ml_bench.baselines.phase_route import confidence, orders, several_frames
 from fpp_ml_bench.baselines.phase_route.calibration_layer import (
     CalibrationLayer,
     Candidates,
@@ -28,14 +27,6 @@ from fpp_ml_bench.baselines.phase_route.observation import (
     Reason,
     Settings,
     Stopwatch,
-)
-from fpp_ml_bench.baselines.phase_route.several_frames import (
-    differs,
-    first_mask,
-    lit_object,
-    pair_fit,
-    pixel_fit,
-    steps_of,
 )
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
@@ -67,7 +58,7 @@ class PhaseRoute:
         self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
         self._windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
-        self.steps = steps_of(rig.sequence.steps, settings.frames)
+        self.steps = several_frames.steps_of(rig.sequence.steps, settings.frames)
         self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
         if settings.frames == 2:
             self._windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
@@ -97,7 +88,7 @@ class PhaseRoute:
         given = None if mask is None else mask[crop]
         mean_grey = None
         if capture.pixelwise:
-            inside, fit, mean_grey = self._pixel_fits(capture, given)
+            inside, fit, mean_grey = several_frames.pixel_fits(capture, self._scene, given, self._windows[1])
         else:
             inside, fit = self._local_fits(capture, region[crop], given)
         phase = wrapped(fit.phase_rad).astype(np.float32)
@@ -204,7 +195,7 @@ class PhaseRoute:
             return mask, fit
         dark = unlit(np.maximum.reduce(greys), background, self.period_px)
         if len(greys) > 1:
-            region = first_mask(differs(capture, self._scene), self.period_px)
+            region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
         inside = region & ~dark
         watch.done("mask")
         fit = self._fit_phase(capture, inside)
@@ -222,13 +213,4 @@ class PhaseRoute:
         """The local fits to one or two frames."""
         greys, ambient_grey = capture.greys, capture.background.ambient_grey
         first = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
-        return pair_fit(greys, capture.shifts_rad, inside, first, ambient_grey, self._windows[1:])
-
-    def _pixel_fits(self, capture: Capture, mask: Mask | None) -> tuple[Mask, FringeFit, Image]:
-        """Object mask (or ``mask``), phase and modulation of every pixel, and its mean grey level, from three frames or
-        more. The fit's weight is the share of a window on the object, which the use of its slopes needs."""
-        fit, mean_grey = pixel_fit(capture)
-        capture.watch.done("phase")
-        inside = lit_object(capture, self._scene, fit.brightness) if mask is None else mask
-        capture.watch.done("mask")
-        return inside, replace(fit, weight=self._windows[1].moment(inside.astype(np.float32))), mean_grey
+        return several_frames.pair_fit(greys, capture.shifts_rad, inside, first, ambient_grey, self._windows[1:])

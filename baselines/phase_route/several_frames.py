@@ -64,12 +64,18 @@ def pair_fit(
     return fit
 
 
-def pixel_fit(capture: Capture) -> tuple[FringeFit, Image]:
-    """Phase and modulation by N-step least squares, and mean grey level, of every pixel of the crop."""
+def pixel_fits(capture: Capture, scene: EmptyScene, mask: Mask | None, window: Window) -> tuple[Mask, FringeFit, Image]:
+    """Object mask (or ``mask``), phase and modulation of every pixel by N-step least squares, and its mean grey level.
+
+    The fit's weight is the share of ``window`` on the object, which the use of its slopes needs.
+    """
     fitted = wrapped_phase(capture.greys, capture.shifts_rad, np.float32)
     phase, modulation, mean = (np.asarray(values, np.float32) for values in fitted)
+    capture.watch.done("phase")
+    inside = lit_object(capture, scene, modulation) if mask is None else mask
+    capture.watch.done("mask")
     flat = np.zeros_like(phase)
-    return FringeFit(phase, modulation, flat, flat, flat), mean
+    return inside, FringeFit(phase, modulation, flat, flat, window.moment(inside.astype(np.float32))), mean
 
 
 def differs(capture: Capture, scene: EmptyScene) -> Mask:
