@@ -50,6 +50,8 @@ CHANNELS = (
     "own misfit around", *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
 )  # fmt: skip
 FIRST_SIDE = CHANNELS.index("first guess") + 1
+FIRST_MISFIT = FIRST_SIDE + len(SIDES)
+"""First of the misfit channels: of no correction, and of each proposed correction."""
 SHADING = (6, 11, 12, 13)
 """Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
 LEAST_WEIGHT = 0.02

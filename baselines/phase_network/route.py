@@ -25,6 +25,7 @@ from fpp_ml_bench.baselines.phase_route import (
     grid_of,
     least_energy,
     links_between,
+    of_choice,
     spread_over_pixels,
     wrapped,
 )
@@ -181,7 +182,7 @@ class NetworkRoute:
         candidate = answers.logits.argmax(axis=0)
         if graph > 0:
             candidate = self._labelled(probabilities, scene, inside, observation, graph)
-        probability = np.clip(_of_candidate(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
+        probability = np.clip(of_choice(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
         margin = np.float32(MARGIN_SCALE) * np.log(probability / (1 - probability))
         return scene.order + np.array(STEPS, np.int32)[candidate], np.maximum(margin, 0).astype(np.float32)
 
@@ -207,9 +208,4 @@ class NetworkRoute:
         question = replace(observation.question, residual_rad=phases, inside=grid_inside)
         order, _ = spread_over_pixels(question, choice, margin, residual_at_zero_rad)
         candidate = np.clip(order - scene.order, -1, 1) + 1
-        return np.where(_of_candidate(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))
-
-
-def _of_candidate(values: NDArray, candidate: NDArray) -> NDArray:
-    """``values`` (3, h, w) of the candidate of each pixel (h, w)."""
-    return np.take_along_axis(values, candidate[None].astype(np.intp), axis=0)[0]
+        return np.where(of_choice(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.inputs import (
     CHANNELS,
+    FIRST_MISFIT,
     FIRST_SIDE,
     SIDES,
     Geometry,
@@ -24,7 +25,7 @@ from fpp_ml_bench.baselines.phase_network.inputs import (
     repeated,
 )
 from fpp_ml_bench.baselines.phase_network.samples import Sample
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Direction
 
@@ -32,10 +33,7 @@ IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
 _MIRRORED = CHANNELS.index("slope across")
 _PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
-_FIRST_MISFIT = FIRST_SIDE + len(SIDES)
-_SWAPPED = (
-    [FIRST_SIDE + place for place in _PARTNERS] + [_FIRST_MISFIT] + [_FIRST_MISFIT + 1 + place for place in _PARTNERS]
-)
+_SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, m
     steps = np.rint(missing / TAU).astype(np.int64)
     possible = target & (np.abs(steps) <= 1)
     place = np.clip(steps, -1, 1) + 1
-    possible &= np.take_along_axis(exists, place[None], axis=0)[0]
+    possible &= of_choice(exists, place)
     correction = (missing - TAU * steps).astype(np.float32)
     _, height, width = x.shape
     pad = ((0, size - height), (0, size - width))

@@ -19,5 +19,6 @@ from .orders import LEAST_BRIGHTNESS as LEAST_BRIGHTNESS
 from .orders import grid_of as grid_of
 from .orders import irradiance as irradiance
 from .orders import links_between as links_between
+from .orders import of_choice as of_choice
 from .orders import spread_over_pixels as spread_over_pixels
 from .route import PhaseRoute as PhaseRoute

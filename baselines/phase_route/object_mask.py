@@ -203,7 +203,7 @@ def unlit(grey: Image, background: Background, period_px: float) -> Mask:
 
 
 def refined(
-    region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: Image, reach_px: float
+    region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: NDArray, reach_px: float
 ) -> Mask:
     """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette.
 

@@ -55,6 +55,11 @@ def links_between(inside: Mask) -> tuple[Image, Image]:
     return link_x, link_y
 
 
+def of_choice(values: NDArray, choice: NDArray) -> NDArray:
+    """``values`` (K, h, w) of the candidate chosen at each pixel, (h, w)."""
+    return np.take_along_axis(values, choice[None].astype(np.intp), axis=0)[0]
+
+
 def question_of(
     capture: Capture, phase_rad: Image, fit: FringeFit, slopes: tuple[Image, Image], candidates: Candidates,
     inside: Mask,
@@ -164,16 +169,16 @@ def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Im
     """By how much the cost of the second-best order exceeds that of the choice, averaged over object pixels nearby."""
     if len(proof) == 1:
         return np.full(choice.shape, 2.0, np.float32)
-    own = np.take_along_axis(proof, choice[None].astype(np.intp), axis=0)[0]
+    own = of_choice(proof, choice)
     rivals = proof.copy()
     np.put_along_axis(rivals, choice[None].astype(np.intp), np.inf, axis=0)
     gap = ((rivals.min(axis=0) - own) * question.inside).astype(np.float32)
     side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
-    mean, share = (
-        cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
-        for values in (gap, question.inside.astype(np.float32))
-    )
-    return mean / np.maximum(share, 1e-3)
+
+    def mean(values: Image) -> NDArray:
+        return cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
+
+    return mean(gap) / np.maximum(mean(question.inside.astype(np.float32)), 1e-3)
 
 
 def spread_over_pixels(
@@ -184,7 +189,7 @@ def spread_over_pixels(
 
     ``residual_at_zero_rad`` (H, W): residual phase at order 0.
     """
-    chosen_rad = np.take_along_axis(question.residual_rad, choice[None].astype(np.intp), axis=0)[0]
+    chosen_rad = of_choice(question.residual_rad, choice)
     if question.inside.any() and not question.inside.all():
         y, x = distance_transform_edt(~question.inside, return_distances=False, return_indices=True)
         chosen_rad, margin = chosen_rad[y, x], margin[y, x]
