@@ -119,7 +119,7 @@ def pictures(dataset: DatasetFolder, method: PhaseNetMethod, folder: Path) -> No
         limits = np.percentile(target[object_mask(target)], [1, 99])
         correction = np.zeros(image.shape)
         if observation.answers is not None:
-            correction[observation.seen.crop] = observation.answers.correction_rad
+            correction[observation.observation.crop] = observation.answers.correction_rad
         error = {"cmap": "RdBu", "vmin": -20, "vmax": 20}
         panels = (
             ("fringe, grey levels", image[box], {"cmap": "gray"}),

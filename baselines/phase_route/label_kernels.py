@@ -1,6 +1,8 @@
 """The message passing of `labels`, compiled; imported only where `fpp_ml_bench.compiled` compiles.
 
-Messages are stored at the node that receives them: 0 from the left, 1 from above, 2 from the right, 3 from below.
+A ``field`` is what `labels.least_energy` makes of its arguments: costs and phases (H, W, K), the links along x and y,
+and the limit of a jump. Messages are stored at the node that receives them: 0 from the left, 1 from above, 2 from the
+right, 3 from below.
 """
 
 import numpy as np
@@ -26,8 +28,9 @@ def _send(costs, returned, phases, neighbour_phases, weight, limit, out):  # typ
 
 
 @njit
-def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ignore[no-untyped-def]
-    """``rounds`` forward and backward passes over (H, W, K) costs; ``messages`` (H, W, 4, K) are updated in place."""
+def iterate(field, rounds, messages):  # type: ignore[no-untyped-def]
+    """``rounds`` forward and backward passes over a field; ``messages`` (H, W, 4, K) are updated in place."""
+    unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
     total = np.empty(count, np.float32)
     none = np.float32(0.0)
@@ -62,8 +65,9 @@ def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ign
 
 
 @njit
-def decide(unary, phase, link_x, link_y, limit, messages, choice, margin):  # type: ignore[no-untyped-def]
+def decide(field, messages, choice, margin):  # type: ignore[no-untyped-def]
     """Labels in reading order, each given the labels before it; ``margin``: by how much the second best costs more."""
+    unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
     for i in range(height):
         for j in range(width):

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image
 from fpp_ml_bench.compiled import numba_enabled
 
+Field = tuple[Image, Image, Image, Image, np.float32]
+
 ROUNDS = 10
 LARGE = np.float32(1e4)
 """Cost of a candidate that does not exist."""
@@ -37,16 +39,14 @@ def least_energy(
     else:
         decide, iterate = _decide, _iterate
     count, height, width = unary.shape
-    # One node's candidates side by side, as both forms read them.
-    costs, phases = (
-        np.ascontiguousarray(maps.transpose(1, 2, 0), dtype=np.float32) for maps in (unary, phase_rad)
-    )  # fmt: skip
-    links = np.ascontiguousarray(link_x, dtype=np.float32), np.ascontiguousarray(link_y, dtype=np.float32)
-    limit = np.float32(limit_rad)
+    # One node's candidates side by side.
+    costs, phases = (np.ascontiguousarray(maps.transpose(1, 2, 0), np.float32) for maps in (unary, phase_rad))
+    links = np.ascontiguousarray(link_x, np.float32), np.ascontiguousarray(link_y, np.float32)
+    field = (costs, phases, *links, np.float32(limit_rad))
     messages = np.zeros((height, width, 4, count), np.float32)
-    iterate(costs, phases, *links, limit, rounds, messages)
+    iterate(field, rounds, messages)
     choice, margin = np.zeros((height, width), np.int32), np.zeros((height, width), np.float32)
-    decide(costs, phases, *links, limit, messages, choice, margin)
+    decide(field, messages, choice, margin)
     return choice, np.minimum(margin, LARGE)
 
 
@@ -79,8 +79,9 @@ def _send(
     return out - out.min(axis=1, keepdims=True)
 
 
-def _iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ignore[no-untyped-def]
+def _iterate(field: Field, rounds: int, messages: Image) -> None:
     """As `label_kernels.iterate`: ``messages`` (H, W, 4, K) are updated in place."""
+    unary, phase, link_x, link_y, limit = field
     height, width, _ = unary.shape
     towards = _links(link_x, link_y, height, width)
     cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
@@ -107,8 +108,9 @@ def _iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ig
     messages[:] = _straight(passed, height, width)
 
 
-def _decide(unary, phase, link_x, link_y, limit, messages, choice, margin):  # type: ignore[no-untyped-def]
+def _decide(field: Field, messages: Image, choice: NDArray[np.int32], margin: Image) -> None:
     """As `label_kernels.decide`: ``choice`` and ``margin`` (H, W) are written."""
+    unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
     towards = _links(link_x, link_y, height, width)
     cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
