@@ -51,7 +51,7 @@ def compare(measurement: Measurement, route: NetworkRoute, target: np.ndarray) -
     measured = inside & (measurement.depth_mm > 0)
     layer = route.geometry.layer.at(measured)
     true_phase = layer.absolute_phase(target[measured])
-    phase_error = measurement.wrapped_phase[measured] + TAU * measurement.order[measured] - true_phase
+    phase_error = measurement.wrapped_phase_rad[measured] + TAU * measurement.order[measured] - true_phase
     wrong = np.abs(phase_error) > np.pi
     error = np.abs(measurement.depth_mm - target)
     return {
@@ -119,11 +119,11 @@ def pictures(dataset: DatasetFolder, method: PhaseNetMethod, folder: Path) -> No
         limits = np.percentile(target[object_mask(target)], [1, 99])
         correction = np.zeros(image.shape)
         if observation.answers is not None:
-            correction[observation.seen.crop] = observation.answers.correction_rad
+            correction[observation.observation.crop] = observation.answers.correction_rad
         error = {"cmap": "RdBu", "vmin": -20, "vmax": 20}
         panels = (
             ("fringe, grey levels", image[box], {"cmap": "gray"}),
-            ("wrapped phase, rad", measurement.wrapped_phase[box], {"cmap": "twilight"}),
+            ("wrapped phase, rad", measurement.wrapped_phase_rad[box], {"cmap": "twilight"}),
             ("order", measurement.order[box] * blank, {"cmap": "viridis"}),
             ("depth, mm", measurement.depth_mm[box] * blank, {"vmin": limits[0], "vmax": limits[1]}),
             ("error, mm", np.where(shown, measurement.depth_mm - target, np.nan)[box], error),

@@ -34,7 +34,7 @@ def compare(measurement: Measurement, route, target: np.ndarray, exact: np.ndarr
     inside = object_mask(target)
     measured = inside & (measurement.depth_mm > 0)
     layer = route.layer.at(measured)
-    wrapped, order = measurement.wrapped_phase[measured].astype(np.float64), measurement.order[measured]
+    wrapped, order = measurement.wrapped_phase_rad[measured].astype(np.float64), measurement.order[measured]
     residual = layer.residual_phase(wrapped, order)
     true_residual = layer.absolute_phase(exact[measured]) - layer.infinity_rad - TAU * layer.infinity_order
     phase_error = residual - true_residual
@@ -117,7 +117,7 @@ def pictures(dataset: DatasetFolder, options: dict, folder: Path, sparse: list[t
         limits = np.percentile(target[object_mask(target)], [1, 99])
         panels = (
             ("fringe, grey levels", image[box], {"cmap": "gray"}),
-            ("wrapped phase, rad", measurement.wrapped_phase[box], {"cmap": "twilight"}),
+            ("wrapped phase, rad", measurement.wrapped_phase_rad[box], {"cmap": "twilight"}),
             ("order", measurement.order[box] * blank, {"cmap": "viridis"}),
             ("depth, mm", measurement.depth_mm[box] * blank, {"vmin": limits[0], "vmax": limits[1]}),
             (

@@ -1,15 +1,34 @@
-"""What publishing would change: a folder of staged files compared with the files of a repository on the Hub.
+"""A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it.
 
-This module uses no network. Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash
-of a small file), so a file that the repository already has is never sent again.
+Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small file), so that a
+dry run can tell what would change; a file that the repository already has is never sent again.
+
+Every error of the Hub's client (no token, no network, 401, 403, 404, 5xx) becomes a `PublishError` that says what to
+do. The client reads ``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
 """
 
 import json
-from collections.abc import Mapping
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from hashlib import sha1, sha256
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, Literal
+
+import yaml
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
+from huggingface_hub.errors import (
+    HfHubHTTPError,
+    HTTPError,
+    LocalTokenNotFoundError,
+    OfflineModeIsEnabled,
+    RepositoryNotFoundError,
+)
+from huggingface_hub.hf_api import RepoFile
+from huggingface_hub.utils import disable_progress_bars
+from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import PublishError
@@ -22,7 +41,19 @@ MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
 _HUB_OWN = frozenset({".gitattributes", "README.md"})
 """Files of a repository that was just made on the Hub's web page."""
-_CHUNK = 1 << 24
+_BATCH_BYTES, _BATCH_FILES = 1 << 26, 64
+"""Files are sent before the commit in batches of about this size, for the progress bar."""
+_REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
+_URL_PREFIX: dict[Kind, str] = {"dataset": "datasets/", "space": "spaces/", "model": ""}
+_ANSWERS = {
+    401: "the Hub does not accept the token (401); run 'hf auth login' again or set another HF_TOKEN",
+    403: "the token may not do that (403); it needs write access to this owner and repository",
+    404: "no such repository, or this token may not see it (404); check the name",
+    409: "somebody else is changing it (409); run the same command again",
+    412: "somebody else committed meanwhile (412); run the same command again",
+    413: "too large for the Hub (413)",
+    429: "too many requests (429); wait some minutes, then run the same command again",
+}
 
 
 @dataclass(frozen=True)
@@ -30,7 +61,7 @@ class Publication:
     """Files staged for a repository; every file below ``folder`` is part of it, hidden files included.
 
     ``owned`` are folders (ending in ``/``) that only this publication fills: any other file in them is deleted.
-    ``message`` is the commit message. With ``must_exist`` no repository is made.
+    ``message`` is the commit message.
     """
 
     kind: Kind
@@ -38,17 +69,6 @@ class Publication:
     folder: Path
     message: str
     owned: tuple[str, ...] = ()
-    must_exist: bool = False
-
-
-@dataclass(frozen=True)
-class RemoteFile:
-    """A file in a repository: its bytes, git's hash of it, and its SHA-256 where it is stored as a large file."""
-
-    path: str
-    bytes: int
-    git_sha1: str
-    sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +77,7 @@ class Remote:
 
     commit: str | None
     private: bool = False
-    files: Mapping[str, RemoteFile] = field(default_factory=dict)
+    files: Mapping[str, RepoFile] = field(default_factory=dict)
 
     @property
     def exists(self) -> bool:
@@ -71,6 +91,12 @@ class Change:
     status: Status
     path: str
     bytes: int
+
+
+def yaml_text(content: Any, allow_unicode: bool = False) -> str:
+    """YAML as the Hub's files have it: in the order given, lines of at most 110 characters."""
+    text: str = yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode)
+    return text
 
 
 def mark_bytes(publishes: str, **about: Any) -> bytes:
@@ -95,32 +121,26 @@ def changes(publication: Publication, remote: Remote) -> list[Change]:
 
     Reads every staged file once. Other files of the repository outside ``owned`` stay as they are.
     """
-    files = dict(remote.files)
-    planned = []
     staged = staged_files(publication.folder)
-    for name, path in staged.items():
-        remote_file = files.get(name)
-        size = path.stat().st_size
-        if remote_file is None:
-            planned.append(Change("new", name, size))
-        else:
-            planned.append(Change("unchanged" if _same(path, size, remote_file) else "changed", name, size))
-    planned += [
-        Change("deleted", name, file.bytes)
-        for name, file in files.items()
-        if name not in staged and name.startswith(publication.owned or ("\0",))
+    planned = [
+        Change(_status(path, remote.files.get(name)), name, path.stat().st_size) for name, path in staged.items()
     ]
+    planned += [
+        Change("deleted", name, stored.size)
+        for name, stored in remote.files.items() if name not in staged and name.startswith(publication.owned)
+    ]  # fmt: skip
     return sorted(planned, key=lambda change: change.path)
 
 
-def _same(path: Path, size: int, remote_file: RemoteFile) -> bool:
-    if remote_file.bytes != size:
-        return False
-    digest = sha256() if remote_file.sha256 is not None else sha1(f"blob {size}\0".encode(), usedforsecurity=False)
+def _status(path: Path, stored: RepoFile | None) -> Status:
+    if stored is None:
+        return "new"
+    if stored.size != path.stat().st_size:
+        return "changed"
+    if stored.lfs is None:
+        return "unchanged" if git_hash(path.read_bytes()) == stored.blob_id else "changed"
     with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest() == (remote_file.sha256 if remote_file.sha256 is not None else remote_file.git_sha1)
+        return "unchanged" if file_digest(file, "sha256").hexdigest() == stored.lfs.sha256 else "changed"
 
 
 def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> None:
@@ -135,3 +155,142 @@ def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> 
             f"({named}, ...); give the name of a new one, or --adopt to publish into it (nothing is deleted outside "
             f"{', '.join(publication.owned) or 'its own files'})"
         )
+
+
+def check_repo_name(repo: str) -> str:
+    """``repo`` itself when it is an OWNER/NAME that the Hub can have, else `PublishError`."""
+    if not _REPO.fullmatch(repo) or repo.endswith(".git"):
+        raise PublishError(
+            f"expected a repository as OWNER/NAME (letters, digits, '-', '_', '.'), got {printable(repo, 80)!r}"
+        )
+    return repo
+
+
+class Hub:
+    """A connection to the Hub. Its constructor uses no network."""
+
+    def __init__(self) -> None:
+        disable_progress_bars()  # ours shows all files together
+        self._api = HfApi(library_name="fpp-ml-bench", library_version=__version__)
+        self.endpoint: str = self._api.endpoint
+        if not self.endpoint.startswith(("https://", "http://")):
+            raise PublishError(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
+
+    def url(self, kind: Kind, repo: str) -> str:
+        return f"{self.endpoint}/{_URL_PREFIX[kind]}{repo}"
+
+    def check_token(self) -> set[str]:
+        """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
+        if not get_token():
+            raise PublishError(
+                "no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a token that may write; "
+                "--dry-run needs none for what is public"
+            )
+        with self._explained("asking who the token belongs to"):
+            me = self._api.whoami()
+        return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
+
+    def check_may_create(self, repo: str, names: set[str]) -> None:
+        """`PublishError` where the token may not make repositories for the owner of ``repo``."""
+        if repo.split("/")[0].lower() not in {name.lower() for name in names}:
+            owners = ", ".join(printable(name, 60) for name in sorted(names))
+            raise PublishError(f"{repo}: does not exist, and this token may make repositories of {owners} only")
+
+    def state(self, kind: Kind, repo: str) -> Remote:
+        """A repository's commit, visibility and files; a `Remote` without a commit where no repository is visible."""
+        with self._explained(f"reading {kind} {repo}"):
+            try:
+                info = self._api.repo_info(repo, repo_type=kind)
+            except RepositoryNotFoundError as error:
+                # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
+                if error.response.status_code == 401 and get_token():
+                    raise
+                return Remote(None)
+            tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
+            files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+        return Remote(info.sha or "", bool(info.private), files)
+
+    def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
+        """Content of `MARK` in a repository; `PublishError` where the file is missing or damaged."""
+        if not remote.exists:
+            raise PublishError(
+                f"{repo}: no such {kind} on {self.endpoint}, or this token may not see it; check the name, or publish "
+                f"it first: fpp-bench publish {kind} ... --repo {repo}"
+            )
+        if MARK not in remote.files or remote.files[MARK].size > 1 << 20:
+            raise PublishError(f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)")
+        with tempfile.TemporaryDirectory() as cache, self._explained(f"reading {MARK} of {kind} {repo}"):
+            path = self._api.hf_hub_download(repo, MARK, repo_type=kind, revision=remote.commit, cache_dir=cache)
+            content = Path(path).read_bytes()
+        try:
+            about = json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise PublishError(f"{repo}: its {MARK} is damaged; publish the {kind} again") from error
+        return about if isinstance(about, dict) else {}
+
+    def send(
+        self, publication: Publication, changes: list[Change], remote: Remote, private: bool,
+        sent: Callable[[int], None] = lambda count: None,
+    ) -> str:  # fmt: skip
+        """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
+
+        All files become visible together, with the commit. An interrupted run, started again, sends only what is
+        missing. ``sent`` is called with the bytes of each batch. Raises `PublishError`, also after a commit by someone
+        else meanwhile.
+        """
+        repo, kind = publication.repo, publication.kind
+        if not remote.exists:
+            with self._explained(f"making {kind} {repo}"):
+                sdk = "static" if kind == "space" else None
+                self._api.create_repo(repo, repo_type=kind, private=private or None, space_sdk=sdk)
+        with self._explained(f"sending to {kind} {repo}"):
+            additions = [
+                CommitOperationAdd(change.path, publication.folder / change.path)
+                for change in changes if change.status in ("new", "changed")
+            ]  # fmt: skip
+            for batch in _batches(additions):
+                self._api.preupload_lfs_files(repo, batch, repo_type=kind, free_memory=False)
+                sent(sum(addition.upload_info.size for addition in batch))
+            deletions = [CommitOperationDelete(c.path, is_folder=False) for c in changes if c.status == "deleted"]
+            done = self._api.create_commit(
+                repo, [*additions, *deletions], commit_message=publication.message, repo_type=kind,
+                parent_commit=remote.commit or None,
+            )  # fmt: skip
+        return str(done.commit_url)
+
+    @contextmanager
+    def _explained(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except OfflineModeIsEnabled as error:
+            raise PublishError(f"{doing}: HF_HUB_OFFLINE is set, so nothing may be sent; unset it") from error
+        except LocalTokenNotFoundError as error:
+            raise PublishError(f"{doing}: no token; run 'hf auth login' or set HF_TOKEN") from error
+        except HfHubHTTPError as error:
+            status, said = error.response.status_code, " ".join((error.server_message or "").split())
+            answer = _ANSWERS.get(status, f"the Hub refused ({status})")
+            if status >= 500:
+                answer = (
+                    f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
+                )
+            raise PublishError(f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}") from error
+        except HTTPError as error:
+            raise PublishError(
+                f"{doing}: {self.endpoint} can't be reached ({printable(str(error)) or type(error).__name__}); check "
+                "the network and HF_ENDPOINT, then run the same command again: it sends only what is missing"
+            ) from error
+        except (ValueError, RuntimeError, OSError) as error:
+            # The client's refusals of an answer or a card (ValueError), and its transfer library (RuntimeError).
+            lines = " ".join(printable(line) for line in str(error).splitlines())
+            raise PublishError(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
+
+
+def _batches(additions: list[CommitOperationAdd]) -> Iterator[list[CommitOperationAdd]]:
+    batch: list[CommitOperationAdd] = []
+    for addition in additions:
+        batch.append(addition)
+        if len(batch) == _BATCH_FILES or sum(queued.upload_info.size for queued in batch) >= _BATCH_BYTES:
+            yield batch
+            batch = []
+    if batch:
+        yield batch

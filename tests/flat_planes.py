@@ -1,10 +1,30 @@
-"""A fringe on a plane that fills the frame, from the benchmark's own light and sensor: what its builder can't place."""
+"""Scenes of the phase routes' tests: an object, and a fringe on a plane that fills the frame, from the benchmark's own
+light and sensor: what its builder can't place."""
+
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.render import Exposure, Lighting, Noise, light_surface
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.loaders.render import BuildSettings, Exposure, Lighting, Noise, Studio, light_surface, solid_mesh
+from fpp_ml_bench.optics import Rig, paper_rig
+
+RIG = paper_rig(480)
+OTHER_RIG = replace(
+    RIG, translation_m=(0.22, -0.16, 0.0), pitch_horizontal_px=24.0, pitch_vertical_px=27.0,
+    working_range_mm=(1400.0, 2200.0), background_m=2.9,
+)  # fmt: skip
+FIRST = {"horizontal": 0, "vertical": 18}
+"""The first fringe of each direction."""
+
+
+@cache
+def photograph(name: str, view: str, rig: Rig = RIG):
+    """An object of the benchmark, anywhere in the working range."""
+    studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied"))
+    row = studio.photograph(solid_mesh(name), view)
+    return replace(row, frames={index: frame.copy() for index, frame in row.frames.items()})
 
 
 def plane_depth_m(rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:

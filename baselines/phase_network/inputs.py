@@ -9,6 +9,7 @@ Maps are rotated so that the fringe's phase grows downwards and a nearer surface
 serves both fringe directions.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,13 +21,16 @@ from fpp_ml_bench.baselines.phase_route import (
     TAU,
     CalibrationLayer,
     Crop,
+    Image,
+    Mask,
     Observation,
+    PhaseRoute,
+    Settings,
+    grid_of,
     irradiance,
     wrapped,
 )
 from fpp_ml_bench.optics import Rig
-
-Image = NDArray[np.float32]
 
 STEPS = (-1, 0, 1)
 """The candidates: a period further than the base order, the base order, a period nearer."""
@@ -46,6 +50,8 @@ CHANNELS = (
     "own misfit around", *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
 )  # fmt: skip
 FIRST_SIDE = CHANNELS.index("first guess") + 1
+FIRST_MISFIT = FIRST_SIDE + len(SIDES)
+"""First of the misfit channels: of no correction, and of each proposed correction."""
 SHADING = (6, 11, 12, 13)
 """Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
 LEAST_WEIGHT = 0.02
@@ -55,6 +61,7 @@ RELIEF_RAD = 1.5
 SINE_FLOOR = 0.1
 STEP_PX = 2
 """Brightness of the candidates is computed on every second pixel."""
+_REAL_MAPS = ("light", "plane_light", "phase_rad", "bright", "weight")
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,34 @@ class Rotation:
         unturned = image[..., ::-1, :] if self.reversed else image
         return unturned.swapaxes(-1, -2) if self.transposed else unturned
 
+    def down_and_right(self, slopes: tuple[Image, Image]) -> tuple[Image, Image]:
+        """Slopes down and to the right in rotated maps, from those along an image's x and y; not rotated themselves."""
+        right, down = slopes[::-1] if self.transposed else slopes
+        return (-self.sign if self.reversed else self.sign) * down, self.sign * right
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Route and rotation for all images of a rig and fringe direction."""
+
+    rig: Rig
+    route: PhaseRoute
+    rotation: Rotation
+
+    @classmethod
+    def of(cls, rig: Rig, settings: Settings) -> "Geometry":
+        route = PhaseRoute(rig, settings)
+        return cls(rig, route, Rotation.of(route.layer, settings.direction))
+
+    @property
+    def layer(self) -> CalibrationLayer:
+        return self.route.layer
+
+    def in_range(self, depth_mm: NDArray) -> Mask:
+        """Whether a depth lies in the working range, or its slack."""
+        (near, far), slack = self.rig.working_range_mm, self.route.settings.slack_mm
+        return (depth_mm > near - slack) & (depth_mm < far + slack)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -101,7 +136,7 @@ class Scene:
     light: Image
     plane_light: Image
     noise: float
-    inside: NDArray[np.bool_]
+    inside: Mask
     phase_rad: Image
     order: NDArray[np.int32]
     bright: Image
@@ -110,33 +145,27 @@ class Scene:
     middle_rad: float
 
     @classmethod
-    def of(cls, observation: Observation, order: NDArray[np.int32], rig: Rig) -> "Scene":
+    def of(cls, observation: Observation, order: NDArray[np.int32]) -> "Scene":
         """From an observation of the measured route, with that route's ``order`` (h, w) as the base order."""
-        background = observation.background
-        unit = np.float32(rig.standoff_m**2 / (background.strength / 2))
-        light = (observation.grey - np.float32(background.ambient_grey)) * unit
-        misfit = background.residual[observation.crop] * unit
+        background, fit = observation.background, observation.fit
+        unit = np.float32(observation.rig.standoff_m**2 / (background.strength / 2))
+        light = (observation.greys[0] - np.float32(background.ambient_grey)) * unit
         residual = observation.layer.residual_phase(observation.phase_rad, order)
         on_object = observation.inside & np.isfinite(residual)
-        middle = float(np.median(residual[on_object])) if on_object.any() else 0.0
         return cls(
-            crop=observation.crop, light=light, plane_light=(light - misfit).astype(np.float32),
+            crop=observation.crop, light=light, plane_light=(light - background.residual * unit).astype(np.float32),
             noise=float(background.noise_grey * unit), inside=observation.inside, phase_rad=observation.phase_rad,
-            order=order, bright=(observation.fit.brightness * unit).astype(np.float32),
-            weight=observation.fit.weight, slopes=observation.slopes,
-            middle_rad=middle,
+            order=order, bright=(fit.brightness * unit).astype(np.float32), weight=fit.weight,
+            slopes=observation.slopes, middle_rad=float(np.median(residual[on_object])) if on_object.any() else 0.0,
         )  # fmt: skip
 
     def window(self, rows: slice, columns: slice) -> "Scene":
         """A part of this scene; slices of its maps, with start and stop."""
         top, left = self.crop[0].start, self.crop[1].start
-        part = (rows, columns)
-        return replace(
-            self, crop=(slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)),
-            light=self.light[part], plane_light=self.plane_light[part], inside=self.inside[part],
-            phase_rad=self.phase_rad[part], order=self.order[part], bright=self.bright[part],
-            weight=self.weight[part], slopes=(self.slopes[0][part], self.slopes[1][part]),
-        )  # fmt: skip
+        crop = slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)
+        inside, slopes = self.inside[rows, columns], (self.slopes[0][rows, columns], self.slopes[1][rows, columns])
+        maps = {name: getattr(self, name)[rows, columns] for name in (*_REAL_MAPS, "order")}
+        return replace(self, crop=crop, inside=inside, slopes=slopes, **maps)
 
     def half(self) -> "Scene":
         """The same in half precision, to save memory; call `single` before use."""
@@ -147,46 +176,37 @@ class Scene:
         return self._as(np.float32, np.int32)
 
     def _as(self, real: type, whole: type) -> "Scene":
-        maps = {
-            name: getattr(self, name).astype(real) for name in ("light", "plane_light", "phase_rad", "bright", "weight")
-        }
+        maps = {name: getattr(self, name).astype(real) for name in _REAL_MAPS}
         slopes: tuple[Image, Image] = (self.slopes[0].astype(real), self.slopes[1].astype(real))
         return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
 
 
-def candidate_brightness(scene: Scene, layer: CalibrationLayer, rig: Rig, sign: float) -> Image:
-    """Brightness with each candidate order (`STEPS`), in units of light, (3, h, w) float32.
-
-    ``layer``: of the scene's part of the image. NaN where a candidate lies behind a device.
-    """
-    height, width = scene.light.shape
-    every = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
-    rows, columns = scene.crop
-    where = (slice(rows.start, rows.stop, STEP_PX), slice(columns.start, columns.stop, STEP_PX))
-    coarse = layer.at(every)
-    slopes = scene.slopes[0][every], scene.slopes[1][every]
-    base = coarse.residual_phase(scene.phase_rad[every], scene.order[every])
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        bright = [
-            irradiance(coarse, (base + sign * TAU * step).astype(np.float32), slopes, rig, where) for step in STEPS
-        ]
-    stacked = (np.stack(bright) * rig.standoff_m**2).astype(np.float32)
-    return stacked.repeat(STEP_PX, axis=1).repeat(STEP_PX, axis=2)[:, :height, :width]
+def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> list[Image]:
+    """`irradiance` with each of ``residuals_rad`` (h, w), on every `STEP_PX`-th pixel; `repeated` spreads it again."""
+    grid, where = grid_of(STEP_PX), grid_of(STEP_PX, scene.crop)
+    layer, slopes = geometry.layer.at(where), (scene.slopes[0][grid], scene.slopes[1][grid])
+    return [irradiance(layer, residual_rad[grid], slopes, geometry.rig, where) for residual_rad in residuals_rad]
 
 
-def channels(
-    scene: Scene, layer: CalibrationLayer, rig: Rig, rotation: Rotation, period_px: float, slack_mm: float
-) -> tuple[Image, NDArray[np.bool_]]:
+def repeated(coarse: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """Maps (..., h', w') of every `STEP_PX`-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
+    return coarse.repeat(STEP_PX, axis=-2).repeat(STEP_PX, axis=-1)[..., : shape[-2], : shape[-1]]
+
+
+def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Image, Mask]:
     """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w').
 
-    The base order always exists, also where its depth lies outside the working range.
+    The base order always exists, also where its depth lies outside the working range. Without ``shading`` the channels
+    that assume one albedo are 0.
     """
-    expected = candidate_brightness(scene, layer, rig, rotation.sign)
+    rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
-    near, far = rig.working_range_mm
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.stack([layer.depth_of_residual_mm(residual + rotation.sign * TAU * step) for step in STEPS])
-        exists = (depth > near - slack_mm) & (depth < far + slack_mm)
+    candidates = [residual + rotation.sign * TAU * step for step in STEPS]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # Brightness with each candidate, in units of light; NaN where a candidate lies behind a device.
+        light = coarse_irradiance(scene, geometry, [candidate.astype(np.float32) for candidate in candidates])
+        exists = geometry.in_range(np.stack([layer.depth_of_residual_mm(candidate) for candidate in candidates]))
+    expected = repeated((np.stack(light) * rig.standoff_m**2).astype(np.float32), scene.light.shape)
     exists[1] = True
     floor = np.float32(LEAST_BRIGHTNESS * rig.standoff_m**2)
     bright = np.maximum(scene.bright, floor)
@@ -199,44 +219,44 @@ def channels(
     relief = np.nan_to_num(rotation.sign * (residual - scene.middle_rad)) / RELIEF_RAD
     # The correction c that a pixel's own light asks for if its brightness g is right: light = g (1 + cos(phase + c)).
     guess = -misfit * rotation.sign * sine / (sine * sine + SINE_FLOOR)
-    unit = period_px / TAU
-    along, across = (1, 0) if not rotation.transposed else (0, 1)
-    flip = -1.0 if rotation.reversed else 1.0
+    unit = geometry.route.period_px / TAU
+    down, right = rotation.down_and_right(scene.slopes)
     fitted = np.stack([
         cosine, rotation.sign * sine, np.log(bright) / 2, scene.weight, np.clip(misfit, -2, 2),
-        flip * rotation.sign * unit * scene.slopes[along], rotation.sign * unit * scene.slopes[across],
-        ratio[0], ratio[1], ratio[2], exists[0], exists[2], np.clip(relief, -4, 4), np.clip(guess, -1.5, 1.5),
+        unit * down, unit * right, ratio[0], ratio[1], ratio[2], exists[0], exists[2],
+        np.clip(relief, -4, 4), np.clip(guess, -1.5, 1.5),
     ]).astype(np.float32)  # fmt: skip
     fitted *= scene.weight > LEAST_WEIGHT
     image_maps = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
     turned_maps = rotation.turn(np.nan_to_num(np.concatenate([image_maps, fitted])))
-    sides = from_the_sides(scene, layer, rotation, period_px)
-    return np.concatenate([turned_maps, sides]), np.ascontiguousarray(rotation.turn(exists))
+    x = np.concatenate([turned_maps, _from_the_sides(scene, layer, geometry)])
+    if not shading:
+        x[list(SHADING)] = 0
+    return x, np.ascontiguousarray(rotation.turn(exists))
 
 
-def around(misfit: NDArray) -> Image:
+def _around(misfit: NDArray) -> Image:
     """Root mean square of a misfit in the pixel's surroundings."""
     square = np.clip(misfit, -2, 2).astype(np.float32) ** 2
     return np.sqrt(cv2.GaussianBlur(square, (0, 0), AROUND_PX, borderType=cv2.BORDER_REPLICATE))
 
 
-def from_the_sides(scene: Scene, layer: CalibrationLayer, rotation: Rotation, period_px: float) -> Image:
+def _from_the_sides(scene: Scene, layer: CalibrationLayer, geometry: Geometry) -> Image:
     """The phase extrapolated to a pixel from each of `SIDES`, minus its own phase, and the misfit of its light with it:
     (17, h', w') float32, rotated. Beside a depth edge the window of a pixel covers two surfaces, a window further in
     only one.
     """
-    turn, sign = rotation.turn, np.float32(rotation.sign)
+    rotation, sign = geometry.rotation, np.float32(geometry.rotation.sign)
+    turn = rotation.turn
     psi = turn(sign * wrapped(scene.phase_rad - layer.infinity_rad).astype(np.float32))
     phase = turn(sign * scene.phase_rad)
-    down, right = (1, 0) if not rotation.transposed else (0, 1)
-    flip = np.float32(-1.0 if rotation.reversed else 1.0)
-    slope_down, slope_right = turn(flip * sign * scene.slopes[down]), turn(sign * scene.slopes[right])
-    reach = max(1, round(SIDE_PERIODS * period_px))
-    maps = np.stack([psi, slope_down, slope_right, turn(scene.bright), turn(scene.inside.astype(np.float32))])
+    reach = max(1, round(SIDE_PERIODS * geometry.route.period_px))
+    turned_maps = (*rotation.down_and_right(scene.slopes), scene.bright, scene.inside.astype(np.float32))
+    maps = np.stack([psi, *map(turn, turned_maps)])
     height, width = psi.shape
     padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
     light = turn(scene.light)
-    corrections, misfits = [], [around(light / np.maximum(maps[3], np.float32(0.05)) - 1 - np.cos(phase))]
+    corrections, misfits = [], [_around(light / np.maximum(maps[3], np.float32(0.05)) - 1 - np.cos(phase))]
     for row, column in SIDES:
         dy, dx = round(row * reach), round(column * reach)
         side_maps = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
@@ -245,5 +265,5 @@ def from_the_sides(scene: Scene, layer: CalibrationLayer, rotation: Rotation, pe
         step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * on_object
         misfit = light / np.maximum(side_maps[3], np.float32(0.05)) - 1 - np.cos(phase + step)
         corrections.append(step)
-        misfits.append(around(np.where(on_object, misfit, np.float32(2))))
+        misfits.append(_around(np.where(on_object, misfit, np.float32(2))))
     return np.stack(corrections + misfits).astype(np.float32)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_SIDE, SIDES, STEPS
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS
 from fpp_ml_bench.errors import NetworkError
 
 BLOCK = 2
@@ -21,8 +21,6 @@ COARSE = 4
 """Pixels along a block that the order's branch averages."""
 ORDER_SHARE = 0.1
 """Share of the order's gradient that reaches the branch of phase and mask."""
-FIRST_MISFIT = FIRST_SIDE + len(SIDES)
-"""First of the misfit channels: of no correction, and of each proposed correction."""
 TRUST = 6.0
 """Start value of the factor by which a proposal's brightness misfit lowers its logit."""
 FIRST_BIAS = 2.5
@@ -31,12 +29,9 @@ FIRST_BIAS = 2.5
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
     parts: list[nn.Module] = []
-    for number in range(2):
-        parts += [
-            nn.Conv2d(inputs if number == 0 else outputs, outputs, 3, padding=1, bias=False),
-            nn.BatchNorm2d(outputs),
-            nn.ReLU(inplace=True),
-        ]
+    for width in (inputs, outputs):
+        convolution = nn.Conv2d(width, outputs, 3, padding=1, bias=False)
+        parts += [convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*parts)
 
 

@@ -16,7 +16,7 @@ class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
 
     ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
-    ``unions``: images that join several objects, made from each sample (see `unions`); ``weight_*``: of the losses;
+    ``unions``: images that join several objects, made from each sample (see `samples`); ``weight_*``: of the losses;
     ``averaged``: decay of the weights' moving average, which is what the weights file holds.
     Raises `RecipeError` for values that train nothing.
     """

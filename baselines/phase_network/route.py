@@ -8,20 +8,24 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_network.decide import Answers, decided_mask, network_answers
-from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Image, Scene
+from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.samples import Geometry, first_order
 from fpp_ml_bench.baselines.phase_route import (
     LARGE,
     MARGIN_SCALE,
     TAU,
+    Image,
+    Mask,
     Measurement,
     Observation,
     Settings,
+    grid_of,
     least_energy,
+    links_between,
+    of_choice,
     spread_over_pixels,
     wrapped,
 )
@@ -31,6 +35,63 @@ LEAST_ODDS = 1e-6
 """Least probability of a wrong order, whatever the network answers."""
 CORRECTED_SHARE = 0.3
 """Share of a correction that counts as uncertainty of the phase."""
+IMPOSSIBLE = -np.inf
+"""Logit of an order that puts its pixel out of the working range."""
+
+DENIED = 5.0
+"""A pixel of the measured route's mask stays object unless its logit is this far below the threshold."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The network's answers in the image's own orientation, maps (h, w) of the scene's crop.
+
+    ``logits`` (3, h, w): of the base order minus one, the base order, and plus one; ``object_logit``;
+    ``correction_rad``: to be added to the wrapped phase.
+    """
+
+    logits: Image
+    object_logit: Image
+    correction_rad: Image
+
+
+def network_answers(
+    network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0
+) -> Answers:
+    """Run ``network`` on a scene.
+
+    ``lead``: the base order's lead, added to its logit. Training windows get made-up wrong base orders (see `windows`),
+    so the network holds the base order wrong more often than it is; the lead, chosen on the validation split, makes up
+    for that."""
+    rotation = geometry.rotation
+    x, exists = channels(scene, geometry, shading)
+    _, height, width = x.shape
+    stride = network.stride
+    padded = np.pad(x, ((0, 0), (0, -height % stride), (0, -width % stride)))
+    with torch.inference_mode():
+        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
+        order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(batch))
+    order = np.where(exists, order + np.array([0, lead, 0], np.float32)[:, None, None], np.float32(IMPOSSIBLE))
+    back = rotation.back
+    signed = back(order) if rotation.sign > 0 else back(order)[::-1]
+    return Answers(
+        np.ascontiguousarray(signed), np.ascontiguousarray(back(inside)),
+        np.ascontiguousarray(back(correction)) * np.float32(rotation.sign),
+    )  # fmt: skip
+
+
+def decided_order(answers: Answers, scene: Scene) -> NDArray[np.int32]:
+    """The most likely order of every pixel, int32 (h, w)."""
+    steps = np.array(STEPS, np.int32)
+    return scene.order + steps[answers.logits.argmax(axis=0)]
+
+
+def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
+    """Object pixels (h, w): those whose logit is above ``threshold``, and those of the measured route's mask whose
+    logit is at most `DENIED` below it; only where enough of the local fit's window lies on the object."""
+    logit = answers.object_logit
+    is_object = (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
+    return is_object & (scene.weight > LEAST_WEIGHT)
 
 
 @dataclass(frozen=True)
@@ -66,14 +127,9 @@ class NetworkRoute:
     """One rig, one fringe direction, one network."""
 
     def __init__(
-        self,
-        rig: Rig,
-        settings: Settings,
-        network: PhaseNet,
-        threshold: float = 0.0,
-        levers: Levers | None = None,
+        self, rig: Rig, settings: Settings, network: PhaseNet, threshold: float = 0.0, levers: Levers | None = None,
         lead: float = 0.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.levers = levers or Levers()
         self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading))
         self.network, self.threshold, self.lead = network, threshold, lead
@@ -86,11 +142,11 @@ class NetworkRoute:
         """The measured route's observation of ``image``, and the network's answers."""
         geometry = self.geometry
         observation = geometry.route.observe(image)
-        base, margin = first_order(observation, geometry.rig, geometry.route.settings)
+        base, margin = geometry.route.choose(observation)
         observation.watch.done("order")
         if observation.empty:
             return AnsweredObservation(observation, base, margin, None, None)
-        scene = Scene.of(observation, base, geometry.rig)
+        scene = Scene.of(observation, base)
         answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
         observation.watch.done("network")
         return AnsweredObservation(observation, base, margin, scene, answers)
@@ -118,7 +174,7 @@ class NetworkRoute:
         )
 
     def _order(
-        self, answers: Answers, scene: Scene, inside: NDArray[np.bool_], observation: Observation, graph: float
+        self, answers: Answers, scene: Scene, inside: Mask, observation: Observation, graph: float
     ) -> tuple[NDArray[np.int32], Image]:
         """Order of every pixel, and its margin, from the network's probability that the order is wrong."""
         probabilities = np.exp(answers.logits - answers.logits.max(axis=0))
@@ -126,37 +182,30 @@ class NetworkRoute:
         candidate = answers.logits.argmax(axis=0)
         if graph > 0:
             candidate = self._labelled(probabilities, scene, inside, observation, graph)
-        probability = np.clip(
-            np.take_along_axis(probabilities, candidate[None].astype(np.intp), axis=0)[0], LEAST_ODDS, 1 - LEAST_ODDS
-        )
+        probability = np.clip(of_choice(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
         margin = np.float32(MARGIN_SCALE) * np.log(probability / (1 - probability))
         return scene.order + np.array(STEPS, np.int32)[candidate], np.maximum(margin, 0).astype(np.float32)
 
     def _labelled(
-        self, probabilities: NDArray, scene: Scene, inside: NDArray[np.bool_], observation: Observation, graph: float
+        self, probabilities: NDArray, scene: Scene, inside: Mask, observation: Observation, graph: float
     ) -> NDArray[np.intp]:
         """Index of each pixel's order, by least energy on a grid of every few pixels."""
         stride = observation.question.stride
-        grid = (slice(None, None, stride), slice(None, None, stride))
+        grid, size = grid_of(stride), (stride, stride)
         weight = inside.astype(np.float32)
-        size = (stride, stride)
         share = cv2.blur(weight, size)
         cost = np.stack(
             [cv2.blur((-np.log(probability + 1e-9) * weight).astype(np.float32), size) for probability in probabilities]
         )
         cost = (cost / np.maximum(share, 1e-3))[:, *grid] * np.float32(stride**2)
         grid_inside = inside[grid]
-        residual_at_zero = observation.layer.residual_phase(observation.phase_rad, 0.0)
-        coarse = (residual_at_zero + TAU * scene.order)[grid]
+        residual_at_zero_rad = observation.residual_at_zero_rad
+        coarse = (residual_at_zero_rad + TAU * scene.order)[grid]
         phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)
-        links = [
-            (a & b).astype(np.float32) * np.float32(graph * stride)
-            for a, b in ((grid_inside[:, 1:], grid_inside[:, :-1]), (grid_inside[1:], grid_inside[:-1]))
-        ]
+        links = [link * np.float32(graph * stride) for link in links_between(grid_inside)]
         cost = np.where(grid_inside, np.minimum(cost, LARGE), 0).astype(np.float32)
         choice, margin = least_energy(cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad)
         question = replace(observation.question, residual_rad=phases, inside=grid_inside)
-        order, _ = spread_over_pixels(question, choice, margin, residual_at_zero)
+        order, _ = spread_over_pixels(question, choice, margin, residual_at_zero_rad)
         candidate = np.clip(order - scene.order, -1, 1) + 1
-        possible = np.take_along_axis(probabilities, candidate[None], axis=0)[0] > 0
-        return np.where(possible, candidate, probabilities.argmax(axis=0))
+        return np.where(of_choice(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))

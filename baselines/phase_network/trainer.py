@@ -13,11 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fpp_ml_bench.baselines.phase_network.decide import Answers, decided_mask, network_answers
+from fpp_ml_bench.baselines.phase_network.inputs import Geometry
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
-from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, samples_of
+from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, network_answers
+from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of, unions_of
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, score, train
-from fpp_ml_bench.baselines.phase_network.unions import unions_of
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_route import Settings
 from fpp_ml_bench.baselines.training import CURVE_FILE, LOG_FILE, training_benchmark, write_log
@@ -30,7 +30,7 @@ WEIGHTS_FILE, RECIPE_FILE = "phase-net.safetensors", "recipe.json"
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
 LEADS = tuple(float(value) for value in range(8))
-"""Leads of the base order (see `decide.network_answers`) that are tried on the validation split."""
+"""Leads of the base order (see `route.network_answers`) that are tried on the validation split."""
 _TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
 """Depth error that a missed or invented pixel counts with; errors this close to the least count as equal."""
 

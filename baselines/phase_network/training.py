@@ -14,10 +14,11 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines.phase_network.decide import Answers, decided_mask, decided_order, network_answers
+from fpp_ml_bench.baselines.phase_network.inputs import Geometry
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
-from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
+from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, decided_order, network_answers
+from fpp_ml_bench.baselines.phase_network.samples import Sample
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window, draw
 from fpp_ml_bench.baselines.phase_route import TAU
 from fpp_ml_bench.baselines.training import optimizer_tensors, read_checkpoint, restore_optimizer, save_checkpoint

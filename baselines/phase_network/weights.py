@@ -34,7 +34,7 @@ class NetConfig:
     """What the network is, how its answers are used, and what it was trained on.
 
     ``options``: arguments of `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added
-    to the logit of the base order (see `decide.network_answers`), both chosen on the validation split; ``period_px``:
+    to the logit of the base order (see `route.network_answers`), both chosen on the validation split; ``period_px``:
     image px per fringe period of the training images, by direction; ``dataset_fingerprint`` and ``benchmark``: training
     data, the latter None for a dataset of the user's own and in older files; ``steps`` trained; ``recipe``: the
     resolved training recipe; ``validation``: scores."""

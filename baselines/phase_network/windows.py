@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.inputs import (
     CHANNELS,
+    FIRST_MISFIT,
     FIRST_SIDE,
-    SHADING,
     SIDES,
-    STEP_PX,
-    Image,
+    Geometry,
     Scene,
     channels,
+    coarse_irradiance,
+    repeated,
 )
-from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer, irradiance
+from fpp_ml_bench.baselines.phase_network.samples import Sample
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Direction
 
@@ -32,10 +33,7 @@ IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
 _MIRRORED = CHANNELS.index("slope across")
 _PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
-_FIRST_MISFIT = FIRST_SIDE + len(SIDES)
-_SWAPPED = (
-    [FIRST_SIDE + place for place in _PARTNERS] + [_FIRST_MISFIT] + [_FIRST_MISFIT + 1 + place for place in _PARTNERS]
-)
+_SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
 
 
 @dataclass(frozen=True)
@@ -59,12 +57,12 @@ class Window:
     (n, n): object; ``mask_valid``: where the mask's loss counts, False for an object that was moved."""
 
     x: Image
-    exists: NDArray[np.bool_]
+    exists: Mask
     order: NDArray[np.int64]
     correction_rad: Image
-    fitted: NDArray[np.bool_]
-    target: NDArray[np.bool_]
-    mask_valid: NDArray[np.bool_]
+    fitted: Mask
+    target: Mask
+    mask_valid: Mask
 
 
 def draw(
@@ -80,18 +78,13 @@ def draw(
     rows, columns = _place(sample, size, random.random() < vary.near_edge, random)
     scene, missing = sample.scene.window(rows, columns).single(), sample.missing_rad[rows, columns].astype(np.float32)
     target = sample.target[rows, columns]
-    layer = geometry.layer.at(scene.crop)
     moved = random.random() < vary.shift and target.any()
     if moved:
-        scene = _moved(scene, missing, target, layer, geometry, vary, random)
-    scene, missing = _wrong(scene, missing, layer, geometry, vary, random)
-    settings = geometry.route.settings
-    x, exists = channels(scene, layer, geometry.rig, geometry.rotation, geometry.route.period_px, settings.slack_mm)
-    if random.random() < vary.no_shading:
-        x[list(SHADING)] = 0
+        scene = _moved(scene, missing, target, geometry, vary, random)
+    scene, missing = _wrong(scene, missing, geometry, vary, random)
+    x, exists = channels(scene, geometry, shading=random.random() >= vary.no_shading)
     missing = geometry.rotation.turn(missing) * np.float32(geometry.rotation.sign)
-    target = geometry.rotation.turn(target)
-    window = _labelled(x, exists, missing, target, size, mask_valid=not moved)
+    window = _labelled(x, exists, missing, geometry.rotation.turn(target), size, mask_valid=not moved)
     return _mirrored(window) if random.random() < vary.mirror else window
 
 
@@ -107,28 +100,21 @@ def _place(sample: Sample, size: int, near_edge: bool, random: np.random.Generat
 
 
 def _moved(
-    scene: Scene, missing: Image, target: NDArray[np.bool_], layer: CalibrationLayer, geometry: Geometry,
-    vary: Variation, random: np.random.Generator,
-) -> Scene:  # fmt: skip
+    scene: Scene, missing: Image, target: Mask, geometry: Geometry, vary: Variation, random: np.random.Generator
+) -> Scene:
     """The object at another distance within the working range."""
     near, far = geometry.rig.working_range_mm
+    layer = geometry.layer.at(scene.crop)
     true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
     middle = float(np.median(true_rad[target]))
     gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
     depth_m = random.uniform(near + vary.margin_mm, far - vary.margin_mm) / MM_PER_M
     delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
-    grid = (slice(None, None, STEP_PX), slice(None, None, STEP_PX))
-    rows, columns = scene.crop
-    where = (slice(rows.start, rows.stop, STEP_PX), slice(columns.start, columns.stop, STEP_PX))
-    coarse, slopes = layer.at(grid), (scene.slopes[0][grid], scene.slopes[1][grid])
     with np.errstate(all="ignore"):
-        before, after = (
-            np.maximum(irradiance(coarse, residual, slopes, geometry.rig, where), 1e-3)
-            for residual in (true_rad[grid], true_rad[grid] + delta)
-        )
+        lit = coarse_irradiance(scene, geometry, (true_rad, true_rad + delta))
+        before, after = (np.maximum(light, 1e-3) for light in lit)
         ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
-    height, width = scene.light.shape
-    ratio = ratio.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[:height, :width].astype(np.float32)
+    ratio = repeated(ratio, scene.light.shape).astype(np.float32)
     ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
     true_phase = scene.phase_rad + missing
     light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
@@ -142,9 +128,8 @@ def _moved(
 
 
 def _wrong(
-    scene: Scene, missing: Image, layer: CalibrationLayer, geometry: Geometry, vary: Variation,
-    random: np.random.Generator,
-) -> tuple[Scene, Image]:  # fmt: skip
+    scene: Scene, missing: Image, geometry: Geometry, vary: Variation, random: np.random.Generator
+) -> tuple[Scene, Image]:
     """Wrong base orders, where the working range allows them."""
     height, width = scene.light.shape
     off = np.zeros((height, width), np.int32)
@@ -158,22 +143,18 @@ def _wrong(
         off += (noise > random.uniform(0.5, 1.5)) * int(random.choice((-1, 1)))
     if not off.any():
         return scene, missing
-    near, far = geometry.rig.working_range_mm
-    slack = geometry.route.settings.slack_mm
     with np.errstate(all="ignore"):
-        depth = layer.depth_mm(scene.phase_rad, scene.order + off)
-        off = np.where((depth > near - slack) & (depth < far + slack), off, 0).astype(np.int32)
+        depth_mm = geometry.layer.at(scene.crop).depth_mm(scene.phase_rad, scene.order + off)
+        off = np.where(geometry.in_range(depth_mm), off, 0).astype(np.int32)
     changed = replace(scene, order=scene.order + off, middle_rad=scene.middle_rad + TAU * middle)
     return changed, missing - np.float32(TAU) * off
 
 
-def _labelled(
-    x: Image, exists: NDArray[np.bool_], missing: Image, target: NDArray[np.bool_], size: int, mask_valid: bool
-) -> Window:
+def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, mask_valid: bool) -> Window:
     steps = np.rint(missing / TAU).astype(np.int64)
     possible = target & (np.abs(steps) <= 1)
     place = np.clip(steps, -1, 1) + 1
-    possible &= np.take_along_axis(exists, place[None], axis=0)[0]
+    possible &= of_choice(exists, place)
     correction = (missing - TAU * steps).astype(np.float32)
     _, height, width = x.shape
     pad = ((0, size - height), (0, size - width))

@@ -11,6 +11,7 @@ back without subtracting large numbers, so that float32 is enough. Everything he
 tensors pass through the same lines (`fpp_ml_bench.baselines.phase_route.calibration_layer_torch` holds the buffers).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,15 @@ from fpp_ml_bench.decoding import FIXED_POINT_STEPS, rotated_ray
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import DIRECTIONS, Coefficients, Direction, Maps, Rig, distortion_polynomial, is_distorted
 
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
 TAU = 2 * np.pi
+
+
+def wrapped(phase_rad: NDArray) -> NDArray:
+    """``phase_rad`` less the nearest whole number of periods, in [-pi, pi]."""
+    return phase_rad - TAU * np.rint(phase_rad / TAU)
 
 
 @dataclass(frozen=True)
@@ -81,14 +90,21 @@ class CalibrationLayer:
             lens=lens,
         )
 
+    @property
+    def maps(self) -> tuple[Any, ...]:
+        """All maps: the four of the pinhole model, and the rays where the projector's lens distorts."""
+        rays = self.lens.rays if self.lens is not None else ()
+        return (self.infinity_rad, self.infinity_order, self.gain, self.forward, *rays)
+
+    def with_maps(self, maps: Iterable[Any]) -> "CalibrationLayer":
+        """The same constants with other ``maps``, in the order of `maps`: parts of them, or tensors."""
+        infinity, order, gain, forward, *rays = maps
+        lens = replace(self.lens, rays=tuple(rays)) if self.lens is not None else None
+        return CalibrationLayer(infinity, order, gain, forward, self.back_m, self.rad_per_unit, lens)
+
     def at(self, where: Any) -> "CalibrationLayer":
         """The layer of a part of the image: ``where`` indexes the maps (slices, a mask)."""
-        lens = self.lens
-        if lens is not None:
-            lens = replace(lens, rays=(lens.rays[0][where], lens.rays[1][where], lens.rays[2][where]))
-        infinity, order = self.infinity_rad[where], self.infinity_order[where]
-        gain, forward = self.gain[where], self.forward[where]
-        return CalibrationLayer(infinity, order, gain, forward, self.back_m, self.rad_per_unit, lens)
+        return self.with_maps(values[where] for values in self.maps)
 
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
         """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole

@@ -6,24 +6,16 @@ the fit extrapolates instead of averaging. The order: its margin gives the proba
 error in mm is known. The confidence, 1 / (1 + error / 5 mm), lies between 0 and 1.
 """
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
-from fpp_ml_bench.baselines.phase_route.empty_scene import Background
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
-from fpp_ml_bench.baselines.phase_route.measurement import Reason
 from fpp_ml_bench.baselines.phase_route.object_mask import disk
-from fpp_ml_bench.baselines.phase_route.observation import Observation
-from fpp_ml_bench.baselines.phase_route.settings import Settings
+from fpp_ml_bench.baselines.phase_route.observation import Capture, Observation, Reason, Settings
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION
-from fpp_ml_bench.optics import Rig
-
-Image = NDArray[np.float32]
+from fpp_ml_bench.decoding import MIN_MODULATION, phase_weights
 
 HALF_CONFIDENCE_MM = 5.0
 LEAST_MARGIN = 0.1
@@ -36,13 +28,13 @@ SLOWEST, FASTEST = 0.35, 2.2
 THIN_PERIODS = 0.5
 
 
-def phase_uncertainty_rad(
-    grey: Image, fit: FringeFit, inside: NDArray[np.bool_], slopes: tuple[Image, Image], background: Background,
-    window: Window,
-) -> Image:  # fmt: skip
-    """Expected error of the phase of a local fit to ``grey`` (h, w), in rad, float32; order aside."""
+def fit_uncertainty_rad(
+    capture: Capture, fit: FringeFit, inside: Mask, slopes: tuple[Image, Image], window: Window
+) -> Image:
+    """Expected error of the phase of a local fit to the first frame, in rad, float32 (h, w); order aside."""
+    background = capture.background
     bright = np.maximum(fit.brightness, 0.5)
-    misfit = (grey - background.ambient_grey - bright * (1 + np.cos(fit.phase_rad))) * inside
+    misfit = (capture.greys[0] - background.ambient_grey - bright * (1 + np.cos(fit.phase_rad))) * inside
     power = window.moment((misfit * misfit).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
     # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not average.
     averaged = background.noise_grey**2 / (2 * np.pi * window.sigma_px**2 * np.maximum(fit.weight, 0.05))
@@ -54,9 +46,24 @@ def phase_uncertainty_rad(
     return expected
 
 
-def clipped_share(greys: Sequence[Image], fit: FringeFit, inside: NDArray[np.bool_], window: Window) -> Image:
+def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) -> Image:
+    """Expected absolute error of the phase of each pixel, float32 (h, w): noise through the weights of the steps, and
+    the difference of mean and modulation beyond it (a pixel that covers two surfaces, or is clipped)."""
+    background = capture.background
+    _, cosine, sine = phase_weights(capture.shifts_rad)
+    bright = np.maximum(fit.brightness, 0.5)
+    # Of phi = -atan2(S, C): d phi = -(C dS - S dC) / B^2 = -(cos phi dS + sin phi dC) / B.
+    c, s = np.cos(fit.phase_rad), np.sin(fit.phase_rad)
+    variance = c * c * (sine @ sine) + s * s * (cosine @ cosine) + 2 * c * s * (sine @ cosine)
+    noise = background.noise_grey * np.sqrt(variance * 2 / np.pi)
+    disagreement = np.abs(mean_grey - background.ambient_grey - fit.brightness)
+    allowed = 3 * background.noise_grey * np.sqrt(3 / len(capture.shifts_rad))
+    return ((noise + np.maximum(disagreement - allowed, 0) / 2) / bright).astype(np.float32)
+
+
+def clipped_share(capture: Capture, fit: FringeFit, inside: Mask, window: Window) -> Image:
     """Share of the window's weight on the object that is saturated in any of the frames, float32 (h, w)."""
-    anywhere = np.any([grey >= GREY_LEVELS for grey in greys], axis=0)
+    anywhere = np.any([grey >= GREY_LEVELS for grey in capture.greys], axis=0)
     clipped = window.moment((anywhere & inside).astype(np.float32))
     share: Image = (clipped / np.maximum(fit.weight, 1e-3)).astype(np.float32)
     return share
@@ -70,10 +77,13 @@ def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    error_mm = np.where(observation.inside, mm_per_rad * (observation.uncertainty_rad + TAU * wrong_chance), 0).astype(
-        np.float32
-    )
-    return error_mm, np.where(observation.inside, mm_per_rad * TAU * wrong_chance, 0).astype(np.float32)
+    error_mm, doubt_mm = (
+        np.where(observation.inside, part_mm, 0).astype(np.float32)
+        for part_mm in (
+            mm_per_rad * (observation.uncertainty_rad + TAU * wrong_chance), mm_per_rad * TAU * wrong_chance,
+        )
+    )  # fmt: skip
+    return error_mm, doubt_mm
 
 
 def confidence_of(error_mm: Image) -> Image:
@@ -82,30 +92,23 @@ def confidence_of(error_mm: Image) -> Image:
 
 
 def reasons(
-    observation: Observation,
-    margin: Image,
-    confidence: Image,
-    depth_mm: NDArray,
-    rig: Rig,
-    settings: Settings,
-    period_px: float,
+    observation: Observation, margin: Image, confidence: Image, depth_mm: NDArray, settings: Settings
 ) -> NDArray[np.uint8]:
     """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
 
     A depth outside the working range is a reason also where another order would give a depth inside: a chooser that
     corrects the phase can leave the range that its orders were chosen for.
     """
-    near, far = rig.working_range_mm
+    near, far = observation.rig.working_range_mm
     outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
-    slopes = observation.slopes
+    slopes, period_px = observation.slopes, observation.period_px
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
     along = np.abs(TAU / period_px + slopes[axis]) * period_px / TAU
     across = np.abs(slopes[1 - axis]) * period_px / TAU
     frequency = np.hypot(along, across)
-    thick = (
-        cv2.morphologyEx(observation.inside.astype(np.uint8), cv2.MORPH_OPEN, disk(THIN_PERIODS / 2 * period_px)) > 0
-    )
+    widest = disk(THIN_PERIODS / 2 * period_px)
+    thick = cv2.morphologyEx(observation.inside.astype(np.uint8), cv2.MORPH_OPEN, widest) > 0
     reason_map = np.full(observation.inside.shape, Reason.MEASURED, np.uint8)
     checks = (
         (confidence < settings.min_confidence, Reason.UNSURE),
@@ -113,7 +116,7 @@ def reasons(
         ((frequency < SLOWEST) | (frequency > FASTEST), Reason.TOO_STEEP),
         (~thick, Reason.THIN),
         ((observation.candidates.count == 0) | outside, Reason.OUT_OF_RANGE),
-        (observation.clipped > SATURATED_SHARE, Reason.SATURATED),
+        (observation.clipped_share > SATURATED_SHARE, Reason.SATURATED),
         (observation.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
         (~observation.inside, Reason.BACKGROUND),
     )

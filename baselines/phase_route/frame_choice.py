@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
-from fpp_ml_bench.baselines.phase_route.several_frames import PIXELWISE, steps_of
+from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement
+from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
@@ -59,11 +59,17 @@ class FrameChoice:
              "by_phase_mm": round(look.phase_mm, 4), "by_order_mm": round(look.order_mm, 4)}
             for look in self.looks
         ]  # fmt: skip
-        last = self.looks[-1]
-        return {
-            "frames": last.frames, "expected_error_mm": round(last.expected_mm, 4),
-            "frames_used": list(self.frames_used), "looks": looks,
-        }  # fmt: skip
+        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
+        return last | {"frames_used": list(self.frames_used), "looks": looks}
+
+
+def _look(measurement: Measurement, count: int) -> Look:
+    on_object = measurement.depth_mm > 0
+    if not on_object.any():
+        return Look(count, False, 0.0, 0.0)
+    order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
+    error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
+    return Look(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
 
 
 def levels_of(steps: int) -> tuple[int, ...]:
@@ -119,42 +125,26 @@ class FewestFrames:
     def choose(self, frames: Frames) -> FrameChoice:
         """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""
         looks: list[Look] = []
-        levels = list(self.methods)
-        level, gray = 0, False
-        while True:
-            count = levels[level]
-            method = self.methods[count]
+        gray = False
+        for count, method in self.methods.items():
             measurement = method.measure(frames)
-            look = self._look(measurement, count)
-            depth_mm, used = measurement.depth_mm, method.frames_used
+            depth_mm, used, look = measurement.depth_mm, method.frames_used, _look(measurement, count)
+            if not gray:
+                looks.append(look)
+                # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
+                # is left.
+                phase_done = look.phase_mm <= self.error_mm or count == max(self.methods)
+                gray = look.expected_mm > self.error_mm and count >= PIXELWISE and phase_done
             if gray:
-                decoded = decode_stack(frames, self.rig, direction=self.options.direction, steps=count)
-                depth_mm, used = decoded.depth_mm, tuple(sorted({*method.frames_used, *self.gray}))
-                look = replace(look, frames=len(used), gray=True, order_mm=0.0)
-            looks.append(look)
-            if look.expected_mm <= self.error_mm:
+                depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
+                used = tuple(sorted({*used, *self.gray}))
+                looks.append(replace(look, frames=len(used), gray=True, order_mm=0.0))
+            if looks[-1].expected_mm <= self.error_mm:
                 break
-            # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe is
-            # left.
-            last = level + 1 == len(levels)
-            if not gray and count >= PIXELWISE and (look.phase_mm <= self.error_mm or last):
-                gray = True
-            elif last:
-                break
-            else:
-                level += 1
         return FrameChoice(depth_mm, used, tuple(looks))
 
-    def _look(self, measurement: Measurement, count: int) -> Look:
-        on_object = measurement.depth_mm > 0
-        if not on_object.any():
-            return Look(count, False, 0.0, 0.0)
-        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
-        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
-        return Look(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
-
     def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Depth as `predict`, and the sample's report (see `Chosen.report`)."""
+        """Depth as `predict`, and the sample's report (see `FrameChoice.report`)."""
         choice = self.choose(frames)
         return choice.depth_mm, choice.report()
 

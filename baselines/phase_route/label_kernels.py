@@ -1,7 +1,8 @@
-"""Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") over a few candidates a pixel.
+"""The message passing of `labels`, compiled; imported only where `fpp_ml_bench.compiled` compiles.
 
-Imported only where `fpp_ml_bench.compiled` compiles; `label_sweeps` gives the same numbers in NumPy. Messages are
-stored at the node that receives them: 0 from the left, 1 from above, 2 from the right, 3 from below.
+A ``field`` is what `labels.least_energy` makes of its arguments: costs and phases (H, W, K), the links along x and y,
+and the limit of a jump. Messages are stored at the node that receives them: 0 from the left, 1 from above, 2 from the
+right, 3 from below.
 """
 
 import numpy as np
@@ -27,57 +28,46 @@ def _send(costs, returned, phases, neighbour_phases, weight, limit, out):  # typ
 
 
 @njit
-def _gather(unary, messages, i, j, total):  # type: ignore[no-untyped-def]
-    for a in range(total.shape[0]):
-        total[a] = unary[i, j, a] + (
-            (messages[i, j, 0, a] + messages[i, j, 1, a]) + (messages[i, j, 2, a] + messages[i, j, 3, a])
-        )
-
-
-@njit
-def iterate(unary, phase, link_x, link_y, limit, rounds, messages):  # type: ignore[no-untyped-def]
-    """``rounds`` forward and backward passes over (H, W, K) costs; ``messages`` (H, W, 4, K) are updated in place."""
+def iterate(field, rounds, messages):  # type: ignore[no-untyped-def]
+    """``rounds`` forward and backward passes over a field; ``messages`` (H, W, 4, K) are updated in place."""
+    unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
     total = np.empty(count, np.float32)
     none = np.float32(0.0)
-    for _ in range(rounds):
-        for i in range(height):
-            for j in range(width):
-                right = link_x[i, j] if j < width - 1 else none
-                down = link_y[i, j] if i < height - 1 else none
-                if right == none and down == none:
-                    continue
+    for number in range(2 * rounds):
+        step = 1 if number % 2 == 0 else -1
+        # What the neighbours ahead have returned lies here, and what they receive goes there; + 1: above and below.
+        here, there = (2, 0) if step > 0 else (0, 2)
+        for row in range(height):
+            i = row if step > 0 else height - 1 - row
+            for column in range(width):
+                j = column if step > 0 else width - 1 - column
                 left = link_x[i, j - 1] if j > 0 else none
                 up = link_y[i - 1, j] if i > 0 else none
-                ahead, behind = int(right > none) + int(down > none), int(left > none) + int(up > none)
-                _gather(unary, messages, i, j, total)
-                for a in range(count):
-                    total[a] = total[a] / np.float32(max(ahead, behind))
-                if right > none:
-                    _send(total, messages[i, j, 2], phase[i, j], phase[i, j + 1], right, limit, messages[i, j + 1, 0])
-                if down > none:
-                    _send(total, messages[i, j, 3], phase[i, j], phase[i + 1, j], down, limit, messages[i + 1, j, 1])
-        for i in range(height - 1, -1, -1):
-            for j in range(width - 1, -1, -1):
-                left = link_x[i, j - 1] if j > 0 else none
-                up = link_y[i - 1, j] if i > 0 else none
-                if left == none and up == none:
-                    continue
                 right = link_x[i, j] if j < width - 1 else none
                 down = link_y[i, j] if i < height - 1 else none
+                across, along = (right, down) if step > 0 else (left, up)
+                if across == none and along == none:
+                    continue
                 ahead, behind = int(right > none) + int(down > none), int(left > none) + int(up > none)
-                _gather(unary, messages, i, j, total)
+                share = np.float32(max(ahead, behind))
                 for a in range(count):
-                    total[a] = total[a] / np.float32(max(ahead, behind))
-                if left > none:
-                    _send(total, messages[i, j, 0], phase[i, j], phase[i, j - 1], left, limit, messages[i, j - 1, 2])
-                if up > none:
-                    _send(total, messages[i, j, 1], phase[i, j], phase[i - 1, j], up, limit, messages[i - 1, j, 3])
+                    received = (messages[i, j, 0, a] + messages[i, j, 1, a]) + (
+                        messages[i, j, 2, a] + messages[i, j, 3, a]
+                    )
+                    total[a] = (unary[i, j, a] + received) / share
+                if across > none:
+                    out = messages[i, j + step, there]
+                    _send(total, messages[i, j, here], phase[i, j], phase[i, j + step], across, limit, out)
+                if along > none:
+                    out = messages[i + step, j, there + 1]
+                    _send(total, messages[i, j, here + 1], phase[i, j], phase[i + step, j], along, limit, out)
 
 
 @njit
-def decide(unary, phase, link_x, link_y, limit, messages, choice, margin):  # type: ignore[no-untyped-def]
+def decide(field, messages, choice, margin):  # type: ignore[no-untyped-def]
     """Labels in reading order, each given the labels before it; ``margin``: by how much the second best costs more."""
+    unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
     for i in range(height):
         for j in range(width):

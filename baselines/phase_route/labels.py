@@ -4,15 +4,21 @@ The energy is a sum over pixels of costs from brightness and priors, and over ne
 residual phases, linear up to a limit: surfaces are smooth, and where they jump, a jump of any height costs the same.
 For a single pixel smoothness is strong and brightness weak; plain belief propagation then keeps the result of its first
 sweep (it put a plane at 2.1 m a whole period too near although brightness favoured the right order at 97% of the
-pixels). The tree-reweighted kind counts the evidence of every pixel once and finds the right order.
+pixels). Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") counts the evidence of every pixel once
+and finds the right order.
+
+It is written twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left
+and upper neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once. Maps are
+sheared for that: row d of a sheared map holds the nodes (i, d - i), at index i.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image
 from fpp_ml_bench.compiled import numba_enabled
 
-Image = NDArray[np.float32]
+Field = tuple[Image, Image, Image, Image, np.float32]
 
 ROUNDS = 10
 LARGE = np.float32(1e4)
@@ -20,12 +26,7 @@ LARGE = np.float32(1e4)
 
 
 def least_energy(
-    unary: NDArray[np.float32],
-    phase_rad: NDArray[np.float32],
-    link_x: Image,
-    link_y: Image,
-    limit_rad: float,
-    rounds: int = ROUNDS,
+    unary: Image, phase_rad: Image, link_x: Image, link_y: Image, limit_rad: float, rounds: int = ROUNDS
 ) -> tuple[NDArray[np.int32], Image]:
     """Index of the chosen candidate, int32 (H, W), and its margin to the second best, float32 (at most `LARGE`).
 
@@ -36,14 +37,93 @@ def least_energy(
     if numba_enabled():
         from fpp_ml_bench.baselines.phase_route.label_kernels import decide, iterate
     else:
-        from fpp_ml_bench.baselines.phase_route.label_sweeps import decide, iterate
+        decide, iterate = _decide, _iterate
     count, height, width = unary.shape
-    costs = np.ascontiguousarray(unary.transpose(1, 2, 0), dtype=np.float32)
-    phases = np.ascontiguousarray(phase_rad.transpose(1, 2, 0), dtype=np.float32)
-    links = np.ascontiguousarray(link_x, dtype=np.float32), np.ascontiguousarray(link_y, dtype=np.float32)
-    limit = np.float32(limit_rad)
+    # One node's candidates side by side.
+    costs, phases = (np.ascontiguousarray(maps.transpose(1, 2, 0), np.float32) for maps in (unary, phase_rad))
+    links = np.ascontiguousarray(link_x, np.float32), np.ascontiguousarray(link_y, np.float32)
+    field = (costs, phases, *links, np.float32(limit_rad))
     messages = np.zeros((height, width, 4, count), np.float32)
-    iterate(costs, phases, *links, limit, rounds, messages)
+    iterate(field, rounds, messages)
     choice, margin = np.zeros((height, width), np.int32), np.zeros((height, width), np.float32)
-    decide(costs, phases, *links, limit, messages, choice, margin)
+    decide(field, messages, choice, margin)
     return choice, np.minimum(margin, LARGE)
+
+
+def _sheared(image: NDArray, height: int, width: int) -> NDArray:
+    """``image`` (height, width, ...) as (height + width - 1, height, ...), zeros where there is no node."""
+    i, j = np.indices((height, width))
+    out = np.zeros((height + width - 1, height, *image.shape[2:]), image.dtype)
+    out[i + j, i] = image
+    return out
+
+
+def _straight(image: NDArray, height: int, width: int) -> NDArray:
+    i, j = np.indices((height, width))
+    return image[i + j, i]
+
+
+def _links(link_x: Image, link_y: Image, height: int, width: int) -> dict[str, Image]:
+    """Weight towards each neighbour, 0 beyond the border, sheared."""
+    towards = {side: np.zeros((height, width), np.float32) for side in ("left", "right", "up", "down")}
+    towards["right"][:, : width - 1], towards["left"][:, 1:] = link_x, link_x
+    towards["down"][: height - 1], towards["up"][1:] = link_y, link_y
+    return {side: _sheared(weights, height, width) for side, weights in towards.items()}
+
+
+def _send(
+    costs: Image, returned: Image, phases: Image, neighbour_phases: Image, weight: Image, limit: np.float32
+) -> Image:
+    jump = np.minimum(np.abs(phases[:, :, None] - neighbour_phases[:, None, :]), limit) * weight[:, None, None]
+    out: Image = ((costs - returned)[:, :, None] + jump).min(axis=1)
+    return out - out.min(axis=1, keepdims=True)
+
+
+def _iterate(field: Field, rounds: int, messages: Image) -> None:
+    """As `label_kernels.iterate`: ``messages`` (H, W, 4, K) are updated in place."""
+    unary, phase, link_x, link_y, limit = field
+    height, width, _ = unary.shape
+    towards = _links(link_x, link_y, height, width)
+    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
+    ahead = (towards["right"] > 0).astype(np.float32) + (towards["down"] > 0)
+    behind = (towards["left"] > 0).astype(np.float32) + (towards["up"] > 0)
+    share = np.maximum(np.maximum(ahead, behind), 1).astype(np.float32)
+    last = height + width - 2
+    forward = (range(last), 1, towards["right"], towards["down"], 2, slice(None, -1), slice(1, None))
+    backward = (range(last, 0, -1), -1, towards["left"], towards["up"], 0, slice(1, None), slice(None, -1))
+    for _ in range(rounds):
+        for diagonals, step, across, along, here, own, other in (forward, backward):
+            there = 2 - here
+            for d in diagonals:
+                n = d + step
+                received = (passed[d, :, 0] + passed[d, :, 1]) + (passed[d, :, 2] + passed[d, :, 3])
+                total = (cost[d] + received) / share[d][:, None]
+                linked = across[d] > 0
+                message = _send(total, passed[d, :, here], phases[d], phases[n], across[d], limit)
+                passed[n, linked, there] = message[linked]
+                linked = along[d, own] > 0
+                returned = passed[d, own, here + 1]
+                message = _send(total[own], returned, phases[d, own], phases[n, other], along[d, own], limit)
+                passed[n, other, there + 1][linked] = message[linked]
+    messages[:] = _straight(passed, height, width)
+
+
+def _decide(field: Field, messages: Image, choice: NDArray[np.int32], margin: Image) -> None:
+    """As `label_kernels.decide`: ``choice`` and ``margin`` (H, W) are written."""
+    unary, phase, link_x, link_y, limit = field
+    height, width, count = unary.shape
+    towards = _links(link_x, link_y, height, width)
+    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
+    labels, margins = np.zeros(cost.shape[:2], np.int32), np.zeros(cost.shape[:2], np.float32)
+    chosen_phase = np.zeros(height, np.float32)
+    for d in range(height + width - 1):
+        total = cost[d] + (passed[d, :, 2] + passed[d, :, 3])
+        if d:
+            total = total + np.minimum(np.abs(chosen_phase[:, None] - phases[d]), limit) * towards["left"][d][:, None]
+            above = np.concatenate([chosen_phase[:1], chosen_phase[:-1]])
+            total = total + np.minimum(np.abs(above[:, None] - phases[d]), limit) * towards["up"][d][:, None]
+        labels[d] = total.argmin(axis=1)
+        chosen_phase = np.take_along_axis(phases[d], labels[d][:, None].astype(np.intp), axis=1)[:, 0]
+        ordered = np.sort(total, axis=1)
+        margins[d] = ordered[:, 1] - ordered[:, 0] if count > 1 else np.inf
+    choice[:], margin[:] = _straight(labels, height, width), _straight(margins, height, width)

@@ -17,13 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
 
 WINDOW_SIGMAS = 3.0
 RIDGE = 1e-6
 """Of the window's weight, added to the diagonal: fits of a few pixels stay finite."""
 LARGEST_STEP_RAD = 0.7
 """Largest correction of the second fit: beyond it the linear model does not hold."""
+STEEPEST_RAD_PER_PX = 0.5
+"""Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
 
 
 class Window:
@@ -55,31 +57,29 @@ class FringeFit:
     weight: Image
 
 
-def solve_symmetric(matrix: list[list[Image]], right: list[Image]) -> list[Image]:
-    """Solve one small symmetric system a pixel by elimination without pivoting; ``matrix[i][j]`` for j >= i.
+def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
+    """Solve one small symmetric system a pixel by elimination without pivoting; ``rows``: from the diagonal on.
 
     Both arguments are overwritten. The windows' normal matrices are positive; `RIDGE` keeps them so in float32.
     """
     size = len(right)
-    ridge = RIDGE * matrix[0][0] + np.float32(1e-9)
-    for i in range(size):
-        matrix[i][i] = matrix[i][i] + ridge
+    ridge = RIDGE * rows[0][0] + np.float32(1e-9)
+    for row in rows:
+        row[0] = row[0] + ridge
     for i in range(size):
         for j in range(i + 1, size):
-            factor = matrix[i][j] / matrix[i][i]
+            factor = rows[i][j - i] / rows[i][0]
             for k in range(j, size):
-                matrix[j][k] = matrix[j][k] - factor * matrix[i][k]
+                rows[j][k - j] = rows[j][k - j] - factor * rows[i][k - i]
             right[j] = right[j] - factor * right[i]
-    answer: list[Image] = [right[0]] * size
     for i in reversed(range(size)):
-        total = right[i]
         for j in range(i + 1, size):
-            total = total - matrix[i][j] * answer[j]
-        answer[i] = total / matrix[i][i]
-    return answer
+            right[i] = right[i] - rows[i][j - i] * right[j]
+        right[i] = right[i] / rows[i][0]
+    return right
 
 
-def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, window: Window) -> Image:
+def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window) -> Image:
     """Phase in rad, float32 (H, W), from the five-term fit of ``grey`` around each pixel; use it inside only."""
     weight = inside.astype(np.float32)
     light = grey * weight
@@ -88,28 +88,26 @@ def carrier_fit(grey: Image, inside: NDArray[np.bool_], carrier_rad: NDArray, wi
     m = window.moment
     w00 = m(weight)
     cc = m(by_cosine * cosine)
-    unused = w00
-    matrix = [
+    rows = [
         [w00, m(weight, 1, 0), m(weight, 0, 1), m(by_cosine), m(by_sine)],
-        [unused, m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
-        [unused, unused, m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
-        [unused, unused, unused, cc, m(by_cosine * sine)],
-        [unused, unused, unused, unused, w00 - cc],
+        [m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
+        [m(weight, 0, 2), m(by_cosine, 0, 1), m(by_sine, 0, 1)],
+        [cc, m(by_cosine * sine)],
+        [w00 - cc],
     ]
     right = [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
-    answer = solve_symmetric(matrix, right)
+    answer = solve_symmetric(rows, right)
     return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
 
 
 def fringe_fit(
-    greys: Sequence[Image], inside: NDArray[np.bool_], carrier_rad: Image, ambient: float, window: Window,
+    greys: Sequence[Image], inside: Mask, carrier_rad: Image, ambient: float, window: Window,
     shifts_rad: Sequence[float] = (0.0,),
 ) -> FringeFit:  # fmt: skip
     """Fit of g (1 + cos(carrier + shift + d)), g a plane, around each pixel of ``greys``, float32 (H, W) each: one
     image, or several whose fringes are shifted by ``shifts_rad``."""
     weight = inside.astype(np.float32)
-    zero = np.zeros_like(weight)
-    rr, rs, ss, lr, ls = zero, zero, zero, zero, zero
+    rr = rs = ss = lr = ls = np.zeros_like(weight)
     for grey, shift in zip(greys, shifts_rad, strict=True):
         angle = carrier_rad + np.float32(shift)
         light = (grey - np.float32(ambient)) * weight
@@ -117,16 +115,28 @@ def fringe_fit(
         rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
         lr, ls = lr + light * raised, ls + light * sine
     m = window.moment
-    r00 = m(rr)
-    matrix = [
-        [r00, m(rr, 1, 0), m(rr, 0, 1), m(rs)],
-        [r00, m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
-        [r00, r00, m(rr, 0, 2), m(rs, 0, 1)],
-        [r00, r00, r00, m(ss)],
+    rows = [
+        [m(rr), m(rr, 1, 0), m(rr, 0, 1), m(rs)],
+        [m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
+        [m(rr, 0, 2), m(rs, 0, 1)],
+        [m(ss)],
     ]
-    right = [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)]
-    g, gx, gy, s = solve_symmetric(matrix, right)
+    g, gx, gy, s = solve_symmetric(rows, [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)])
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
     scale = np.float32(1 / window.sigma_px)
     phase = (carrier_rad + step).astype(np.float32)
     return FringeFit(phase, g, gx * scale, gy * scale, m(weight))
+
+
+def phase_slopes(residual_rad: Image, inside: Mask, smooth_px: float) -> tuple[Image, Image]:
+    """Change of the residual phase a px along x and y, float32 (H, W), averaged under a Gaussian inside the mask."""
+    size = 2 * int(np.ceil(2.5 * smooth_px)) + 1
+    weight = cv2.erode(inside.astype(np.float32), np.ones((3, 3), np.uint8))
+    total = np.maximum(cv2.GaussianBlur(weight, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT), 1e-3)
+    slopes: list[Image] = []
+    for axis in (1, 0):
+        change: NDArray = wrapped(np.roll(residual_rad, -1, axis) - np.roll(residual_rad, 1, axis)) / 2
+        change = np.clip(change, -STEEPEST_RAD_PER_PX, STEEPEST_RAD_PER_PX).astype(np.float32) * weight
+        smooth = cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT)
+        slopes.append((smooth / total).astype(np.float32))
+    return slopes[0], slopes[1]

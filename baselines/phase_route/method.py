@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement
+from fpp_ml_bench.baselines.phase_route.observation import Measurement, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
-from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics import Rig
 

@@ -1,18 +1,44 @@
 """The object mask: pixels whose grey level the empty scene does not explain.
 
+The background plane's distance is calibrated, so its phase is known at every pixel, and so is its brightness except for
+three things: ambient light, the lamp's strength, and a slow change of its sheen across the image. `EmptyScene` fits
+them to the image's own background. Pixels that then differ from the prediction by more than noise are not background.
+The lamp's strength also turns an object's brightness into distance and slope (`orders.irradiance`): the paper's plane
+and objects are of the same material.
+
 Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
 is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete:
-the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it
-(`fpp_ml_bench.baselines.phase_route.local_fit`). The prediction nearer to the pixel's grey level wins.
+the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it (`local_fit`). The
+prediction nearer to the pixel's grey level wins.
 """
+
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.empty_scene import Background
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Image, Mask
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import MIN_MODULATION
+from fpp_ml_bench.optics import Rig
 
+Crop = tuple[slice, slice]
+
+TILE_PX_PER_PERIOD = 1.1
+"""Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
+TILE_NOISE_GREY = 3.0
+"""Largest misfit of a tile that may be background: three times the benchmark's noise."""
+LEAST_SHARE = 0.02
+"""Of the image's tiles that must show background for the image to calibrate itself."""
+STRENGTH_TOLERANCE = 0.4
+"""Relative deviation of the lamp's strength in an image from the calibrated strength. A surface in the working range
+whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+SAMPLE_STEP_PX = 5
+FLOOR_NOISE_GREY = 0.3
+"""Noise of rounding to whole grey levels."""
+DEFAULT_NOISE_GREY = 1.0
+"""Noise of an image that shows no background to measure it on."""
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
@@ -27,6 +53,122 @@ LEAST_AREA_PERIODS = 0.1
 """Smallest object, and largest hole that is closed, in squares of one period."""
 
 
+@dataclass(frozen=True)
+class Background:
+    """Fit of the empty scene to one image, grey levels.
+
+    ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
+    ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
+    the calibrated constants were used; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
+    """
+
+    ambient_grey: float
+    strength: float
+    noise_grey: float
+    residual: Image
+    share: float
+    weights: tuple[float, ...]
+
+    def at(self, crop: Crop) -> "Background":
+        """The fit for a part of the image."""
+        return replace(self, residual=self.residual[crop])
+
+    @property
+    def different(self) -> Mask:
+        """Pixels (H, W) whose own grey level the empty scene does not explain."""
+        return np.abs(self.residual) > DIFFERENT_SIGMAS * self.noise_grey
+
+
+class EmptyScene:
+    """The background plane as a rig and direction show it; computed once, then fitted to every image.
+
+    ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
+    grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
+    surface in ambient light alone.
+    """
+
+    def __init__(self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float, ambient_grey: float):
+        self.ambient_grey = ambient_grey
+        self.strength = white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        self._rays = rig.camera.rays()
+        self._phase = layer.absolute_phase(rig.background_m * MM_PER_M)
+        self._fall_off = plane_irradiance(rig, rig.background_m)
+        self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
+        self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
+        self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
+        self._mean, self._square = self._tiles(self._light), self._tiles(self._light * self._light)
+
+    def fit(self, image: NDArray[np.uint8]) -> Background:
+        """Background of ``image`` uint8 (H, W)."""
+        grey = image.astype(np.float32)
+        plane_tiles = self._background_tiles(grey)
+        share = float(plane_tiles.mean())
+        if share < LEAST_SHARE:
+            residual = grey - self.ambient_grey - self.strength * self._terms[0]
+            return Background(self.ambient_grey, self.strength, DEFAULT_NOISE_GREY, residual, 0.0, (self.strength,))
+        rows, columns = (count * self._tile for count in plane_tiles.shape)
+        sampled = np.zeros(image.shape, dtype=bool)
+        sampled[:rows, :columns] = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
+        every = np.zeros_like(sampled)
+        every[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = True
+        sampled &= every
+        ones = np.ones(int(sampled.sum()))
+        terms = np.stack([ones] + [term[sampled] for term in self._terms], axis=1).astype(np.float64)
+        solution = np.linalg.lstsq(terms, grey[sampled].astype(np.float64), rcond=None)[0]
+        misfit = grey[sampled] - terms @ solution
+        noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
+        ambient_grey, *weights = solution
+        residual = grey - np.float32(ambient_grey)
+        for weight, term in zip(weights, self._terms, strict=True):
+            residual -= np.float32(weight) * term
+        return Background(float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights))
+
+    def predicted(self, background: Background, shift_rad: float, where: Crop) -> Image:
+        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose fringe is shifted by
+        ``shift_rad``, in the light that ``background`` was fitted to."""
+        terms = _quadratic(*(axis[where] for axis in self._rays))
+        lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
+        fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
+        plane = np.nan_to_num(lamp * self._fall_off[where] * fringe).astype(np.float32)
+        return np.float32(background.ambient_grey) + plane
+
+    def _tiles(self, image: NDArray) -> NDArray[np.float64]:
+        """Means over whole tiles."""
+        tile = self._tile
+        height, width = (length // tile * tile for length in image.shape)
+        rows = image[:height, :width].reshape(height, width // tile, tile).sum(axis=2, dtype=np.float64)
+        return rows.reshape(height // tile, tile, width // tile).sum(axis=1) / (tile * tile)
+
+    def _background_tiles(self, grey: Image) -> Mask:
+        """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""
+        mean, square = self._tiles(grey), self._tiles(grey * grey)
+        spread = self._square - self._mean**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self._tiles(grey * self._light) - mean * self._mean
+            slope = covariance / spread
+            misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
+            plane_tiles = (misfit < TILE_NOISE_GREY) & (spread > 1e-2 * spread.max())
+            plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
+        if not plane_tiles.any():
+            return plane_tiles
+        typical = float(np.median(slope[plane_tiles]))
+        return plane_tiles & (np.abs(slope / typical - 1) < 0.15)
+
+
+def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
+    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
+    x, y = rig.camera.rays()
+    centre = -rig.R.T @ rig.t
+    # The plane's normal is the camera's axis, however the projector is rotated.
+    from_lamp = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
+    squared = from_lamp[0] ** 2 + from_lamp[1] ** 2 + from_lamp[2] ** 2
+    return from_lamp[2] / (squared * np.sqrt(squared))
+
+
+def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
+    return np.ones_like(x), x, y, x * x, x * y, y * y
+
+
 def disk(radius_px: float) -> NDArray[np.uint8]:
     """Disk as a structuring element of odd size."""
     half = max(1, round(radius_px))
@@ -34,7 +176,13 @@ def disk(radius_px: float) -> NDArray[np.uint8]:
     return (x * x + y * y <= (half + 0.5) ** 2).astype(np.uint8)
 
 
-def without_small(mask: NDArray[np.bool_], least_px: float) -> NDArray[np.bool_]:
+def closed(mask: Mask, radius_px: float, least_px: float) -> Mask:
+    """``mask`` closed by a disk, then without objects and without holes of fewer than ``least_px`` pixels."""
+    region = without_small(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disk(radius_px)) > 0, least_px)
+    return region | ~without_small(~region, least_px)
+
+
+def without_small(mask: Mask, least_px: float) -> Mask:
     """``mask`` (H, W) without its 8-connected components of fewer than ``least_px`` pixels."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     keep = stats[:, cv2.CC_STAT_AREA] >= least_px
@@ -42,35 +190,21 @@ def without_small(mask: NDArray[np.bool_], least_px: float) -> NDArray[np.bool_]
     return keep[labels] if count > 1 else mask
 
 
-def different(background: Background) -> NDArray[np.bool_]:
-    """Pixels (H, W) whose own grey level the empty scene does not explain."""
-    return np.abs(background.residual) > DIFFERENT_SIGMAS * background.noise_grey
-
-
-def object_region(background: Background, period_px: float) -> NDArray[np.bool_]:
+def object_region(background: Background, period_px: float) -> Mask:
     """First mask (H, W): pixels that differ, closed over the stripes where object and plane are equally bright."""
-    differing = different(background).astype(np.uint8)
-    closed = cv2.morphologyEx(differing, cv2.MORPH_CLOSE, disk(CLOSING_PERIODS * period_px)) > 0
-    area = LEAST_AREA_PERIODS * period_px**2
-    region = without_small(closed, area)
-    return region | ~without_small(~region, area)
+    return closed(background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2)
 
 
-def unlit(grey: NDArray[np.float32], ambient: float, noise: float, period_px: float) -> NDArray[np.bool_]:
+def unlit(grey: Image, background: Background, period_px: float) -> Mask:
     """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first."""
     size = 2 * round(UNLIT_PERIODS * period_px / 2) + 1
     filled = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return filled < ambient + UNLIT_SIGMAS * noise
+    return filled < background.ambient_grey + UNLIT_SIGMAS * background.noise_grey
 
 
 def refined(
-    region: NDArray[np.bool_],
-    background: Background,
-    predicted: NDArray[np.float32],
-    grey: NDArray[np.float32],
-    fringe_noise: NDArray[np.floating],
-    reach_px: float,
-) -> NDArray[np.bool_]:
+    region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: NDArray, reach_px: float
+) -> Mask:
     """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette.
 
     ``predicted`` grey levels of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its
@@ -82,10 +216,9 @@ def refined(
         as_object = (grey - predicted) ** 2 / (noise**2 + fringe_noise**2)
         nearer = as_object < as_plane + OBJECT_BONUS
     ring = cv2.dilate(region.astype(np.uint8), disk(reach_px)) > 0
-    clear = different(background)
     # Pixels that differ stay. The others at the rim are object where the object's fringe explains them better.
+    clear = background.different & region
     inner = cv2.erode(region.astype(np.uint8), disk(reach_px)) > 0
-    votes = (clear & region) | inner | (ring & nearer)
-    votes = without_small(votes, 4)
+    votes = without_small(clear | inner | (ring & nearer), 4)
     smooth = cv2.medianBlur(votes.astype(np.uint8), 3) > 0
-    return (smooth | (clear & region)) & ring
+    return (smooth | clear) & ring

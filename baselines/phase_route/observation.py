@@ -1,18 +1,72 @@
-"""What the phase route measures in an image before it chooses the fringe orders."""
+"""What the phase route is asked for, what it has measured before it chooses the fringe orders, and what it answers."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 from time import perf_counter
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates
-from fpp_ml_bench.baselines.phase_route.empty_scene import Background
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
-from fpp_ml_bench.baselines.phase_route.orders import Question
+from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.render import Lighting
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
-Image = NDArray[np.float32]
-Crop = tuple[slice, slice]
+Prior = Literal["none", "standoff"]
+PRIORS: tuple[Prior, ...] = ("none", "standoff")
+PIXELWISE = 3
+"""Frames from which on every pixel has a phase of its own."""
+_POSITIVE = (
+    "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread", "white_grey",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
+    the order may use: ``shading`` and ``prior``; ``min_confidence``: pixels below it are 0 (0: dense, every object
+    pixel gets a depth). The default values were chosen on train and validation objects.
+
+    ``prior`` "standoff" assumes that objects are near the rig's standoff, which is true of fixed placement;
+    "none" leaves only the working range. Windows are in image px per fringe period: of the first fit, of the second,
+    of the last one to two frames, and of the slopes. Costs (no unit): ``shading_cost`` a pixel for each
+    ``shading_spread`` of log brightness, up to ``shading_limit`` of them; ``prior_cost`` a pixel for each 100 mm;
+    ``jump_rad``: a jump of phase between neighbours from which on it costs no more. ``slack_mm`` widens the working
+    range for noise at its ends. ``white_grey`` and ``ambient_grey`` calibrate images that show no background (see
+    `EmptyScene`).
+    """
+
+    direction: Direction = "horizontal"
+    frames: int = 1
+    shading: bool = True
+    prior: Prior = "none"
+    min_confidence: float = 0.0
+    first_window: float = 0.35
+    second_window: float = 0.27
+    pair_window: float = 0.06
+    slope_window: float = 0.13
+    shading_cost: float = 0.003
+    shading_spread: float = 0.1
+    shading_limit: float = 3.0
+    prior_cost: float = 0.002
+    jump_rad: float = 2.5
+    slack_mm: float = 15.0
+    white_grey: float = Lighting.white_grey
+    ambient_grey: float = Lighting.ambient_grey
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise PredictionError(f"direction {self.direction!r}: one fringe is {' or '.join(DIRECTIONS)}, not both")
+        if self.prior not in PRIORS:
+            raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(PRIORS)}")
+        if not 0 <= self.min_confidence < 1:
+            raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
 
 
 class Stopwatch:
@@ -29,35 +83,123 @@ class Stopwatch:
 
 
 @dataclass(frozen=True)
-class Observation:
-    """Everything measured around the object; maps (h, w) of the part ``crop`` of an image of ``shape`` (H, W).
+class Capture:
+    """Captured fringes around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W).
 
-    ``frames``: how many were captured; ``grey`` float32 grey levels of the first; ``inside``: object; ``layer``:
-    calibration layer of the crop; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase
-    in [-pi, pi]; ``residual_rad``: that phase minus the phase at infinity, wrapped; ``slopes``: its
-    change a px along x and y; ``uncertainty_rad`` float32: of the phase, order aside; ``clipped`` float32: share of
-    the window's weight that is saturated; ``candidates``: the orders that the working range allows; ``question``: the
-    same on a grid, for a `Chooser`. An image without an object has a crop of one pixel that is not ``inside``.
+    ``greys``: float32 grey levels of each frame, whose fringe is shifted by ``shifts_rad``; ``background`` and
+    ``layer``: fit of the empty scene and calibration layer, both of the crop; ``period_px``: of the fringe in the
+    image. An image without an object has a crop of one pixel.
     """
 
+    rig: Rig
+    period_px: float
     shape: tuple[int, int]
     crop: Crop
-    frames: int
+    greys: tuple[Image, ...]
+    shifts_rad: tuple[float, ...]
     background: Background
-    grey: Image
-    inside: NDArray[np.bool_]
     layer: CalibrationLayer
+    watch: Stopwatch
+
+    @property
+    def pixelwise(self) -> bool:
+        """Whether there are frames enough for every pixel to have a phase of its own."""
+        return len(self.greys) >= PIXELWISE
+
+
+@dataclass(frozen=True)
+class Question:
+    """K candidates a pixel on the grid (h, w), nearest order first: ``residual_rad``, ``depth_mm``, ``exists`` and
+    ``irradiance`` (1/m^2) are (K, h, w); ``brightness``: measured, in the same 1/m^2; ``trust`` 0 to 1: weight of the
+    brightness there (small at rims and on dark slopes); ``inside``: object; ``stride``: image px a grid step;
+    ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree.
+    """
+
+    residual_rad: Image
+    depth_mm: Image
+    exists: Mask
+    irradiance: Image
+    brightness: Image
+    trust: Image
+    inside: Mask
+    stride: int
+    period_px: float
+    smooth_x: Image | float
+    smooth_y: Image | float
+
+
+@dataclass(frozen=True)
+class Observation(Capture):
+    """Everything measured in a capture before the orders are chosen, maps (h, w).
+
+    ``inside``: object; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in
+    [-pi, pi]; ``slopes``: change of the residual phase in rad a px along x and y; ``uncertainty_rad`` float32: of the
+    phase, order aside; ``clipped_share`` float32: of the window's weight, what is saturated; ``candidates``: the orders
+    that the working range allows; ``question``: the same on a grid, for a `Chooser`.
+    """
+
+    inside: Mask
     fit: FringeFit
     phase_rad: Image
-    residual_rad: Image
     slopes: tuple[Image, Image]
     uncertainty_rad: Image
-    clipped: Image
+    clipped_share: Image
     candidates: Candidates
     question: Question
-    watch: Stopwatch
+
+    @property
+    def residual_at_zero_rad(self) -> NDArray[np.float64]:
+        """Residual phase (h, w) at order 0."""
+        residual: NDArray[np.float64] = self.layer.residual_phase(self.phase_rad, 0.0)
+        return residual
 
     @property
     def empty(self) -> bool:
         """Whether there is no object."""
         return not self.inside.any()
+
+
+class Reason(IntEnum):
+    """Why a pixel should not be trusted; of several reasons the lowest.
+
+    BACKGROUND: the empty scene explains it. LOW_MODULATION: too dark for a fringe, in shadow or turned away.
+    SATURATED: clipped grey levels in the window. OUT_OF_RANGE: no order puts it in the working range. THIN: the object
+    is thinner than half a period there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves.
+    AMBIGUOUS: the candidate orders can't be told apart. UNSURE: the expected error alone is too large.
+    """
+
+    MEASURED = 0
+    BACKGROUND = 1
+    LOW_MODULATION = 2
+    SATURATED = 3
+    OUT_OF_RANGE = 4
+    THIN = 5
+    TOO_STEEP = 6
+    AMBIGUOUS = 7
+    UNSURE = 8
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Maps (H, W) of one image; NaN or 0 where there is no object.
+
+    ``wrapped_phase_rad`` float32 in [-pi, pi]; ``modulation_grey`` float32 grey levels; ``order`` int32;
+    ``candidates``: the orders that the working range allows; ``confidence`` float32, 0 to 1, computed from
+    ``expected_error_mm`` float32; ``order_doubt_mm``: the part of that error that comes from the order; ``depth_mm``
+    float32, 0 = background or masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked or not;
+    ``counts``: pixels per reason; ``background_share``: of the image's tiles that calibrated its brightness;
+    ``seconds`` per stage.
+    """
+
+    wrapped_phase_rad: Image
+    modulation_grey: Image
+    order: NDArray[np.int32]
+    candidates: Candidates
+    confidence: Image
+    expected_error_mm: Image
+    order_doubt_mm: Image
+    depth_mm: Image
+    reason: NDArray[np.uint8]
+    counts: dict[str, int]
+    background_share: float
+    seconds: dict[str, float]

@@ -9,29 +9,29 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import confidence, orders
-from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, orders_in_range
-from fpp_ml_bench.baselines.phase_route.empty_scene import Background, EmptyScene
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit
-from fpp_ml_bench.baselines.phase_route.measurement import Measurement, Reason
-from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, object_region, refined, unlit
-from fpp_ml_bench.baselines.phase_route.observation import Crop, Observation, Stopwatch
-from fpp_ml_bench.baselines.phase_route.settings import Settings
-from fpp_ml_bench.baselines.phase_route.several_frames import (
-    PIXELWISE,
-    differs,
-    first_mask,
-    measure_pixels,
-    pair_fit,
-    pixel_uncertainty_rad,
-    steps_of,
+from fpp_ml_bench.baselines.phase_route import confidence, orders, several_frames
+from fpp_ml_bench.baselines.phase_route.calibration_layer import (
+    CalibrationLayer,
+    Candidates,
+    Image,
+    Mask,
+    orders_in_range,
+    wrapped,
 )
-from fpp_ml_bench.baselines.phase_route.shading import phase_slopes, wrapped
+from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, phase_slopes
+from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, Crop, EmptyScene, object_region, refined, unlit
+from fpp_ml_bench.baselines.phase_route.observation import (
+    Capture,
+    Measurement,
+    Observation,
+    Reason,
+    Settings,
+    Stopwatch,
+)
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
-Image = NDArray[np.float32]
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 MARGIN_PERIODS = 0.5
@@ -51,33 +51,27 @@ class PhaseRoute:
         self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness
     ) -> None:
         self.rig, self.settings, self.chooser = rig, settings or Settings(), chooser
-        direction = self.settings.direction
-        self.layer = CalibrationLayer.of(rig, direction)
-        self.period_px = rig.image_px_per_period(direction)
+        settings = self.settings
+        self.layer = CalibrationLayer.of(rig, settings.direction)
+        self.period_px = rig.image_px_per_period(settings.direction)
         rig.check_sampling()
-        self._scene = EmptyScene(rig, self.layer, self.period_px, self.settings.white_grey, self.settings.ambient_grey)
+        self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
-        self._windows = [
-            Window(share * self.period_px) for share in (self.settings.first_window, self.settings.second_window)
-        ]
-        self.steps = steps_of(rig.sequence.steps, self.settings.frames)
+        self._windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
+        self.steps = several_frames.steps_of(rig.sequence.steps, settings.frames)
         self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
-        if self.settings.frames == 2:
-            self._windows += [Window(self.settings.pair_window * self.period_px)] * PAIR_ROUNDS
+        if settings.frames == 2:
+            self._windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
-    def measure(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Measurement:
+    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
         """Depth and the maps behind it, from one captured fringe, uint8 (H, W), or from the frames of ``steps``.
 
         ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
         """
         observation = self.observe(image, mask)
-        choice, margin = self.chooser(observation.question, self.rig, self.settings)
-        order, margin = orders.spread_over_pixels(
-            observation.question, choice, margin, observation.layer.residual_phase(observation.phase_rad, 0.0)
-        )
-        return self.conclude(observation, order, margin)
+        return self.conclude(observation, *self.choose(observation))
 
-    def observe(self, image: Frames, mask: NDArray[np.bool_] | None = None) -> Observation:
+    def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask, phase and candidate orders of captured fringes; arguments as of `measure`."""
         images = self._checked(image)
         watch = Stopwatch()
@@ -86,39 +80,85 @@ class PhaseRoute:
         region = object_region(background, self.period_px) if mask is None else mask
         crop = self._crop(region)
         watch.done("mask")
-        greys = [frame[crop].astype(np.float32) for frame in images]
-        crop_mask = None if mask is None else mask[crop]
-        layer = self.layer.at(crop)
+        capture = Capture(
+            self.rig, self.period_px, (region.shape[0], region.shape[1]), crop,
+            tuple(frame[crop].astype(np.float32) for frame in images), self.shifts_rad, background.at(crop),
+            self.layer.at(crop), watch,
+        )  # fmt: skip
+        given = None if mask is None else mask[crop]
         mean_grey = None
-        if len(greys) < PIXELWISE:
-            inside, fit = self._local_fits(greys, region[crop], crop_mask, background, crop, watch)
+        if capture.pixelwise:
+            inside, fit, mean_grey = several_frames.pixel_fits(capture, self._scene, given, self._windows[1])
         else:
-            inside, fit, mean_grey = measure_pixels(
-                greys, self.shifts_rad, crop_mask, self._scene, background, crop, self._windows[1], self.period_px,
-                watch,
-            )  # fmt: skip
+            inside, fit = self._local_fits(capture, region[crop], given)
         phase = wrapped(fit.phase_rad).astype(np.float32)
-        residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
+        residual = wrapped(phase - capture.layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
         near, far = self.rig.working_range_mm
         slack = self.settings.slack_mm
-        candidates = orders_in_range(layer, phase, (near - slack, far + slack))
-        question = orders.question_of(
-            phase, fit, slopes, candidates, inside, layer, self.rig, crop, background.strength, self.period_px,
-            sharp=mean_grey is not None,
-        )  # fmt: skip
+        candidates = orders_in_range(capture.layer, phase, (near - slack, far + slack))
+        question = orders.question_of(capture, phase, fit, slopes, candidates, inside)
         watch.done("candidates")
         if mean_grey is None:
-            uncertainty = confidence.phase_uncertainty_rad(greys[0], fit, inside, slopes, background, self._windows[-1])
+            uncertainty = confidence.fit_uncertainty_rad(capture, fit, inside, slopes, self._windows[-1])
         else:
-            uncertainty = pixel_uncertainty_rad(fit, mean_grey, self.shifts_rad, background)
-        clipped = confidence.clipped_share(greys, fit, inside, self._windows[1])
+            uncertainty = confidence.pixel_uncertainty_rad(capture, fit, mean_grey)
+        clipped = confidence.clipped_share(capture, fit, inside, self._windows[1])
         watch.done("confidence")
-        shape = images[0].shape
         return Observation(
-            (shape[0], shape[1]), crop, len(greys), background, greys[0], inside, layer, fit, phase, residual, slopes,
-            uncertainty, clipped, candidates, question, watch,
+            **vars(capture), inside=inside, fit=fit, phase_rad=phase, slopes=slopes, uncertainty_rad=uncertainty,
+            clipped_share=clipped, candidates=candidates, question=question,
         )  # fmt: skip
+
+    def choose(self, observation: Observation) -> tuple[NDArray[np.int32], Image]:
+        """The chooser's order of every pixel of the observation's crop (h, w), and its margin."""
+        choice, margin = self.chooser(observation.question, self.rig, self.settings)
+        return orders.spread_over_pixels(observation.question, choice, margin, observation.residual_at_zero_rad)
+
+    def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
+        """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
+        ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
+
+        Raises `DecodeError` for shapes that are not the crop's."""
+        inside, watch = observation.inside, observation.watch
+        if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
+            raise DecodeError(
+                f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the "
+                f"object, got {np.shape(order)} and {np.shape(margin)}"
+            )
+        watch.done("order")
+        depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
+        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
+        watch.done("depth")
+        error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
+        sureness = confidence.confidence_of(error_mm)
+        reason = confidence.reasons(observation, margin, sureness, depth_mm, self.settings)
+        watch.done("confidence")
+
+        def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
+            image: NDArray = np.full(observation.shape, outside, dtype=dtype)
+            image[observation.crop] = np.where(inside, part, outside)
+            return image
+
+        least, allowed = self.settings.min_confidence, observation.candidates
+        reasons = paste(reason, np.uint8, Reason.BACKGROUND)
+        counts = np.bincount(reasons.ravel(), minlength=len(Reason))
+        measurement = Measurement(
+            wrapped_phase_rad=paste(observation.phase_rad, np.float32, np.nan),
+            modulation_grey=paste(observation.fit.brightness, np.float32, 0),
+            order=paste(order, np.int32, 0),
+            candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
+            confidence=paste(sureness, np.float32, 0),
+            expected_error_mm=paste(error_mm, np.float32, 0),
+            order_doubt_mm=paste(doubt_mm, np.float32, 0),
+            depth_mm=paste(depth_mm if least == 0 else depth_mm * (sureness >= least), np.float32, 0),
+            reason=reasons,
+            counts={code.name.lower(): int(counts[code]) for code in Reason},
+            background_share=observation.background.share,
+            seconds=watch.seconds,
+        )
+        watch.done("depth")
+        return measurement
 
     def _checked(self, image: Frames) -> list[NDArray[np.uint8]]:
         """The frames, as many as the settings say."""
@@ -134,58 +174,7 @@ class PhaseRoute:
                 )
         return images
 
-    def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
-        """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
-        ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
-
-        Raises `DecodeError` for shapes that are not the crop's."""
-        if np.shape(order) != observation.inside.shape or np.shape(margin) != observation.inside.shape:
-            raise DecodeError(
-                f"expected an order and a margin for each of the {observation.inside.shape} pixels (h, w) around the "
-                f"object, got {np.shape(order)} and {np.shape(margin)}"
-            )
-        observation.watch.done("order")
-        depth_mm = np.where(observation.inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
-        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
-        observation.watch.done("depth")
-        error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
-        confidence_map = confidence.confidence_of(error_mm)
-        reason = confidence.reasons(
-            observation, margin, confidence_map, depth_mm, self.rig, self.settings, self.period_px
-        )
-        observation.watch.done("confidence")
-        return self._full_image(observation, order, confidence_map, error_mm, doubt_mm, depth_mm, reason)
-
-    def _local_fits(
-        self, greys: Sequence[Image], region: NDArray[np.bool_], mask: NDArray[np.bool_] | None, background: Background,
-        crop: Crop, watch: Stopwatch,
-    ) -> tuple[NDArray[np.bool_], FringeFit]:  # fmt: skip
-        """Object mask and local fits of one or two frames; ``region``: where the first of them differs."""
-        if mask is not None:
-            fit = self.fit_phase(greys, mask, self._carrier[crop], background)
-            watch.done("phase")
-            return mask, fit
-        dark = unlit(np.maximum.reduce(greys), background.ambient_grey, background.noise_grey, self.period_px)
-        if len(greys) > 1:
-            region = first_mask(differs(greys, self.shifts_rad, self._scene, background, crop), self.period_px)
-        inside = region & ~dark
-        watch.done("mask")
-        fit = self.fit_phase(greys, inside, self._carrier[crop], background)
-        watch.done("phase")
-        if len(greys) == 1:
-            inside = self._refine(greys[0], inside, fit, background, crop)
-        inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
-        watch.done("mask")
-        return inside, fit
-
-    def fit_phase(
-        self, greys: Sequence[Image], inside: NDArray[np.bool_], carrier: NDArray, background: Background
-    ) -> FringeFit:
-        """The local fits to one or two frames; arrays (h, w) of one part of the image."""
-        first = carrier_fit(greys[0], inside, carrier, self._windows[0])
-        return pair_fit(greys, self.shifts_rad, inside, first, background.ambient_grey, self._windows[1:])
-
-    def _crop(self, region: NDArray[np.bool_]) -> Crop:
+    def _crop(self, region: Mask) -> Crop:
         rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
         if not rows.size:
             return slice(0, 1), slice(0, 1)
@@ -196,48 +185,32 @@ class PhaseRoute:
             slice(max(int(columns[0]) - pad, 0), min(int(columns[-1]) + pad + 1, width)),
         )
 
-    def _refine(
-        self, grey: NDArray[np.float32], inside: NDArray[np.bool_], fit: FringeFit, background: Background, crop: Crop
-    ) -> NDArray[np.bool_]:
-        bright = np.maximum(fit.brightness, 0)
-        predicted = background.ambient_grey + bright * (1 + np.cos(fit.phase_rad))
-        part = Background(
-            background.ambient_grey, background.strength, background.noise_grey, background.residual[crop],
-            background.share,
-        )  # fmt: skip
-        return refined(
-            inside, part, predicted.astype(np.float32), grey, FRINGE_NOISE * bright, RING_PERIODS * self.period_px
-        )
+    def _local_fits(self, capture: Capture, region: Mask, mask: Mask | None) -> tuple[Mask, FringeFit]:
+        """Object mask (or ``mask``) and local fits of one or two frames; ``region``: where the first of them
+        differs."""
+        greys, background, watch = capture.greys, capture.background, capture.watch
+        if mask is not None:
+            fit = self._fit_phase(capture, mask)
+            watch.done("phase")
+            return mask, fit
+        dark = unlit(np.maximum.reduce(greys), background, self.period_px)
+        if len(greys) > 1:
+            region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+        inside = region & ~dark
+        watch.done("mask")
+        fit = self._fit_phase(capture, inside)
+        watch.done("phase")
+        if len(greys) == 1:
+            bright = np.maximum(fit.brightness, 0)
+            predicted = (background.ambient_grey + bright * (1 + np.cos(fit.phase_rad))).astype(np.float32)
+            reach_px = RING_PERIODS * self.period_px
+            inside = refined(inside, background, predicted, greys[0], FRINGE_NOISE * bright, reach_px)
+        inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
+        watch.done("mask")
+        return inside, fit
 
-    def _full_image(
-        self, observation: Observation, order: NDArray[np.int32], confidence_map: NDArray, error_mm: NDArray,
-        doubt_mm: NDArray, depth_mm: NDArray, reason: NDArray[np.uint8],
-    ) -> Measurement:  # fmt: skip
-        """Maps of the whole image from those of the crop."""
-
-        def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
-            image: NDArray = np.full(observation.shape, outside, dtype=dtype)
-            image[observation.crop] = np.where(observation.inside, part, outside)
-            return image
-
-        least = self.settings.min_confidence
-        masked_mm = depth_mm if least == 0 else depth_mm * (confidence_map >= least)
-        reasons = paste(reason, np.uint8, Reason.BACKGROUND)
-        counts = np.bincount(reasons.ravel(), minlength=len(Reason))
-        allowed = observation.candidates
-        measurement = Measurement(
-            wrapped_phase=paste(observation.phase_rad, np.float32, np.nan),
-            modulation=paste(observation.fit.brightness, np.float32, 0),
-            order=paste(order, np.int32, 0),
-            candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
-            confidence=paste(confidence_map, np.float32, 0),
-            expected_error_mm=paste(error_mm, np.float32, 0),
-            order_doubt_mm=paste(doubt_mm, np.float32, 0),
-            depth_mm=paste(masked_mm, np.float32, 0),
-            reason=reasons,
-            counts={code.name.lower(): int(counts[code]) for code in Reason},
-            background_share=observation.background.share,
-            seconds=observation.watch.seconds,
-        )
-        observation.watch.done("depth")
-        return measurement
+    def _fit_phase(self, capture: Capture, inside: Mask) -> FringeFit:
+        """The local fits to one or two frames."""
+        greys, ambient_grey = capture.greys, capture.background.ambient_grey
+        first = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
+        return several_frames.pair_fit(greys, capture.shifts_rad, inside, first, ambient_grey, self._windows[1:])

@@ -1,15 +1,17 @@
 """``fpp-bench publish``: the dataset, the leaderboard's page or results on the Hugging Face Hub."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from fpp_ml_bench import leaderboard, loaders
 from fpp_ml_bench.errors import PublishError
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.machine import usable_cores
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.hub import Change, Publication, Remote
-    from fpp_ml_bench.loaders.hub_client import Hub
+    from fpp_ml_bench.loaders.hub import Hub, Kind, Publication, Remote
 
 SUMMARY = "Publish a dataset, the leaderboard's page or results on the Hugging Face Hub; sends only what changed."
 EXAMPLES = (
@@ -30,11 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     dataset.add_argument("--private", action="store_true", help="make the repository private if it is new")
     dataset.add_argument("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
     dataset.add_argument(
-        "--staging",
-        type=Path,
-        metavar="DIR",
+        "--staging", type=Path, metavar="DIR",
         help="put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
-    )
+    )  # fmt: skip
 
     page = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
     page.add_argument(
@@ -68,32 +68,27 @@ def _part(kinds: "argparse._SubParsersAction", name: str, summary: str, adopt: b
 
 def run(args: argparse.Namespace) -> int:
     """Publish. Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
-    from fpp_ml_bench.loaders.hub_client import Hub, check_repo_name
-
-    check_repo_name(args.repo)
-    if getattr(args, "dataset_repo", None) is not None:
-        check_repo_name(args.dataset_repo)
-    steps: dict[str, Callable[[argparse.Namespace, Hub], int]] = {
-        "dataset": _dataset, "leaderboard": _leaderboard, "results": _results,
-    }  # fmt: skip
-    return steps[args.what](args, Hub())
+    for repo in (args.repo, getattr(args, "dataset_repo", None)):
+        if repo is not None:
+            loaders.hub.check_repo_name(repo)
+    steps = {"dataset": _dataset, "leaderboard": _leaderboard, "results": _results}
+    return steps[args.what](args, loaders.hub.Hub())
 
 
 def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
     from fpp_ml_bench.cli.console import progress_bar
-    from fpp_ml_bench.leaderboard.publish_dataset import dataset_licence, stage_dataset
-    from fpp_ml_bench.loaders.hub_staging import staging_folder
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-    from fpp_ml_bench.machine import usable_cores
 
-    dataset = DatasetFolder(args.dataset)
-    licence = dataset_licence(dataset, args.license)
+    dataset = loaders.DatasetFolder(args.dataset)
+    licence = loaders.hub_dataset.dataset_licence(dataset, args.license)
     remote = _remote(args, hub, "dataset")
+    texts = leaderboard.publish.dataset_texts(dataset, args.repo, licence)
     rows = sum(len(samples) for samples in dataset.splits.values())
-    with staging_folder(args.staging, dataset.fingerprint) as folder:
+    with loaders.hub_dataset.staging_folder(args.staging, dataset.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                publication = stage_dataset(dataset, args.repo, folder, licence, usable_cores(), advance)
+                publication = loaders.hub_dataset.stage_dataset(
+                    dataset, args.repo, folder, texts, usable_cores(), advance
+                )
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some space, or give a "
@@ -103,38 +98,30 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
 
 
 def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
-    from tempfile import TemporaryDirectory
-
-    from fpp_ml_bench.leaderboard.publish_page import stage_page, write_page_of
-
     if args.page is not None and args.results:
         raise PublishError("expected result files or --page, got both; give one of them")
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
         if args.page is None:
-            write_page_of(args.results, Path(written))
-        publication = stage_page(args.page or Path(written), args.repo, Path(folder), args.dataset_repo)
+            leaderboard.publish.write_page_of(args.results, Path(written))
+        page = args.page or Path(written)
+        publication = leaderboard.publish.stage_page(page, args.repo, Path(folder), args.dataset_repo)
         return _carry_out(args, hub, publication, _remote(args, hub, "space"))
 
 
 def _results(args: argparse.Namespace, hub: "Hub") -> int:
-    from tempfile import TemporaryDirectory
-
-    from fpp_ml_bench.leaderboard.publish_results import stage_results
-
     remote = _remote(args, hub, "model")
     dataset = hub.state("dataset", args.dataset_repo)
-    published = hub.mark("dataset", args.dataset_repo, dataset)
+    about = hub.mark("dataset", args.dataset_repo, dataset)
+    scored_on = leaderboard.publish.ScoredOn(args.dataset_repo, dataset.commit or "", about, args.source_url)
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
-        publication = stage_results(
-            args.results, args.repo, args.dataset_repo, published, dataset.commit or "", Path(folder), args.source_url
-        )
+        publication = leaderboard.publish.stage_results(args.results, args.repo, scored_on, Path(folder))
         return _carry_out(args, hub, publication, remote)
 
 
-def _remote(args: argparse.Namespace, hub: "Hub", kind: str) -> "Remote":
+def _remote(args: argparse.Namespace, hub: "Hub", kind: "Kind") -> "Remote":
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if args.dry_run else hub.check_token()
-    remote = hub.state(kind, args.repo)  # type: ignore[arg-type]
+    remote = hub.state(kind, args.repo)
     if not remote.exists and kind == "model":
         raise PublishError(f"{args.repo}: no such model on {hub.endpoint}, or this token may not see it; make it first")
     if not remote.exists and not args.dry_run:
@@ -146,42 +133,27 @@ def _remote(args: argparse.Namespace, hub: "Hub", kind: str) -> "Remote":
 
 def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication", remote: "Remote") -> int:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
-    from fpp_ml_bench.cli.console import progress_bar
-    from fpp_ml_bench.loaders.hub import changes, check_replaceable
+    from fpp_ml_bench.cli.console import gigabytes, progress_bar
 
-    check_replaceable(publication, remote, getattr(args, "adopt", False))
-    planned = changes(publication, remote)
-    _show(args, hub, publication, remote, planned)
+    private = getattr(args, "private", False)
+    loaders.hub.check_replaceable(publication, remote, getattr(args, "adopt", False))
+    planned = loaders.hub.changes(publication, remote)
+    visibility = "private" if (remote.private if remote.exists else private) else "public"
+    kind = publication.kind
+    print(f"{kind} {hub.url(kind, publication.repo)} ({'' if remote.exists else 'new, '}{visibility})")
+    for change in planned:
+        size = gigabytes(change.bytes)
+        print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")
+    bytes_of = {status: [change.bytes for change in planned if change.status == status] for status in _SIGNS}
+    counts = [f"{len(sizes)} {status} ({gigabytes(sum(sizes))})" for status, sizes in bytes_of.items() if sizes]
+    print(f"{len(planned)} files: {', '.join(counts)}")
     if all(change.status == "unchanged" for change in planned):
         print("Nothing to send: the Hub has all files.")
         return 0
     if args.dry_run:
         print("Dry run: nothing was sent.")
         return 0
-    sending = [change for change in planned if change.status in ("new", "changed")]
-    with progress_bar("sending", sum(change.bytes for change in sending), "bytes") as advance:
-        url = hub.send(publication, planned, remote, getattr(args, "private", False), advance)
+    with progress_bar("sending", sum(bytes_of["new"] + bytes_of["changed"]), "bytes") as advance:
+        url = hub.send(publication, planned, remote, private, advance)
     print(f"Published: {url}")
     return 0
-
-
-def _show(
-    args: argparse.Namespace, hub: "Hub", publication: "Publication", remote: "Remote", planned: "list[Change]"
-) -> None:
-    from fpp_ml_bench.cli.console import gigabytes
-    from fpp_ml_bench.files import printable
-
-    if remote.exists:
-        visibility = "private" if remote.private else "public"
-    else:
-        visibility = "new, private" if getattr(args, "private", False) else "new, public"
-    print(f"{publication.kind} {hub.url(publication.kind, publication.repo)} ({visibility})")
-    for change in planned:
-        size = gigabytes(change.bytes)
-        print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")
-    counts = []
-    for status in _SIGNS:
-        sizes = [change.bytes for change in planned if change.status == status]
-        if sizes:
-            counts.append(f"{len(sizes)} {status} ({gigabytes(sum(sizes))})")
-    print(f"{len(planned)} files: {', '.join(counts)}")

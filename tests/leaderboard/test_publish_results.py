@@ -9,15 +9,15 @@ import pytest
 import yaml
 from hub_server import Repo, git_sha1
 from huggingface_hub import parse_eval_result_entries
+from huggingface_hub.hf_api import RepoFile
 from publishing import SIZE, listed, running_hub
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.leaderboard.publish_tasks import score
-from fpp_ml_bench.loaders.hub import Change, Publication, Remote, RemoteFile, changes
-from fpp_ml_bench.loaders.hub_client import check_repo_name
+from fpp_ml_bench.leaderboard.publish import score
+from fpp_ml_bench.loaders.hub import Change, Publication, Remote, changes, check_repo_name
 from fpp_ml_bench.loaders.storage import preview
 
 HOSTILE = "</script>: [*x]({y}) | `z` - !!python/object:os.system"
@@ -60,15 +60,8 @@ def entry(client, repo: str, task: str):
 
 def test_results_parse_back(client, scored):
     client.server.repos["models", "alice/unet"] = Repo(files={"README.md": b"card", ".eval_results/hle.yaml": b"[]"})
-    call = [
-        "results",
-        str(scored["good"]),
-        str(scored["many"]),
-        "--repo",
-        "alice/unet",
-        "--dataset-repo",
-        "alice/scored",
-    ]
+    call = ["results", str(scored["good"]), str(scored["many"]), "--repo", "alice/unet"]
+    call += ["--dataset-repo", "alice/scored"]
     client.server.writes()
     dry = client.good([*call, "--dry-run", "--source-url", "https://example.org/page"])
     assert client.server.writes() == []
@@ -214,14 +207,15 @@ def test_changes_compare_with_the_hashes_the_hub_keeps(tmp_path):
     for name, content in {"same.txt": b"1", "same.bin": b"2", "other.txt": b"3", "d/new.txt": b""}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(content)
-    stored = {
-        "same.txt": RemoteFile("same.txt", 1, "56a6051ca2b02b04ef92d5150c9ef600403cb1de"),  # git hash-object of "1"
-        "same.bin": RemoteFile("same.bin", 1, "0" * 40, hashlib.sha256(b"2").hexdigest()),
-        "other.txt": RemoteFile("other.txt", 1, git_sha1(b"4")),
-        "d/gone.txt": RemoteFile("d/gone.txt", 7, git_sha1(b"")),
-        "kept.txt": RemoteFile("kept.txt", 8, git_sha1(b"")),
-    }
-    remote = Remote("c" * 40, files=stored)
+    large = {"oid": hashlib.sha256(b"2").hexdigest(), "size": 1, "pointerSize": 130}
+    stored = [
+        RepoFile(path="same.txt", size=1, oid="56a6051ca2b02b04ef92d5150c9ef600403cb1de"),  # git hash-object of "1"
+        RepoFile(path="same.bin", size=1, oid="0" * 40, lfs=large),
+        RepoFile(path="other.txt", size=1, oid=git_sha1(b"4")),
+        RepoFile(path="d/gone.txt", size=7, oid=git_sha1(b"")),
+        RepoFile(path="kept.txt", size=8, oid=git_sha1(b"")),
+    ]
+    remote = Remote("c" * 40, files={file.path: file for file in stored})
     assert changes(Publication("dataset", "a/b", tmp_path, "m", owned=("d/",)), remote) == [
         Change("deleted", "d/gone.txt", 7), Change("new", "d/new.txt", 0), Change("changed", "other.txt", 1),
         Change("unchanged", "same.bin", 1), Change("unchanged", "same.txt", 1),

@@ -19,7 +19,7 @@ from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
 from fpp_ml_bench.evaluation.result import read_result, result_json, write_result
 from fpp_ml_bench.evaluation.score import differences, evaluate
 from fpp_ml_bench.evaluation.submission import Submission, read_submission
-from fpp_ml_bench.leaderboard.publish_tasks import task_of
+from fpp_ml_bench.leaderboard.publish import task_of
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from flat_planes import plane_depth_m, plane_fringe
-from test_phase_route import OTHER_RIG, photograph
+from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.method import method
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
@@ -17,9 +16,6 @@ from fpp_ml_bench.baselines.phase_network.weights import load_net
 from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Settings
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
 from fpp_ml_bench.optics import Rig, paper_rig
-
-RIG = paper_rig(480)
-FIRST = {"horizontal": 0, "vertical": 18}
 
 
 def part_of(rig: Rig, size: int) -> Rig:

@@ -9,12 +9,11 @@ import pytest
 import torch
 from flat_planes import plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Rotation
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.recipe import Recipe
-from fpp_ml_bench.baselines.phase_network.samples import Geometry, Sample, sample_of
+from fpp_ml_bench.baselines.phase_network.samples import Sample, companions, sample_of, united
 from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, train
-from fpp_ml_bench.baselines.phase_network.unions import companions, united
 from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import Settings

@@ -106,7 +106,7 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
     measurement = made(frames, direction).measure(plane(1.8, direction))
     middle = (slice(150, 330), slice(150, 330))
     error = (measurement.depth_mm - 1800)[middle].astype(np.float64)
-    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation[middle].mean()), 1.0)
+    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation_grey[middle].mean()), 1.0)
     # Rounding adds a twelfth of a squared level to the noise; unequal steps weigh noise a little unevenly.
     assert 0.9 < error.std() / expected < 1.15
     assert abs(error.mean()) < 3 * expected / 180 + 0.05
@@ -119,7 +119,7 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
 @pytest.mark.parametrize("frames", [2, 3])
 def test_a_plane_is_at_its_distance_without_gray_code(frames: int, distance_m: float) -> None:
     measurement = made(frames).measure(plane(distance_m))
-    lit = measurement.modulation > 5
+    lit = measurement.modulation_grey > 5
     assert lit.mean() > 0.7
     assert np.abs(measurement.depth_mm - distance_m * 1000)[lit].mean() < 1.5
 

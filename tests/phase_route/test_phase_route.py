@@ -5,31 +5,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from flat_planes import plane_depth_m, plane_fringe
+from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.method import method
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+from fpp_ml_bench.baselines.phase_route.observation import Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
-from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.loaders.render import BuildSettings, Lighting, Studio
-from fpp_ml_bench.loaders.storage import Row
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.loaders.render import Lighting
+from fpp_ml_bench.optics import Rig
 
-SIZE = 480
-RIG = paper_rig(SIZE)
-FIRST = {"horizontal": 0, "vertical": 18}
-OTHER_RIG = replace(
-    RIG,
-    translation_m=(0.22, -0.16, 0.0),
-    pitch_horizontal_px=24.0,
-    pitch_vertical_px=27.0,
-    working_range_mm=(1400.0, 2200.0),
-    background_m=2.9,
-)
-
-
+SIZE = RIG.camera.width
 ANGLE = np.deg2rad(5.0)
 TURNED_RIG = replace(
     RIG,
@@ -43,15 +30,6 @@ def route(direction: str, rig: Rig = RIG, **options: object) -> PhaseRoute:
     return PhaseRoute(rig, Settings(direction=direction, **options))  # type: ignore[arg-type]
 
 
-@cache
-def photograph(name: str, view: str, rig: Rig = RIG) -> Row:
-    from fpp_ml_bench.loaders.render import solid_mesh
-
-    studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied"))
-    row = studio.photograph(solid_mesh(name), view)
-    return replace(row, frames={index: frame.copy() for index, frame in row.frames.items()})
-
-
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("distance_m", [1.5, 1.8, 2.1])
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
@@ -60,7 +38,7 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
     depth_m = plane_depth_m(rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt)
     for exact_m, slope in ((plane_depth_m(rig, distance_m), (0.0, 0.0)), (depth_m, tilt)):
         measurement = route(direction, rig).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
-        lit = measurement.modulation > 5
+        lit = measurement.modulation_grey > 5
         assert lit.mean() > 0.7  # the projector's field ends before the camera's
         error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
         assert error.mean() < 1.0
@@ -70,7 +48,7 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
 def test_a_projector_that_is_turned_and_ahead() -> None:
     exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
     measurement = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
-    lit = measurement.modulation > 5
+    lit = measurement.modulation_grey > 5
     assert lit.mean() > 0.7
     assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
@@ -85,7 +63,7 @@ def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
         spread[noise] = error.std()
         sigma_px = Settings().second_window * RIG.image_px_per_period("vertical")
         averaged = int(4 * np.pi * sigma_px**2)
-        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation[middle].mean(), noise)
+        predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation_grey[middle].mean(), noise)
         # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice the even spread.
         assert 0.6 * predicted < spread[noise] < 2.5 * predicted
     assert 2.2 < spread[3.0] / spread[1.0] < 4
@@ -131,7 +109,7 @@ def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
     measurement = random_route.measure(photograph("cork", "A60").frames[0])
     on_object = measurement.depth_mm > 0
     layer = random_route.layer.at(on_object)
-    again = layer.depth_mm(measurement.wrapped_phase[on_object].astype(np.float64), measurement.order[on_object])
+    again = layer.depth_mm(measurement.wrapped_phase_rad[on_object].astype(np.float64), measurement.order[on_object])
     assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
 
 
@@ -154,7 +132,7 @@ def test_saturated_ambiguous_and_thin_are_said() -> None:
     assert blind.counts["ambiguous"] > 0.5 * image.size
     assert blind.confidence.max() < 0.2
     near = route("horizontal", shading=False, prior="standoff").measure(image)
-    lit = near.modulation > 5
+    lit = near.modulation_grey > 5
     assert np.abs(near.depth_mm - 1800)[lit].mean() < 1
     pole = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m)).copy()
     pole[100:380, 240:244] = image[100:380, 240:244]
@@ -170,7 +148,7 @@ def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     rig = replace(RIG, working_range_mm=span, pitch_vertical_px=pitch, sequence=sequence)
     image = plane_fringe(rig, 18, plane_depth_m(rig, 1.8))
     measurement = route("vertical", rig).measure(image)
-    lit = measurement.modulation > 5
+    lit = measurement.modulation_grey > 5
     assert measurement.candidates.most in ((1, 2) if pitch == 18 else (10, 11))
     assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1
 

@@ -1,0 +1,1 @@
+from . import publish as publish

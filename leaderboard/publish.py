@@ -1,0 +1,275 @@
+"""What the leaderboard puts on the Hub: the benchmark's registration, its page, and results.
+
+A dataset's repository registers the benchmark's tasks; the page becomes a static Space; results become
+``.eval_results/*.yaml`` of a model's repository, from which the Hub fills its benchmark table.
+
+The Hub ranks by the greatest value and knows no unit. So an error becomes a score between 0 and 100,
+
+    score = 100 / (1 + object MAE / 10 mm),
+
+which falls strictly with the error (0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1); the millimetres are in the notes.
+Own definition; 10 mm is the widest tolerance that this benchmark counts pixels within.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.errors import PublishError
+from fpp_ml_bench.evaluation.protocol import Track
+from fpp_ml_bench.evaluation.report import millimetres, percent
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard.export import markdown_text
+from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
+from fpp_ml_bench.leaderboard.paper import chosen_tables
+from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.tradeoff import shipped_tradeoff
+from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
+from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
+from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
+from fpp_ml_bench.loaders.storage import PREVIEW, DatasetFolder
+from fpp_ml_bench.optics import CONFIGS
+
+FRAMEWORK = "fpp-ml-bench"
+SPLIT, TARGET, MODE = "test", "depth", "standard"
+SCORE_HALF_MM = 10.0
+SCORE_TEXT = "score = 100 / (1 + object MAE / 10 mm), higher is better"
+_SCORE_DIGITS = 6
+CARD_FILE, EVAL_FILE, RESULT_FOLDER = "README.md", "eval.yaml", ".eval_results"
+_SUFFIXES = {
+    ".html", ".css", ".js", ".mjs", ".json", ".csv", ".txt", ".svg", ".png", ".jpg", ".webp", ".avif", ".ico", ".woff2",
+}  # fmt: skip
+_LARGEST_BYTES = 1 << 30
+_BODY = """\
+# FPP-ML-Bench: single-shot fringe projection profilometry
+
+{rows} samples of {height} x {width} px ({origin} data): what a structured-light camera sees of an object under
+projected fringes, and the depth of every pixel. No object is in two splits.
+
+| split | samples | objects |
+| --- | ---: | --- |
+{splits}
+
+```python
+import datasets
+
+rows = datasets.load_dataset("{repo}", "{config}", split="{split}").with_format("numpy")
+```
+
+| column | content |
+| --- | --- |
+| `frame_NN` | captured frame, 8-bit grey PNG; `frame_00` is the single-shot input |
+| `depth` | float32 (H, W), mm, 0 = background: decoded from the captured frames |{exact}
+| `{preview}` | small picture of `depth`, scaled to the object's own range: for looking, not for training |
+| `depth_min`, `depth_max` | range of `depth` on the object, mm; using them is the *oracle range* track |
+
+Configurations: {configs}.
+Each reads only its own columns. `meshes/` holds the objects (PLY, metres) where they are known, `rig.yaml` the camera,
+the projector and the sequence.
+
+Scored by `fpp-eval` of fpp-ml-bench: MAE and RMSE in mm over the object, the background and the full grid. The Hub's
+own table ranks by {score}.
+Single-shot and multi-frame methods, and methods that are given the depth range of a test sample, are separate tasks in
+`eval.yaml`.
+
+Fingerprint of the dataset: `{fingerprint}`. Written by fpp-ml-bench {package}.
+"""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A ranking on the Hub: results of other tracks, or with more frames, have their own."""
+
+    id: str
+    single_shot: bool
+    track: Track
+
+
+TASKS = (
+    Task("single_shot_depth", True, "metric"),
+    Task("single_shot_depth_oracle_range", True, "oracle range"),
+    Task("multi_frame_depth", False, "metric"),
+    Task("multi_frame_depth_oracle_range", False, "oracle range"),
+)
+
+
+def score(object_mae_mm: float) -> float:
+    """Score in [0, 100] of an object MAE in mm (0 or more); 6 decimals."""
+    return round(100.0 / (1.0 + object_mae_mm / SCORE_HALF_MM), _SCORE_DIGITS)
+
+
+def task_of(result: Result, name: str) -> Task:
+    """The task that a result belongs to; `PublishError`, naming the file ``name``, where it belongs to none."""
+    if (result.dataset.split, result.target, result.mode) != (SPLIT, TARGET, MODE):
+        raise PublishError(
+            f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
+            f"on {result.dataset.split} against {result.target} in {result.mode} mode; score the predictions so first"
+        )
+    if result.submission.uses_ground_truth_mask:
+        raise PublishError(
+            f"{name}: the Hub's benchmark has no task for the {result.track} track (the method was given the object "
+            "mask of the test samples); publish a result of a method that finds the object itself"
+        )
+    single = set(result.submission.frames_used) <= {SINGLE_SHOT_FRAME}
+    return next(task for task in TASKS if (task.single_shot, task.track) == (single, result.track))
+
+
+def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, str]:
+    """What a dataset's repository ``repo`` says beside its data: the card, and the registration of the tasks."""
+    widest = max(dataset.configs, key=CONFIGS.index)
+    tasks = [
+        {"id": task.id, "config": CONFIGS[0] if task.single_shot else widest, "split": SPLIT}
+        for task in TASKS if task.single_shot or widest != CONFIGS[0]
+    ]  # fmt: skip
+    evaluation = {
+        "name": NAME,
+        "description": f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}.",
+        "evaluation_framework": FRAMEWORK,
+        "tasks": tasks,
+    }
+    splits = []
+    for split in dataset.splits:
+        samples = dataset.manifest.samples[split]
+        objects = dict.fromkeys(sample["object"] for sample in samples)
+        splits.append(f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |")
+    exact = "\n| `depth_exact` | the same, exact, from the ray cast that made the frames |" if dataset.has_exact else ""
+    body = _BODY.format(
+        rows=sum(len(samples) for samples in dataset.splits.values()), height=dataset.size[0], width=dataset.size[1],
+        origin=dataset.manifest.origin, repo=repo, splits="\n".join(splits), config=dataset.configs[-1],
+        split=list(dataset.splits)[-1], exact=exact, preview=PREVIEW,
+        configs=", ".join(f"`{config}`" for config in dataset.configs), score=SCORE_TEXT,
+        fingerprint=dataset.fingerprint, package=__version__,
+    )  # fmt: skip
+    return {CARD_FILE: card_head(dataset, licence) + body, EVAL_FILE: yaml_text(evaluation)}
+
+
+def write_page_of(results: Sequence[Path], folder: Path) -> None:
+    """Write the page of result and row files, or of the rows shipped with the package where none are named.
+
+    Nothing is looked for in the current folder: what gets published is named. Raises SubmissionError for a file that is
+    no sound result.
+    """
+    rows = expand(results) if results else shipped_rows()
+    settings = None if results else shipped_tradeoff()
+    write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
+
+
+def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
+    """Copy the page in folder ``page`` to ``folder`` and add the Space's README; ``dataset_repo`` is linked from it.
+
+    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space
+    publishes every file.
+    """
+    if not (page / INDEX).is_file():
+        raise PublishError(f"{page}: expected a page with {INDEX}; write one with: fpp-bench leaderboard --page {page}")
+    files = staged_files(page)
+    for name, path in files.items():
+        hidden = any(part.startswith(".") for part in Path(name).parts)
+        if hidden or path.suffix.lower() not in _SUFFIXES or name in (CARD_FILE, MARK):
+            raise PublishError(
+                f"{printable(str(path), 300)}: is no part of a page (expected {', '.join(sorted(_SUFFIXES))}); a Space "
+                "publishes every file, so move it out"
+            )
+    total = sum(path.stat().st_size for path in files.values())
+    if total > _LARGEST_BYTES:
+        raise PublishError(f"{page}: {total:,} bytes; a static Space holds at most {_LARGEST_BYTES:,}")
+    for name, path in files.items():
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+    head: dict[str, Any] = {
+        "title": "FPP-ML-Bench leaderboard",
+        "emoji": "📐",
+        "colorFrom": "blue",
+        "colorTo": "gray",
+        "sdk": "static",
+        "app_file": INDEX,
+        "pinned": False,
+        "license": "mit",
+        "short_description": "Depth from one fringe image: error and run time",
+        "tags": ["leaderboard", "depth-estimation", "structured-light", "fpp-ml-bench"],
+        **({"datasets": [dataset_repo]} if dataset_repo is not None else {}),
+    }
+    body = f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
+    (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode())
+    (folder / MARK).write_bytes(mark_bytes("leaderboard"))
+    owned = {f"{Path(name).parts[0]}/" for name in files if "/" in name} | {f"{SUBMISSIONS}/"}
+    return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", tuple(sorted(owned)))
+
+
+@dataclass(frozen=True)
+class ScoredOn:
+    """The published dataset that results belong to: its repository, the ``revision`` there, and what its mark file
+    says (``about``). ``source_url``: https address where the results come from."""
+
+    repo: str
+    revision: str
+    about: Mapping[str, Any]
+    source_url: str | None = None
+
+
+def stage_results(paths: Sequence[Path], repo: str, scored_on: ScoredOn, folder: Path) -> Publication:
+    """Write a file for each result into ``folder``; it replaces an earlier result of the same task.
+
+    Only numbers and fixed words of a result are published, no text that its author wrote. A result scored on other data
+    is refused, as is a result of another split or target, or without an object score (`PublishError`).
+    """
+    source_url, fingerprint = scored_on.source_url, scored_on.about.get("fingerprint")
+    if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
+        raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")
+    named: dict[str, Path] = {}
+    (folder / RESULT_FOLDER).mkdir()
+    for path in paths:
+        result, file = read_entry(path).result, printable(str(path), 300)
+        if result.dataset.fingerprint != fingerprint:
+            raise PublishError(
+                f"{file}: was scored on other data (fingerprint {result.dataset.fingerprint[:12]}) than "
+                f"{scored_on.repo} holds ({printable(fingerprint, 12)}); score the predictions on that dataset, or "
+                "publish this one"
+            )
+        task = task_of(result, file).id
+        if task in named:
+            raise PublishError(
+                f"{printable(str(named[task]), 300)} and {file} are both results of {task}; a model has one of "
+                "each, publish the other with its own model repository"
+            )
+        named[task] = path
+        error_mm = result.metrics.object_mae_mm
+        if error_mm is None:
+            raise PublishError(
+                f"{file}: has no object score (no sample shows an object), so there is nothing to rank by"
+            )
+        entry = EvalResultEntry(
+            dataset_id=scored_on.repo, task_id=task, value=score(error_mm), dataset_revision=scored_on.revision,
+            date=result.created[:10], source_url=source_url,
+            source_name=f"{NAME} leaderboard" if source_url is not None else None, notes=_notes(result),
+        )  # fmt: skip
+        name = f"{task}--{scored_on.repo.replace('/', '--')}.yaml"
+        (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([entry])).encode())
+    return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")
+
+
+def _notes(result: Result) -> str:
+    metrics, submission = result.metrics, result.submission
+    ends = result.intervals.of("object_mae_mm")
+    interval = f" (95% interval {millimetres(ends[0])} to {millimetres(ends[1])})" if ends is not None else ""
+    frames = len(submission.frames_used)
+    time = ""
+    if submission.seconds_per_sample is not None:
+        time = f"; {submission.seconds_per_sample:.4g} s per sample, {submission.seconds_source}"
+    missing = percent(metrics.object_missing_share)
+    return (
+        f"{SCORE_TEXT}. Object MAE {millimetres(metrics.object_mae_mm)} mm{interval}, RMSE "
+        f"{millimetres(metrics.object_rmse_mm)} mm; overall MAE {millimetres(metrics.overall_mae_mm)} mm; object "
+        f"pixels missing {missing}; {result.dataset.samples} samples of {result.dataset.split}, {result.track} track, "
+        f"{frames} {'frame' if frames == 1 else 'frames'}{time}; protocol {result.protocol_version}, dataset "
+        f"{result.dataset.fingerprint[:12]}"
+    )
