@@ -1,3 +1,3 @@
-from .storage.joined import load_dataset as load_dataset
 from .storage.store import DatasetFolder as DatasetFolder
+from .storage.store import load_dataset as load_dataset
 from .training import FringeDepthDataset as FringeDepthDataset

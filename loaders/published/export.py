@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import Normalisation, normalise, object_mask
-from fpp_ml_bench.loaders.published.layout import (
+from fpp_ml_bench.loaders.published.mat_files import matrix_bytes
+from fpp_ml_bench.loaders.published.png import png_bytes
+from fpp_ml_bench.loaders.published.tree import (
     BACKGROUND_REMOVED_FOLDERS,
     DEPTH,
     FRINGE,
@@ -30,8 +32,6 @@ from fpp_ml_bench.loaders.published.layout import (
     WRAPPED_PHASE_VARIABLE,
     frame_file,
 )
-from fpp_ml_bench.loaders.published.mat_files import matrix_bytes
-from fpp_ml_bench.loaders.published.png import png_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage import DatasetFolder, depth_range_mm
 from fpp_ml_bench.optics import Direction

@@ -1,34 +1,69 @@
-"""Scanning a published tree: its samples and their files, and all errors in the layout that names alone show.
+"""The published tree: its names, and a scan that lists its samples and every error in the layout that names alone show.
 
 Only directory entries and PNG headers are read here; contents are checked when a sample is read
-(`fpp_ml_bench.loaders.published.reading`). Names that begin with a dot, and files beside the folders, are ignored.
+(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored.
 """
 
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name
+from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.layout import (
-    BACKGROUND_REMOVED_FOLDERS,
-    DEPTH,
-    FRINGE,
-    INFO,
-    NOT_STORED,
-    RAW_SCANS,
-    TRAINING,
-    VARIANT_FOLDERS,
-    frame_file,
-    label_of,
-    layout_error,
-)
 from fpp_ml_bench.loaders.published.png import read_png_header
 
+TRAINING = "training_datasets"
+RAW_SCANS = "fpp_synthetic_dataset"
+FRINGE, DEPTH = "fringe", "depth"
+INFO = "info_depth_params"
+INFO_VARIABLES = ("depth_min", "depth_max")
+
+VARIANT_FOLDERS: dict[Normalisation, str] = {
+    "raw": "training_data_depth_raw",
+    "global": "training_data_depth_global_normalized",
+    "individual": "training_data_depth_individual_normalized",
+}
+"""Folder of each depth representation; depth in mm is taken from the first that is present."""
+BACKGROUND_REMOVED_FOLDERS: dict[Normalisation, str] = {
+    name: folder.replace("training_data_depth", "training_data_bgremoved_depth")
+    for name, folder in VARIANT_FOLDERS.items()
+}
+VARIABLES: dict[Normalisation, str] = {
+    "raw": "depthMap", "global": "depthMapMeters", "individual": "depthMapNormalized",
+}  # fmt: skip
+WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS = "wrapped_phase.mat", "unwrapped_phase.mat", "z.csv"
+WRAPPED_PHASE_VARIABLE, UNWRAPPED_PHASE_VARIABLE = "wph", "uph"
+NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
+"""Files of a raw scan that are computed from its frames; the import ignores them."""
+
+LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
 FilesBySplit = dict[str, dict[str, Path]]
 """The files of each split by stem (sample name); keys are this package's split names."""
+
+
+def frame_file(index: int) -> str:
+    """File name of frame ``index`` in a raw scan."""
+    return f"A_{index}.png"
+
+
+def label_of(stem: str) -> tuple[str, str] | None:
+    """Object and view in a file name without its suffix, None for any other name."""
+    try:
+        name, view = split_sample_name(stem)
+    except ValueError:
+        return None
+    return (name, view) if view in VIEWS else None
+
+
+def layout_error(root: object, problems: list[str]) -> LayoutError:
+    """The error that lists the problems of a tree, at most `LISTED_PROBLEMS` of them."""
+    shown = problems[:LISTED_PROBLEMS]
+    if len(problems) > len(shown):
+        shown.append(f"... and {len(problems) - len(shown)} more")
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    return LayoutError("\n  ".join([f"{root}: {count} with the published layout:", *shown]))
 
 
 @dataclass(frozen=True)

@@ -13,24 +13,13 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.raycast import Hits, TracedObject
+from fpp_ml_bench.loaders.render.scene import Lighting
 from fpp_ml_bench.optics import Direction, Rig
 from fpp_ml_bench.portable import power
 from fpp_ml_bench.skipping import skipping_enabled
 
 NEAREST_M = 1e-3
 """A point nearer to a centre of projection is inside that lens and gets no light: the inverse square has no limit."""
-
-
-@dataclass(frozen=True)
-class Lighting:
-    """Exposure and material. ``white_grey``: grey level of a white pattern on a surface that faces the projector at the
-    near end of the working range, so that nothing in range saturates; ``ambient_grey``: light besides the projector."""
-
-    white_grey: float = 225.0
-    ambient_grey: float = 6.0
-    specular: float = 0.15
-    roughness: float = 0.95
-    shadows: bool = False
 
 
 @dataclass(frozen=True)
@@ -81,13 +70,6 @@ class LitPixels:
             replaced(self.ambient, patch.ambient),
             self.shadow_rays + patch.shadow_rays,
         )
-
-
-def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -> float:
-    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
-    by the inverse square of the distance."""
-    white = (lighting or Lighting()).white_grey
-    return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
 
 
 def projector_centre_m(rig: Rig) -> NDArray[np.float64]:

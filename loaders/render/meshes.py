@@ -13,8 +13,7 @@ import numpy as np
 from fpp_ml_bench.constants import OBJECTS, SPLITS
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import file_hash
-from fpp_ml_bench.loaders.render.scene import SolidMesh
-from fpp_ml_bench.loaders.render.settings import UserMesh
+from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:

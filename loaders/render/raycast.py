@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.raycast_kernels import LEAF, SLACK, any_hit, build_tree, rasterise
 from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.optics import Pinhole
 
-SLACK = 1e-9
-"""Boxes are widened by this, in m or normalised units: far above float64's rounding, far below a pixel."""
 _SHADOW_OFFSET_M = 1e-4
 
 
@@ -75,8 +74,6 @@ class TracedObject:
 
     def primary(self, rays: PixelRays) -> Hits:
         """What the camera's rays meet first."""
-        from fpp_ml_bench.loaders.render.raycast_kernels import rasterise
-
         window = self._window(rays)
         (top, bottom), (left, right) = window
         shape = (max(bottom - top, 0), max(right - left, 0))
@@ -133,8 +130,6 @@ class TracedObject:
 
     def blocked(self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the object lies between each origin and its target, both (n, 3) in camera coordinates; bool (n,)."""
-        from fpp_ml_bench.loaders.render.raycast_kernels import any_hit
-
         blocked = np.zeros(len(origins_m), dtype=bool)
         any_hit(*self._tree, origins_m, targets_m, blocked)
         return blocked
@@ -142,8 +137,6 @@ class TracedObject:
     @cached_property
     def _tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
         """Triangles in the order of a box tree, where its leaves start, and its boxes."""
-        from fpp_ml_bench.loaders.render.raycast_kernels import LEAF, build_tree
-
         count = len(self._corners)
         leaves = 1 << (-(-count // LEAF) - 1).bit_length()
         order, starts, boxes = np.empty(count, np.int64), np.empty(leaves + 1, np.int64), np.empty((2 * leaves, 6))

@@ -5,7 +5,6 @@ builds of the same settings: no date, no path, no machine.
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -119,10 +118,3 @@ def read_manifest(folder: Path) -> Manifest:
 def describe_file(folder: Path, path: Path) -> OtherFile:
     """Manifest entry of a file below the dataset folder."""
     return OtherFile(path.relative_to(folder).as_posix(), path.stat().st_size, file_hash(path))
-
-
-def dataset_files(folder: Path) -> Iterator[Path]:
-    """Every file below a dataset folder, sorted, without the builder's own work folder and lock."""
-    for path in sorted(folder.rglob("*")):
-        if WORK_FOLDER not in path.relative_to(folder).parts and (path.is_file() or path.is_symlink()):
-            yield path

@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.phase_route.settings import Settings
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, Lighting, Studio
-from fpp_ml_bench.loaders.storage import Row
+from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.optics import Rig, paper_rig
 
 SIZE = 480

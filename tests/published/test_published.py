@@ -219,10 +219,7 @@ BROKEN = {
     "depth infinite": (lambda t: set_pixel(depth_path(t), np.inf), f"{MAT}: 1 pixels are NaN"),
     "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
     "depth empty": (lambda t: write_mat(depth_path(t), depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
-    "depth in metres": (
-        lambda t: write_mat(depth_path(t), depthMap=depth_of(STEM) / 1000),
-        f"{MAT}: depths of 1.7",
-    ),
+    "depth in metres": (lambda t: write_mat(depth_path(t), depthMap=depth_of(STEM) / 1000), f"{MAT}: depths of 1.7"),
 }
 
 

@@ -12,9 +12,9 @@ from fpp_ml_bench.constants import MINI_OBJECTS, OBJECTS, SPLITS, TEST_OBJECTS, 
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build, plan_build
 from fpp_ml_bench.loaders.render.meshes import single_mesh
-from fpp_ml_bench.loaders.render.settings import PRESETS, BuildSettings
-from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
-from fpp_ml_bench.loaders.storage import DatasetFolder, Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.render.scene import PRESETS, BuildSettings
+from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
+from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
 
 
@@ -204,7 +204,7 @@ def row(sample="bowl_A0", depth=None, frames=None):
 
 def write(tmp_path, rows):
     (plan,) = plan_shards("train", {"bowl": [("bowl_A0", "bowl", "A0")]})
-    return ShardWriter(tmp_path, tmp_path, plan, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(rows)
+    return ShardWriter(tmp_path, tmp_path, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(plan, rows)
 
 
 @pytest.mark.parametrize(

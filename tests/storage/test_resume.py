@@ -274,10 +274,10 @@ def test_lock_is_free_after_an_error(tmp_path, monkeypatch):
 # ---- dying workers
 
 
-def die(folder, scratch, plan, row_done):
+def die(plan, folder):
     if plan.split == "validation":
         os._exit(9)  # as the system ends a process that took too much memory
-    return assembly_of(half_settings()).work(folder, scratch, plan, row_done)
+    return assembly_of(half_settings()).rows(plan, folder)
 
 
 def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
