@@ -46,5 +46,5 @@ def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):
         origin=origin, generator={"name": "test", "version": "0"}, settings={}, rig=paper_rig().to_dict(), size=SIZE,
         stored="single_shot", exact=True, samples={}, shards=[],
     )  # fmt: skip
-    assemble(folder, Assembly(plans, SyntheticRows(**changes), manifest, 0), workers=1)
+    assemble(folder, Assembly(plans, SyntheticRows(**changes), manifest), workers=1)
     return folder

@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from fpp_ml_bench.loaders.published.tree import (
     layout_error,
     scan_tree,
 )
-from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row, stored_frames
+from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
 from fpp_ml_bench.loaders.storage import (
     MANIFEST,
     WORK_FOLDER,
@@ -37,7 +38,7 @@ from fpp_ml_bench.loaders.storage import (
     assemble,
     plan_shards,
 )
-from fpp_ml_bench.optics import Rig, Sequence, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig
 
 IMPORTED = "imported"
 _CHECK_THREADS = 4
@@ -48,6 +49,15 @@ differs by mm."""
 _UNIT_SLACK = 10.0
 _ROUNDING = 1e-6
 _SHOWN_MISFITS = 3
+
+
+@contextmanager
+def _listed(problems: list[str]) -> Iterator[None]:
+    """Add a `LayoutError` inside the block to ``problems``."""
+    try:
+        yield
+    except LayoutError as error:
+        problems.append(str(error))
 
 
 @dataclass(frozen=True)
@@ -61,61 +71,55 @@ class SampleReader:
 
     def read(self, sample: PublishedSample) -> Row:
         """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line per wrong file."""
-        problems: list[str] = []
-        row = self._read(sample, problems)
+        row, problems = self._read(sample)
         if row is None:
             raise LayoutError("\n".join(problems))
         return row
 
     def problems(self, sample: PublishedSample) -> list[str]:
         """Problems of the sample's files, a line each; empty when the sample can be read."""
-        problems: list[str] = []
-        self._read(sample, problems)
-        return problems
+        return self._read(sample)[1]
 
-    def _read(self, sample: PublishedSample, problems: list[str]) -> Row | None:
-        fringe = self._fringe(sample, problems)
+    def _read(self, sample: PublishedSample) -> tuple[Row | None, list[str]]:
+        problems: list[str] = []
+        fringe, *copies = self._images(sample.fringes, problems)
+        if fringe is not None:
+            problems += [
+                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
+                for path, image in zip(sample.fringes[1:], copies, strict=True)
+                if image is not None and not np.array_equal(image, fringe)
+            ]
         depth_mm = self._depth_mm(sample, problems)
-        files = [self._image(path, problems) for path in sample.frames]
+        files = self._images(sample.frames, problems)
         frames = {} if fringe is None else {SINGLE_SHOT_FRAME: fringe}
         present = [image for image in files if image is not None]
-        if sample.frames and len(present) == len(files):
+        if files and len(present) == len(files):
             if fringe is not None and not np.array_equal(present[0], fringe):
                 problems.append(f"{sample.frames[0]}: differs from the single-shot input {sample.fringes[0]}")
             if self.order is not None:
-                frames = self._ordered(sample, present, self.order, problems)
+                problems += self._misfits(sample, present, self.order)
+                ordered = self.order.frames(self.rig.sequence)
+                frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
         if problems or depth_mm is None:
-            return None
-        return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None)
+            return None, problems
+        return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None), problems
 
-    def _image(self, path: Path, problems: list[str]) -> NDArray[np.uint8] | None:
-        try:
-            return read_grey_png(path)
-        except LayoutError as error:
-            problems.append(str(error))
-            return None
+    def _images(self, paths: tuple[Path, ...], problems: list[str]) -> list[NDArray[np.uint8] | None]:
+        images: list[NDArray[np.uint8] | None] = [None] * len(paths)
+        for number, path in enumerate(paths):
+            with _listed(problems):
+                images[number] = read_grey_png(path)
+        return images
 
-    def _fringe(self, sample: PublishedSample, problems: list[str]) -> NDArray[np.uint8] | None:
-        images = [self._image(path, problems) for path in sample.fringes]
-        if images[0] is not None:
-            problems += [
-                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
-                for path, image in zip(sample.fringes[1:], images[1:], strict=True)
-                if image is not None and not np.array_equal(image, images[0])
-            ]
-        return images[0]
-
-    def _ordered(
-        self, sample: PublishedSample, files: list[NDArray[np.uint8]], order: FrameOrder, problems: list[str]
-    ) -> dict[int, NDArray[np.uint8]]:
+    def _misfits(self, sample: PublishedSample, files: list[NDArray[np.uint8]], order: FrameOrder) -> list[str]:
         misfits = check_order(files, order, self.rig)
-        if misfits:
-            fitting = find_order(files, self.rig)
-            hint = "it fits no named order" if fitting is None else f"it has the order {fitting.name}"
-            more = f" (and {len(misfits) - _SHOWN_MISFITS} more)" if len(misfits) > _SHOWN_MISFITS else ""
-            shown = "; ".join(misfits[:_SHOWN_MISFITS])
-            problems.append(f"{sample.frames[0].parent}: not in frame order {order.name}, {hint}: {shown}{more}")
-        return {frame.index: image for frame, image in zip(order.frames(self.rig.sequence), files, strict=True)}
+        if not misfits:
+            return []
+        fitting = find_order(files, self.rig)
+        hint = "it fits no named order" if fitting is None else f"it has the order {fitting.name}"
+        more = f" (and {len(misfits) - _SHOWN_MISFITS} more)" if len(misfits) > _SHOWN_MISFITS else ""
+        shown = "; ".join(misfits[:_SHOWN_MISFITS])
+        return [f"{sample.frames[0].parent}: not in frame order {order.name}, {hint}: {shown}{more}"]
 
     def _depth_mm(self, sample: PublishedSample, problems: list[str]) -> NDArray[np.float32] | None:
         """Depth from the first variant; the other variants and the depth range must agree with it."""
@@ -124,11 +128,9 @@ class SampleReader:
         for variant, path in zip(self.variants, sample.depths, strict=True):
             if variant == "individual" and limits is None:
                 continue
-            try:
+            with _listed(problems):
                 values = read_matrix(path, VARIABLES[variant])
                 maps.append((variant, path, self._to_mm(path, values, variant, limits or (0.0, 0.0))))
-            except LayoutError as error:
-                problems.append(str(error))
         if not maps or maps[0][1] != sample.depths[0]:
             return None
         depth_mm = maps[0][2].astype(np.float32)
@@ -150,17 +152,13 @@ class SampleReader:
         return depth_mm
 
     def _range_mm(self, sample: PublishedSample, problems: list[str]) -> tuple[float, float] | None:
-        if sample.info is None:
-            return None
-        try:
-            low, high = (read_scalar(sample.info, name) for name in INFO_VARIABLES)
-        except LayoutError as error:
-            problems.append(str(error))
-            return None
-        if not 0 < low <= high:
-            problems.append(f"{sample.info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
-            return None
-        return low, high
+        with _listed(problems):
+            if sample.info is not None:
+                low, high = (read_scalar(sample.info, name) for name in INFO_VARIABLES)
+                if 0 < low <= high:
+                    return low, high
+                problems.append(f"{sample.info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
+        return None
 
     def _to_mm(
         self, path: Path, values: NDArray, variant: Normalisation, limits: tuple[float, float]
@@ -261,13 +259,9 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         size=tree.size,
         stored=stored,
         exact=False,
-        samples={},
-        shards=[],
     )
     rows = ImportedRows({sample.sample: sample for sample in tree.all_samples()}, reader)
-    # One byte a frame and one float32 depth map.
-    bytes_per_row = tree.size[0] * tree.size[1] * (len(stored_frames(rig_used.sequence, stored)) + 4)
-    return ImportPlan(tree, reader, Assembly(plans, rows, manifest, bytes_per_row))
+    return ImportPlan(tree, reader, Assembly(plans, rows, manifest))
 
 
 def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
@@ -303,8 +297,7 @@ def import_notes(manifest: Manifest) -> list[str]:
     if settings["frame_order"]:
         notes.append(f"frame order of the raw scans: {settings['frame_order']}")
         order = parse_order(settings["frame_order"])
-        sequence = Sequence(**manifest.rig["sequence"])
-        first_file = (order or FrameOrder()).frames(sequence)[0]
+        first_file = (order or FrameOrder()).frames(manifest.sequence)[0]
         if first_file.index != SINGLE_SHOT_FRAME:
             notes.append(
                 f"the published single-shot input, A_0.png, is a {first_file.direction} fringe, stored in column "
@@ -350,20 +343,23 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     raise layout_error(tree.root, refusals)
 
 
-def _changed_ns(path: Path) -> int:
-    """When a file last changed, in ns. Unlike the modification time alone, copying or setting times can't reset it."""
-    status = path.stat()
-    return max(status.st_ctime_ns, status.st_mtime_ns)
+def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
+    """A file of the sample that changed after the file ``moment`` was written, or None.
+
+    Unlike the modification time alone, copying or setting times can't reset what is compared here.
+    """
+    written = moment.stat().st_mtime_ns
+    for path in sample.files:
+        status = path.stat()
+        if max(status.st_ctime_ns, status.st_mtime_ns) > written:
+            return path
+    return None
 
 
 def _refuse_changed(folder: Path, tree: PublishedTree) -> None:
-    manifest_path = folder / MANIFEST
-    if not manifest_path.is_file():
-        return
-    finished = manifest_path.stat().st_mtime_ns
-    for sample in tree.all_samples():
-        for path in sample.files:
-            if _changed_ns(path) > finished:
+    if (folder / MANIFEST).is_file():
+        for sample in tree.all_samples():
+            if path := _changed_after(sample, folder / MANIFEST):
                 raise BuildError(
                     f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
                 )
@@ -374,8 +370,5 @@ def _drop_stale_receipts(folder: Path, plan: ImportPlan) -> None:
     samples = {sample.sample: sample for sample in plan.tree.all_samples()}
     for shard_plan in plan.assembly.plans:
         receipt = folder / WORK_FOLDER / f"{shard_plan.name}.json"
-        if receipt.is_file():
-            written = receipt.stat().st_mtime_ns
-            files = (path for stem, _, _ in shard_plan.samples for path in samples[stem].files)
-            if any(_changed_ns(path) > written for path in files):
-                receipt.unlink(missing_ok=True)
+        if receipt.is_file() and any(_changed_after(samples[stem], receipt) for stem, _, _ in shard_plan.samples):
+            receipt.unlink()

@@ -13,7 +13,7 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.loaders.sample import Row, stored_frames
+from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage import GENERATED, Assembly, Manifest, Progress, ShardPlan, assemble, plan_shards
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
@@ -59,22 +59,16 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
 
 def assembly_of(settings: BuildSettings) -> Assembly:
     """What there is to do for a build, and its manifest so far."""
-    camera = settings.rig.camera
-    pixels = camera.width * camera.height
-    frames = stored_frames(settings.rig.sequence, settings.stored)
     manifest = Manifest(
         origin=GENERATED,
         generator={"name": "fpp-ml-bench", "version": __version__},
         settings=settings.describe(),
         rig=settings.rig.to_dict(),
-        size=(camera.height, camera.width),
+        size=(settings.rig.camera.height, settings.rig.camera.width),
         stored=settings.stored,
         exact=True,
-        samples={},
-        shards=[],
     )
-    # Two float32 depth maps and one byte a frame.
-    return Assembly(plan_build(settings), PhotographedRows(settings), manifest, pixels * (len(frames) + 8), MESH_FOLDER)
+    return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 
 
 def build(folder: Path, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None) -> Manifest:

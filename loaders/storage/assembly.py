@@ -27,7 +27,6 @@ from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import THREAD_COUNTS
-from fpp_ml_bench.optics import Sequence
 
 SETTINGS = "settings.json"
 RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
@@ -45,7 +44,6 @@ class Assembly:
     plans: list[ShardPlan]
     rows: RowSource
     manifest: Manifest
-    bytes_per_row: int
     mesh_folder: str | None = None
     """Folder below the dataset folder into which ``rows`` writes a PLY of each object."""
 
@@ -65,9 +63,7 @@ class Assembly:
     def writer(self, folder: Path, scratch: Path) -> ShardWriter:
         """The writer of this dataset's shards."""
         content = self.manifest
-        return ShardWriter(
-            folder, scratch, Sequence(**content.rig["sequence"]), content.stored, content.exact, content.size
-        )
+        return ShardWriter(folder, scratch, content.sequence, content.stored, content.exact, content.size)
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
@@ -185,7 +181,7 @@ def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
 
 
 def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
-    needed = sum(len(plan.samples) for plan in missing) * assembly.bytes_per_row
+    needed = sum(len(plan.samples) for plan in missing) * assembly.manifest.row_bytes
     free = shutil.disk_usage(folder).free
     if needed + _RESERVE_BYTES > free:
         raise BuildError(

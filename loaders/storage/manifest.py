@@ -13,6 +13,8 @@ from typing import Any
 from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.optics import Sequence
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
@@ -57,8 +59,8 @@ class Manifest:
     size: tuple[int, int]
     stored: str
     exact: bool
-    samples: dict[str, list[dict[str, Any]]]
-    shards: list[ShardFile]
+    samples: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    shards: list[ShardFile] = field(default_factory=list)
     others: list[OtherFile] = field(default_factory=list)
     schema_version: str = SCHEMA_VERSION
 
@@ -69,6 +71,16 @@ class Manifest:
         for key in ("others", "generator"):
             content.pop(key)
         return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+    @property
+    def sequence(self) -> Sequence:
+        return Sequence(**self.rig["sequence"])
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's images: one a pixel and stored frame, four a depth map."""
+        depths = 8 if self.exact else 4
+        return self.size[0] * self.size[1] * (len(stored_frames(self.sequence, self.stored)) + depths)
 
     @property
     def files(self) -> tuple[ShardFile | OtherFile, ...]:

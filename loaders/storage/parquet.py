@@ -207,9 +207,7 @@ def _write_groups(
 
 
 def _rows_per_group(dataset: DatasetFolder, group_bytes: int) -> int:
-    height, width = dataset.size
-    row_bytes = height * width * (len(_frames(dataset)) + (8 if dataset.has_exact else 4))
-    return max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // row_bytes))
+    return max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // dataset.manifest.row_bytes))
 
 
 def _parts(dataset: DatasetFolder, shard: ShardFile) -> list[ShardFile]:

@@ -88,7 +88,7 @@ class DatasetFolder:
 
     @cached_property
     def sequence(self) -> Sequence:
-        return Sequence(**self.manifest.rig["sequence"])
+        return self.manifest.sequence
 
     @property
     def configs(self) -> tuple[str, ...]:

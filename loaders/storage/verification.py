@@ -17,7 +17,6 @@ from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, 
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics import Sequence
 
 ImagePlaces = dict[str, list[tuple[str, str, str]]]
 """Hash of an image -> where it stands: (split, sample, column)."""
@@ -131,9 +130,8 @@ def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: lis
 def _coverage_findings(manifest: Manifest) -> list[str]:
     """Rows that no file holds, or more than one: every group's files must follow on from each other."""
     findings = []
-    sequence = Sequence(**manifest.rig["sequence"])
     for split, rows in manifest.samples.items():
-        for group in stored_groups(sequence, manifest.stored):
+        for group in stored_groups(manifest.sequence, manifest.stored):
             files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
             held = [row for shard in files for row in range(shard.first_row, shard.first_row + shard.rows)]
             if held != list(range(len(rows))):

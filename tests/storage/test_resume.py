@@ -283,7 +283,7 @@ def die(plan, folder):
 def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
     folder = tmp_path / "set"
     assembly = assembly_of(half_settings())
-    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.bytes_per_row, assembly.mesh_folder)
+    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.mesh_folder)
     with pytest.raises(BuildError, match="worker process died"):
         assemble(folder, broken, workers=2)
     assert not (folder / "manifest.json").exists()
