@@ -5,7 +5,7 @@ float64, from which the same float32 mm are recovered; float32 would be off by a
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -48,18 +48,10 @@ def write_tree(
     ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
     ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
     """
-    with ThreadPoolExecutor(threads) as pool:
-        jobs = [
-            pool.submit(_write_sample, dataset, folder, split, sample)
-            for split in splits for sample in dataset.samples(split)
-        ]  # fmt: skip
-        try:
-            for job in as_completed(jobs):
-                job.result()
-                row_done()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
+    with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
+        for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
+            row_done()
 
 
 def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str) -> None:

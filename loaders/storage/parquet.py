@@ -10,7 +10,7 @@ of a file is in memory at a time.
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -75,11 +75,8 @@ def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
 
 
 def _all_columns(dataset: DatasetFolder) -> list[str]:
-    return row_columns(dataset.sequence, _frames(dataset), dataset.has_exact)
-
-
-def _frames(dataset: DatasetFolder) -> tuple[int, ...]:
-    return stored_frames(dataset.sequence, dataset.manifest.stored)
+    frames = stored_frames(dataset.sequence, dataset.manifest.stored)
+    return row_columns(dataset.sequence, frames, dataset.has_exact)
 
 
 def data_shards(dataset: DatasetFolder) -> dict[str, ShardFile]:
@@ -100,21 +97,13 @@ def write_parquet(
     memory.
     """
     (folder / "data").mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(threads) as pool:
-        jobs = [
-            pool.submit(_write_arrays, dataset, shard, folder / name, rows_done)
-            for name, shard in data_shards(dataset).items() if shard.split in splits
-        ]  # fmt: skip
-        try:
-            for job in as_completed(jobs):
-                job.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    files = [(folder / name, shard) for name, shard in data_shards(dataset).items() if shard.split in splits]
+    with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
+        list(pool.map(lambda file: _write_arrays(dataset, *file, rows_done), files))
     (folder / "README.md").write_text(_card(dataset, splits), encoding="utf-8")
 
 
-def _write_arrays(dataset: DatasetFolder, shard: ShardFile, path: Path, rows_done: Callable[[int], None]) -> None:
+def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_done: Callable[[int], None]) -> None:
     names = _all_columns(dataset)
     schema = arrow_schema(names, dataset.size)
     stored = _stored_columns(dataset, _parts(dataset, shard))

@@ -10,17 +10,14 @@ Source: own shapes after the names of the YCB and warehouse objects that the pap
 
 import difflib
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.objects import boxes, containers, household, tools
 from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
-
-if TYPE_CHECKING:
-    import trimesh
 
 __all__ = ["BUILDERS", "object_mesh"]
 
@@ -83,15 +80,13 @@ BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
 }
 
 
-def object_mesh(name: str) -> "trimesh.Trimesh":
+def object_mesh(name: str) -> trimesh.Trimesh:
     """Mesh of one of the 50 objects, at the size it has in the scene.
 
     Metres, z up, outward faces, watertight. The bounding box is centred at the origin and the turning axis is z; the
     camera of the first view looks along +x. The same name gives the same bytes at every call. Raises
     :class:`MeshError` for a name that is not one of ``constants.OBJECTS``. Source: own.
     """
-    import trimesh
-
     if name not in BUILDERS:
         near = difflib.get_close_matches(name, BUILDERS, n=3, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(BUILDERS)}"
