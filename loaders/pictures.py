@@ -11,7 +11,6 @@ from fpp_ml_bench.constants import VIEWS, sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import render
-from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS
 
@@ -49,7 +48,7 @@ Panel = tuple[str, NDArray, str, float, float]
 
 
 def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
-    sequence, stored = dataset.sequence, stored_frames(dataset.sequence, dataset.manifest.stored)
+    sequence, stored = dataset.sequence, dataset.manifest.stored_frames
     # The third finest Gray bit: its stripes are still visible in a small picture.
     codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
     frames = [i for i in (0, sequence.sinusoids("vertical")[0], *codes, sequence.white) if i in stored]
@@ -106,8 +105,7 @@ def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
     """Write all objects (two per line) in their six views as a PNG, in white light if that frame is stored."""
     samples = dataset.samples(split)
     objects = list(dict.fromkeys(dataset.measured(sample)["object"] for sample in samples))
-    available = stored_frames(dataset.sequence, dataset.manifest.stored)
-    index = dataset.sequence.white if dataset.sequence.white in available else 0
+    index = dataset.sequence.white if dataset.sequence.white in dataset.manifest.stored_frames else 0
     label_px, columns = 18, 2
     line_px = _TILE_PX + label_px
     lines = -(-len(objects) // columns)

@@ -77,10 +77,15 @@ class Manifest:
         return Sequence(**self.rig["sequence"])
 
     @property
+    def stored_frames(self) -> tuple[int, ...]:
+        """Indices of the frames on disk, ascending."""
+        return stored_frames(self.sequence, self.stored)
+
+    @property
     def row_bytes(self) -> int:
         """Bytes of a row's images: one a pixel and stored frame, four a depth map."""
         depths = 8 if self.exact else 4
-        return self.size[0] * self.size[1] * (len(stored_frames(self.sequence, self.stored)) + depths)
+        return self.size[0] * self.size[1] * (len(self.stored_frames) + depths)
 
     @property
     def files(self) -> tuple[ShardFile | OtherFile, ...]:

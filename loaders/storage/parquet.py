@@ -34,7 +34,6 @@ from fpp_ml_bench.loaders.sample import (
     config_columns,
     features,
     row_columns,
-    stored_frames,
 )
 from fpp_ml_bench.loaders.storage.card import CARD_HEAD, data_version
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
@@ -75,8 +74,7 @@ def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
 
 
 def _all_columns(dataset: DatasetFolder) -> list[str]:
-    frames = stored_frames(dataset.sequence, dataset.manifest.stored)
-    return row_columns(dataset.sequence, frames, dataset.has_exact)
+    return row_columns(dataset.sequence, dataset.manifest.stored_frames, dataset.has_exact)
 
 
 def data_shards(dataset: DatasetFolder) -> dict[str, ShardFile]:
