@@ -12,7 +12,7 @@ from pathlib import Path
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.png import read_png_header
+from fpp_ml_bench.loaders.published.png import read_png_size
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"
@@ -307,7 +307,7 @@ class _Scan:
         sizes: dict[Path, tuple[int, int]] = {}
         for path in (path for sample in samples for path in (*sample.fringes, *sample.frames)):
             try:
-                sizes[path] = read_png_header(path).size
+                sizes[path] = read_png_size(path)
             except LayoutError as error:
                 self.problems.append(str(error))
         if not sizes:

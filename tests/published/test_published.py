@@ -11,10 +11,12 @@ from published_trees import (
     SPLITS,
     TRAINING,
     VIEWS,
+    command,
     depth_of,
     depth_path,
     fringe_of,
     fringe_path,
+    imported,
     info_path,
     make_tree,
     v73_bytes,
@@ -22,18 +24,11 @@ from published_trees import (
     write_png,
 )  # fmt: skip
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.published.importing import plan_import
 from fpp_ml_bench.optics import paper_rig, save_rig
 
 ALL_VARIANTS = ("raw", "global", "individual")
-
-
-def imported(tree, out, workers=1, **settings):
-    import_tree(out, plan_import(tree, **settings), workers)
-    return DatasetFolder(out)
 
 
 def refusal(tree, out):
@@ -377,10 +372,6 @@ def test_a_finished_import_is_left_alone_unless_the_tree_changed(tmp_path):
     write_mat(depth_path(tree), depthMap=depth_of("bowl_A0"))
     with pytest.raises(BuildError, match=r"power_drill_A60\.mat changed"):
         imported(tree, tmp_path / "out")
-
-
-def command(*words):
-    return main([str(word) for word in words])
 
 
 def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
