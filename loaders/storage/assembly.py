@@ -11,7 +11,7 @@ import signal
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import connection, get_context, parent_process
@@ -192,7 +192,7 @@ def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> 
 
 def _write_in_processes(
     folder: Path, scratch: Path, assembly: Assembly, plans: list[ShardPlan], workers: int, progress: Progress
-) -> Iterator[tuple[ShardPlan, Receipt]]:
+) -> Generator[tuple[ShardPlan, Receipt], None, None]:
     """Write the shards in processes that each go from shard to shard; yields each when it is finished, in any order."""
     context = get_context("spawn")
     rows_done, reported = context.Value("q", 0), 0

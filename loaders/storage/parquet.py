@@ -97,7 +97,7 @@ def write_parquet(
     (folder / "data").mkdir(parents=True, exist_ok=True)
     files = [(folder / name, shard) for name, shard in data_shards(dataset).items() if shard.split in splits]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
-        list(pool.map(lambda file: _write_arrays(dataset, *file, rows_done), files))
+        list(pool.map(lambda file: _write_arrays(dataset, file[0], file[1], rows_done), files))
     (folder / "README.md").write_text(_card(dataset, splits), encoding="utf-8")
 
 
