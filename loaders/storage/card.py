@@ -68,10 +68,10 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
     sequence = rig.sequence
     frames = stored_groups(sequence, manifest.stored)[DATA_GROUP]
     columns = group_columns(sequence, DATA_GROUP, frames, manifest.exact)
-    data = [shard for shard in manifest.shards if shard.group == DATA_GROUP]
+    contents: dict[str, Any] = {"dataset_dict.json": {"splits": list(manifest.samples)}}
     for split in manifest.samples:
-        files = [shard.path for shard in data if shard.split == split]
-        state: dict[str, Any] = {
+        files = [shard.path for shard in manifest.shards if (shard.group, shard.split) == (DATA_GROUP, split)]
+        contents[f"{split}/state.json"] = {
             "_data_files": [{"filename": path.split("/")[-1]} for path in files],
             "_fingerprint": manifest.fingerprint[:16],
             "_format_columns": None,
@@ -80,11 +80,12 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
             "_output_all_columns": False,
             "_split": split,
         }
-        info = {"citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
-                "license": "mit"}  # fmt: skip
-        _write_json(folder / split / "state.json", state)
-        _write_json(folder / split / "dataset_info.json", info)
-    _write_json(folder / "dataset_dict.json", {"splits": list(manifest.samples)})
+        contents[f"{split}/dataset_info.json"] = {
+            "citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
+            "license": "mit",
+        }  # fmt: skip
+    for name, content in contents.items():
+        write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
     save_rig(rig, folder / RIG_FILE)
     text = CARD_HEAD + _CARD.format(
         version=data_version(manifest.fingerprint),
@@ -100,12 +101,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         package=__version__,
     )
     write_atomically(folder / "README.md", text.encode())
-    states = [f"{split}/{name}" for split in manifest.samples for name in ("state.json", "dataset_info.json")]
-    return ["README.md", "dataset_dict.json", RIG_FILE, *states]
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_atomically(path, json.dumps(content, indent=1).encode() + b"\n")
+    return ["README.md", RIG_FILE, *contents]
 
 
 @dataclass(frozen=True)
