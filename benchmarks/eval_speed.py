@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
 from fpp_ml_bench.evaluation.protocol import HEADLINE
-from fpp_ml_bench.loaders.storage import Manifest, Row, ShardFile, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage import Manifest, ShardFile, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 COVER = 0.1
@@ -102,8 +103,8 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
         written, rows_described = ShardWriter(
-            data, data / ".build", plan, PAPER_SEQUENCE, "single_shot", False, (size, size)
-        ).write(rows)
+            data, data / ".build", PAPER_SEQUENCE, "single_shot", False, (size, size)
+        ).write(plan, rows)
         shards += written
         described += rows_described
     (data / ".build").rmdir()

@@ -71,25 +71,18 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
     rig, studio = settings.rig, Studio(settings)
     mesh = solid_mesh(settings.objects[0])
     vertices_m, _ = place(mesh, "A60", rig, "fixed", settings.seed)
-    traced = TracedObject(mesh, vertices_m)
-    rays = PixelRays.of(rig.camera)
-    hits = traced.primary(rays)
-    lit = lit_object(hits, rig, studio.lighting, traced)
-    whole = studio.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
+    rays, scene = PixelRays.of(rig.camera), studio.trace(mesh, "A60")
+    traced, hits, whole = scene.traced, scene.hits, studio.light(scene)
     row = studio.photograph(mesh, "A60")
     frames = [row.frames[i] for i in range(len(rig.sequence))]
     seen = np.zeros(row.depth_mm.shape, dtype=bool)
     seen.ravel()[hits.pixels] = True
-    stream = (settings.seed, mesh.name, "A60")
     count = len(frames)
     times = [
         ("triangles of the mesh", median_ms(lambda: TracedObject(mesh, vertices_m))),
         ("visible triangle, exact depth", median_ms(lambda: traced.primary(rays))),
         ("illumination of the object", median_ms(lambda: lit_object(hits, rig, studio.lighting, traced))),
-        (
-            f"{count} exposures with noise",
-            median_ms(lambda: studio.expose(hits, lit, whole, stream)),
-        ),
+        (f"{count} exposures with noise", median_ms(lambda: studio.expose(scene, whole))),
         ("decoded ground truth (object only)", median_ms(lambda: decode_stack(frames, rig, mask=seen))),
     ]
     return [(name, ms, ms / count) for name, ms in times]
@@ -100,13 +93,8 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
     import cv2
 
     rig, studio = settings.rig, Studio(settings)
-    mesh = solid_mesh(settings.objects[0])
-    vertices_m, _ = place(mesh, "A60", rig, "fixed", settings.seed)
-    traced = TracedObject(mesh, vertices_m)
-    hits = traced.primary(PixelRays.of(rig.camera))
-    lit = studio.backdrop.behind(traced, hits.pixels).patched(
-        hits.pixels, lit_object(hits, rig, studio.lighting, traced)
-    )
+    scene = studio.trace(solid_mesh(settings.objects[0]), "A60")
+    hits, lit = scene.hits, studio.light(scene)
     shape = (rig.camera.height, rig.camera.width)
     x, y = rig.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * rig.background_m

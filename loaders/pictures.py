@@ -2,88 +2,75 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import VIEWS, sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 _TILE_PX = 120
 _DPI = 110
+_GREY = "gray"
 
 
 def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh."""
     from matplotlib.figure import Figure
 
-    sequence = dataset.sequence
-    stored = set(stored_frames(sequence, dataset.manifest.stored))
-    # The third finest Gray bit: its stripes are still visible in a small picture.
-    codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
-    shown_frames = [0, sequence.sinusoids("vertical")[0], *codes, sequence.white]
-    panels: list[tuple[str, Callable[[Axes], None]]] = []
-    for index in (i for i in shown_frames if i in stored):
-        panels.append((sequence.frames[index].title, _grey(dataset.frame(sample, index))))
-    depth_mm = dataset.depth_mm(sample)
-    inside = object_mask(depth_mm)
-    low, high = float(depth_mm[inside].min()), float(depth_mm.max())
-    panels.append((f"depth, {low:.0f}-{high:.0f} mm", _colours(_hidden(depth_mm, inside), "viridis", low, high, "mm")))
-    if dataset.has_exact:
-        exact_mm = dataset.depth_mm(sample, "depth_exact")
-        error_mm = depth_mm - exact_mm
-        limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
-        panels.append(("exact depth", _colours(_hidden(exact_mm, object_mask(exact_mm)), "viridis", low, high, "mm")))
-        panels.append(
-            (f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm",
-             _colours(_hidden(error_mm, inside), "coolwarm", -limit, limit, "mm"))
-        )  # fmt: skip
-    cover = 100 * inside.mean()
-    panels.append((f"object mask, {cover:.1f}% of the image", _grey(inside.astype(np.uint8) * 255)))
-    mesh = dataset.path / "meshes" / f"{dataset.measured(sample)['object']}.ply"
-    if mesh.is_file():
-        panels.append(("ground-truth mesh", _grey(_mesh_picture(mesh, 480))))
+    panels = _panels(dataset, sample)
     columns = 5
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.4 * columns, 3.7 * rows), dpi=_DPI, layout="constrained")
     figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
-    for number, (title, draw) in enumerate(panels):
+    for number, (title, image, colours, low, high) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)
-        draw(axes)
+        if colours == _GREY:
+            axes.imshow(image, cmap=colours, vmin=low, vmax=high)
+        else:
+            drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+            bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
+            bar.set_label("mm", fontsize=8)
+            bar.ax.tick_params(labelsize=7)
         axes.set_title(title, fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])
     _save(figure.savefig, path)
 
 
-def _grey(image: NDArray) -> "Callable[[Axes], None]":
-    def draw(axes: "Axes") -> None:
-        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-
-    return draw
+Panel = tuple[str, NDArray, str, float, float]
+"""Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
 
 
-def _colours(image: NDArray, colours: str, low: float, high: float, unit: str) -> "Callable[[Axes], None]":
-    def draw(axes: "Axes") -> None:
-        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
-        bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-        bar.set_label(unit, fontsize=8)
-        bar.ax.tick_params(labelsize=7)
-
-    return draw
-
-
-def _hidden(image: NDArray, inside: NDArray[np.bool_]) -> NDArray:
-    return np.where(inside, image, np.nan)
+def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
+    sequence, stored = dataset.sequence, dataset.manifest.stored_frames
+    # The third finest Gray bit: its stripes are still visible in a small picture.
+    codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
+    frames = [i for i in (0, sequence.sinusoids("vertical")[0], *codes, sequence.white) if i in stored]
+    panels: list[Panel] = [(sequence.frames[i].title, dataset.frame(sample, i), _GREY, 0, 255) for i in frames]
+    depth_mm = dataset.depth_mm(sample)
+    inside = object_mask(depth_mm)
+    low, high = float(depth_mm[inside].min()), float(depth_mm.max())
+    title = f"depth, {low:.0f}-{high:.0f} mm"
+    panels.append((title, np.where(inside, depth_mm, np.nan), "viridis", low, high))
+    if dataset.has_exact:
+        exact_mm = dataset.depth_mm(sample, "depth_exact")
+        error_mm = depth_mm - exact_mm
+        limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
+        title = f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm"
+        panels.append(("exact depth", np.where(object_mask(exact_mm), exact_mm, np.nan), "viridis", low, high))
+        panels.append((title, np.where(inside, error_mm, np.nan), "coolwarm", -limit, limit))
+    title = f"object mask, {100 * inside.mean():.1f}% of the image"
+    panels.append((title, inside.astype(np.uint8) * 255, _GREY, 0, 255))
+    mesh = dataset.path / "meshes" / f"{dataset.measured(sample)['object']}.ply"
+    if mesh.is_file():
+        panels.append(("ground-truth mesh", _mesh_picture(mesh, 480), _GREY, 0, 255))
+    return panels
 
 
 def _save(save: Callable[..., None], path: Path) -> None:
@@ -96,10 +83,8 @@ def _save(save: Callable[..., None], path: Path) -> None:
 
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     """The mesh seen from above and the side, lit from the viewer; uint8 (size, size)."""
-    from fpp_ml_bench.loaders.render import PixelRays, TracedObject, UserMesh, load_user_mesh, turned
-
-    mesh = load_user_mesh(UserMesh(path.stem, str(path), centre=False))
-    vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
+    mesh = render.load_user_mesh(render.UserMesh(path.stem, str(path), centre=False))
+    vertices_m = render.turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
     tilt = np.deg2rad(25.0)
     rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     vertices_m = vertices_m @ rotation.T
@@ -107,7 +92,8 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     distance = 4.0 * radius
     line = np.linspace(-1, 1, size) * (1.05 * radius / distance)
     x, y = np.meshgrid(line, line)
-    hits = TracedObject(mesh, vertices_m + np.array([0, 0, distance])).primary(PixelRays(x, y))
+    traced = render.TracedObject(mesh, vertices_m + np.array([0, 0, distance]))
+    hits = traced.primary(render.PixelRays(x, y))
     toward = -np.column_stack([x.ravel()[hits.pixels], y.ravel()[hits.pixels], np.ones(hits.pixels.size)])
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     picture = np.full(size * size, 255, dtype=np.uint8)
@@ -117,12 +103,9 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
 
 def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
     """Write all objects (two per line) in their six views as a PNG, in white light if that frame is stored."""
-    import cv2
-
     samples = dataset.samples(split)
     objects = list(dict.fromkeys(dataset.measured(sample)["object"] for sample in samples))
-    available = stored_frames(dataset.sequence, dataset.manifest.stored)
-    index = dataset.sequence.white if dataset.sequence.white in available else 0
+    index = dataset.sequence.white if dataset.sequence.white in dataset.manifest.stored_frames else 0
     label_px, columns = 18, 2
     line_px = _TILE_PX + label_px
     lines = -(-len(objects) // columns)

@@ -1,4 +1,4 @@
-"""The dataset's columns, and the files they live in.
+"""A dataset's rows and columns, and the files that the columns live in.
 
 There is one row per object and view, and one column PER FRAME, so that reading a frame costs a single frame (a stacked
 column would decode all 52). Columns are stored in *groups* of separate files, so that no pixel is stored twice and a
@@ -12,20 +12,36 @@ configuration opens only the files it needs:
 The ``data`` group alone is the `single_shot` configuration, which plain ``datasets`` can open without this package.
 """
 
-import json
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.optics import CONFIGS, Sequence
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")
 DEPTH, DEPTH_EXACT = "depth", "depth_exact"
 RANGE = ("depth_min", "depth_max")
 SINGLE_SHOT_FRAME = 0
+
+
+@dataclass
+class Row:
+    """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest.
+
+    The images' memory may be reused as soon as the writer takes the next row.
+    """
+
+    sample: str
+    object: str
+    view: str
+    frames: dict[int, NDArray[np.uint8]]
+    depth_mm: NDArray[np.float32]
+    depth_exact_mm: NDArray[np.float32] | None
+    measured: dict[str, Any] = field(default_factory=dict)
 
 
 def stored_groups(sequence: Sequence, stored: str) -> dict[str, tuple[int, ...]]:
@@ -51,10 +67,22 @@ def available_configs(sequence: Sequence, stored: str) -> tuple[str, ...]:
     return tuple(config for config in CONFIGS if available.issuperset(sequence.config(config)))
 
 
+def row_columns(sequence: Sequence, frames: tuple[int, ...], exact: bool) -> list[str]:
+    """Columns of a table with ``frames``, in order: labels, frames, depths, range."""
+    names = [sequence.frames[i].column for i in frames]
+    return [*LABELS, *names, DEPTH, *([DEPTH_EXACT] if exact else []), *RANGE]
+
+
 def config_columns(sequence: Sequence, config: str, exact: bool) -> list[str]:
     """Column names of a configuration, in order."""
-    frames = [sequence.frames[i].column for i in sequence.config(config)]
-    return [*LABELS, *frames, DEPTH, *([DEPTH_EXACT] if exact else []), *RANGE]
+    return row_columns(sequence, sequence.config(config), exact)
+
+
+def group_columns(sequence: Sequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
+    """Column names of a group's files, in order."""
+    if group == DATA_GROUP:
+        return row_columns(sequence, frames, exact)
+    return [sequence.frames[i].column for i in frames]
 
 
 def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
@@ -63,43 +91,8 @@ def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, A
 
 
 def _feature(name: str, size: tuple[int, int]) -> dict[str, Any]:
-    if name in LABELS:
-        return {"dtype": "string", "_type": "Value"}
-    if name in RANGE:
-        return {"dtype": "float32", "_type": "Value"}
-    if name in (DEPTH, DEPTH_EXACT):
-        return {"shape": list(size), "dtype": "float32", "_type": "Array2D"}
-    if name.startswith("frame_"):
-        return {"shape": list(size), "dtype": "uint8", "_type": "Array2D"}
+    if name in LABELS or name in RANGE:
+        return {"dtype": "string" if name in LABELS else "float32", "_type": "Value"}
+    if name in (DEPTH, DEPTH_EXACT) or name.startswith("frame_"):
+        return {"shape": list(size), "dtype": "uint8" if name.startswith("frame_") else "float32", "_type": "Array2D"}
     raise DatasetError(f"unknown column {name!r}")
-
-
-def group_columns(sequence: Sequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
-    """Column names of a group's files, in order."""
-    names = [sequence.frames[i].column for i in frames]
-    if group != DATA_GROUP:
-        return names
-    return [*LABELS, *names, DEPTH, *([DEPTH_EXACT] if exact else []), *RANGE]
-
-
-def arrow_schema(columns: list[str], size: tuple[int, int]) -> "pa.Schema":
-    """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``.
-
-    Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
-    metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
-    """
-    import pyarrow as pa
-
-    fields = []
-    described = features(columns, size)
-    for name, feature in described.items():
-        if feature["_type"] == "Array2D":
-            metadata = {
-                b"ARROW:extension:name": b"datasets.features.features.Array2DExtensionType",
-                b"ARROW:extension:metadata": json.dumps([feature["shape"], feature["dtype"]]).encode(),
-            }
-            value = pa.uint8() if feature["dtype"] == "uint8" else pa.float32()
-            fields.append(pa.field(name, pa.list_(pa.list_(value)), metadata=metadata))
-        else:
-            fields.append(pa.field(name, pa.string() if feature["dtype"] == "string" else pa.float32()))
-    return pa.schema(fields, metadata={b"huggingface": json.dumps({"info": {"features": described}}).encode()})

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from fpp_ml_bench.compiled import numba_enabled
+from fpp_ml_bench.compiled import njit, numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
@@ -123,8 +123,13 @@ def unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
     """Grey levels / 255 into ``out``: a product with the float32 reciprocal, within 1 unit in the last place."""
     factor = np.float32(1 / GREY_LEVELS)
     if numba_enabled():
-        from fpp_ml_bench.loaders.training_kernel import scale_kernel
-
-        scale_kernel(grey.reshape(-1), out.reshape(-1), factor)
+        _scale(grey.reshape(-1), out.reshape(-1), factor)
     else:
         np.multiply(grey, factor, out=out)
+
+
+@njit
+def _scale(grey, out, factor):  # type: ignore[no-untyped-def]
+    """``out`` float32 (n,) = ``grey`` uint8 (n,) x ``factor`` float32, in one pass over memory."""
+    for k in range(grey.size):
+        out[k] = np.float32(grey[k]) * factor

@@ -9,6 +9,10 @@ import h5py
 import numpy as np
 import scipy.io
 
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.loaders.published import import_tree, plan_import
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
 SIZE = (24, 24)
 SPLITS = {"train": ("bowl",), "val": ("mug",), "test": ("power_drill", "my_own_part")}
 """Published folder names, and an object that is not among the benchmark's 50."""
@@ -82,6 +86,15 @@ def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
                     root / TRAINING / f"info_depth_params/{split}/depth/{stem}.mat", depth_min=low, depth_max=high
                 )
     return root
+
+
+def imported(tree, out, workers=1, **settings):
+    import_tree(out, plan_import(tree, **settings), workers)
+    return DatasetFolder(out)
+
+
+def command(*words):
+    return main([str(word) for word in words])
 
 
 def fringe_path(root, split="test", stem="power_drill_A60", variant="raw"):

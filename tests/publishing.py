@@ -14,7 +14,8 @@ import numpy as np
 from hub_server import HubServer
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWriter, describe_file, plan_shards
+from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, describe_file, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -41,8 +42,7 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
                 frames = dict(enumerate(rng.integers(0, 256, (len(PAPER_SEQUENCE), *SIZE), dtype=np.uint8)))
                 depth = np.nextafter(disk_depth(SIZE, len(rows)), np.float32(5000)).astype(np.float32)
                 rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001)))
-            writer = ShardWriter(folder, scratch, plan, PAPER_SEQUENCE, "all", True, SIZE)
-            files, described = writer.write(rows)
+            files, described = ShardWriter(folder, scratch, PAPER_SEQUENCE, "all", True, SIZE).write(plan, rows)
             shards += files
             samples.setdefault(split, []).extend(described)
     shutil.rmtree(scratch)

@@ -8,7 +8,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
@@ -51,6 +52,7 @@ def make_dataset(
     """
     scratch = folder / ".build"
     scratch.mkdir(parents=True)
+    writer = ShardWriter(folder, scratch, PAPER_SEQUENCE, "single_shot", exact, size)
     shards, samples = [], {}
     for number, (split, names) in enumerate(OBJECTS.items()):
         objects = {name: [(f"{name}_{view}", name, view) for view in views] for name in names}
@@ -65,9 +67,7 @@ def make_dataset(
                 rows.append(
                     Row(sample, name, view, {0: frame}, depth, depth + np.float32(0.5) * (depth > 0) if exact else None)
                 )
-            written, described = ShardWriter(folder, scratch, plan, PAPER_SEQUENCE, "single_shot", exact, size).write(
-                rows
-            )
+            written, described = writer.write(plan, rows)
             shards += written
             samples.setdefault(split, []).extend(described)
     scratch.rmdir()

@@ -5,23 +5,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpp_ml_bench.constants import VIEWS
-from fpp_ml_bench.loaders.storage import Assembly, Manifest, Row, ShardWriter, assemble, plan_shards
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage import Assembly, Manifest, assemble, plan_shards
+from fpp_ml_bench.optics import paper_rig
 
 SIZE = (12, 16)
 SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_drill",)}
 
 
 @dataclass(frozen=True)
-class SyntheticShard:
+class SyntheticRows:
     """Rows of noise, a seed per sample; ``same`` gives a sample the frame of another, ``spoil`` a wrong depth."""
 
     same: tuple[tuple[str, str], ...] = ()
     spoil: tuple[str, float] | None = None
 
-    def __call__(self, folder, scratch, plan, row_done):
-        writer = ShardWriter(folder, scratch, plan, PAPER_SEQUENCE, "single_shot", True, SIZE)
-        return writer.write((self.row(*sample) for sample in plan.samples), row_done)
+    def __call__(self, plan, folder):
+        return (self.row(*sample) for sample in plan.samples)
 
     def row(self, sample, name, view):
         def noise(label):
@@ -46,5 +46,5 @@ def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):
         origin=origin, generator={"name": "test", "version": "0"}, settings={}, rig=paper_rig().to_dict(), size=SIZE,
         stored="single_shot", exact=True, samples={}, shards=[],
     )  # fmt: skip
-    assemble(folder, Assembly(plans, SyntheticShard(**changes), manifest, 0), workers=1)
+    assemble(folder, Assembly(plans, SyntheticRows(**changes), manifest), workers=1)
     return folder

@@ -1,16 +1,16 @@
 """``fpp-bench build``: generate the benchmark."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from time import perf_counter
 
+from fpp_ml_bench import optics
+from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.optics import CONFIGS
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.render import BuildSettings
-    from fpp_ml_bench.loaders.storage import Manifest
+from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."
 EXAMPLES = (
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
-    parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
+    parser.add_argument("--frames", choices=optics.CONFIGS, default="all", help="frames to store (default: all)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
@@ -45,36 +45,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_explain_options(parser)
 
 
-def settings_of(args: argparse.Namespace) -> "BuildSettings":
+def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     """Build settings that the arguments ask for; raises `BuildError`, `MeshError` or `RigError`."""
-    from dataclasses import replace
-
-    from fpp_ml_bench.loaders.render import PRESETS, BuildSettings, read_mesh_list, single_mesh
-    from fpp_ml_bench.optics import bits_needed, load_rig, paper_rig
-
-    objects, size = PRESETS[args.preset]
+    objects, size = render.PRESETS[args.preset]
     if args.size is not None and not 1 <= args.size <= 8192:
         raise BuildError(f"--size {args.size}: expected 1 to 8192 px")
-    rig = paper_rig(args.size or size) if args.rig is None else load_rig(args.rig)
+    rig = optics.paper_rig(args.size or size) if args.rig is None else optics.load_rig(args.rig)
     if args.rig is not None and args.size is not None:
         rig = rig.scaled(args.size)
     if args.pitch is not None:
         sequence = rig.sequence
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
+            horizontal, vertical = (
+                optics.bits_needed(rig.pattern_length(direction), args.pitch) for direction in optics.DIRECTIONS
+            )
             sequence = replace(
                 sequence,
-                bits_horizontal=max(
-                    sequence.bits_horizontal, bits_needed(rig.pattern_length("horizontal"), args.pitch)
-                ),
-                bits_vertical=max(sequence.bits_vertical, bits_needed(rig.pattern_length("vertical"), args.pitch)),
+                bits_horizontal=max(sequence.bits_horizontal, horizontal),
+                bits_vertical=max(sequence.bits_vertical, vertical),
             )
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
-    meshes = (read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(single_mesh, args.mesh))
+    meshes = (render.read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(render.single_mesh, args.mesh))
     if args.objects is not None:
         objects = tuple(name.strip() for name in args.objects.split(",") if name.strip())
     elif meshes:
         objects = ()
-    return BuildSettings(
+    return render.BuildSettings(
         rig=rig,
         objects=(*objects, *(mesh.name for mesh in meshes)),
         placement=args.placement,
@@ -92,20 +88,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from time import perf_counter
-
-    from fpp_ml_bench.cli.console import progress_bar
-    from fpp_ml_bench.loaders.render import assembly_of, build
-    from fpp_ml_bench.loaders.sample import stored_frames
-    from fpp_ml_bench.machine import usable_cores
-
     settings = settings_of(args)
     workers = usable_cores() if args.workers is None else args.workers
     if workers < 1:
         raise BuildError(f"--workers {workers}: expected 1 or more")
-    assembly = assembly_of(settings)
+    assembly = render.assembly_of(settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
-    frames = len(stored_frames(settings.rig.sequence, settings.stored))
+    frames = len(assembly.manifest.stored_frames)
     steps: list[int] = []
     started = perf_counter()
     with progress_bar("building", rows, "images", frames) as advance:
@@ -114,25 +103,17 @@ def _run(args: argparse.Namespace) -> int:
             steps.append(finished)
             advance(finished)
 
-        manifest = build(args.out, settings, workers, count)
+        manifest = render.build(args.out, settings, workers, count)
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
-    _summary(args.out, manifest, rows * frames, sum(steps[1:]) * frames, seconds)
-    from fpp_ml_bench.loaders.render import explain_build
-
-    explain(args, lambda: explain_build(manifest, settings))
-    return 0
-
-
-def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: float) -> None:
-    from fpp_ml_bench.cli.console import gigabytes, say_benchmark
-    from fpp_ml_bench.loaders.storage import ground_truth_summary
-
-    size = sum(file.bytes for file in manifest.files)
-    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
+    made = sum(steps[1:]) * frames
     rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
-    print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)}; {rate}")
-    for line in ground_truth_summary(manifest):
+    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
+    size = gigabytes(sum(file.bytes for file in manifest.files))
+    print(f"{args.out}: {parts} samples, {rows * frames:,} images, {size}; {rate}")
+    for line in storage.ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)
-    print(f"next: fpp-bench info {out}")
+    print(f"next: fpp-bench info {args.out}")
+    explain(args, lambda: render.explain_build(manifest, settings))
+    return 0

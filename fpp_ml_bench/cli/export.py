@@ -3,7 +3,10 @@
 import argparse
 from pathlib import Path
 
+from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns."
 EXAMPLES = (
@@ -27,18 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export. Raises FppBenchError for an unusable dataset, form or folder."""
-    from fpp_ml_bench.cli.console import gigabytes, progress_bar
-    from fpp_ml_bench.loaders.storage import FORMS, SAMPLE_FORMS, DatasetFolder, chosen_splits, export
-    from fpp_ml_bench.machine import usable_cores
-
-    forms = [form for form in FORMS if getattr(args, form)]
+    forms = [form for form in storage.FORMS if getattr(args, form)]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
-    dataset = DatasetFolder(args.dataset)
-    splits = chosen_splits(dataset, args.split)
+    dataset = storage.DatasetFolder(args.dataset)
+    splits = storage.chosen_splits(dataset, args.split)
     samples = sum(len(dataset.samples(split)) for split in splits)
-    with progress_bar("exporting", samples * sum(form in SAMPLE_FORMS for form in forms), "samples") as advance:
-        export(dataset, args.out, forms, splits, usable_cores(), advance)
+    with progress_bar("exporting", samples * sum(form in storage.SAMPLE_FORMS for form in forms), "samples") as advance:
+        storage.export(dataset, args.out, forms, splits, usable_cores(), advance)
     files = [path for path in args.out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{args.out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders import storage
 
 SUMMARY = "One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."
 EXAMPLES = (
@@ -24,15 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-
     if args.sheet == (args.sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json` lists the samples")
     out = args.out or Path("sheet.png" if args.sheet else f"{args.sample}.png")
     if out.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
-    dataset = DatasetFolder(args.dataset)
+    dataset = storage.DatasetFolder(args.dataset)
+    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
+
     if args.sheet:
         contact_sheet(dataset, args.split, out)
     else:

@@ -15,8 +15,8 @@ from fpp_ml_bench.leaderboard.ranking import rank, shipped_rows
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.tradeoff.ladder import Ladder, Rung
 from fpp_ml_bench.loaders.render import BuildSettings, build, single_mesh, solid_mesh, write_ply
-from fpp_ml_bench.loaders.sample import stored_frames
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.sample import Row, stored_frames
+from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, Rig
 
 BUILT_OBJECTS, QUICK_OBJECTS = (1, 2, 4, 8), (1, 2, 3)
@@ -68,9 +68,9 @@ def written_dataset(folder: Path, objects: int, size: int, stored: str = "single
     shards, samples = [], []
     names = [f"object_{number:04d}" for number in range(objects)]
     samples_by_object = {name: [(sample_name(name, view), name, view) for view in VIEWS[:views]] for name in names}
+    writer = ShardWriter(target, scratch, PAPER_SEQUENCE, stored, True, (size, size))
     for plan in plan_shards("test", samples_by_object):
-        writer = ShardWriter(target, scratch, plan, PAPER_SEQUENCE, stored, True, (size, size))
-        files, rows = writer.write(Row(*where, frames, depth_mm, depth_mm) for where in plan.samples)
+        files, rows = writer.write(plan, (Row(*where, frames, depth_mm, depth_mm) for where in plan.samples))
         shards += files
         samples += rows
     from fpp_ml_bench.optics import paper_rig

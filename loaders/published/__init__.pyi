@@ -2,11 +2,12 @@ from .export import write_tree as write_tree
 from .importing import import_notes as import_notes
 from .importing import import_tree as import_tree
 from .importing import plan_import as plan_import
-from .layout import DEPTH as DEPTH
-from .layout import FRINGE as FRINGE
-from .layout import TRAINING as TRAINING
-from .layout import VARIABLES as VARIABLES
-from .layout import VARIANT_FOLDERS as VARIANT_FOLDERS
 from .mat_files import parse_matrix as parse_matrix
 from .order import FrameOrder as FrameOrder
 from .order import parse_order as parse_order
+from .png import png_chunks as png_chunks
+from .tree import DEPTH as DEPTH
+from .tree import FRINGE as FRINGE
+from .tree import TRAINING as TRAINING
+from .tree import VARIABLES as VARIABLES
+from .tree import VARIANT_FOLDERS as VARIANT_FOLDERS

@@ -5,7 +5,7 @@ float64, from which the same float32 mm are recovered; float32 would be off by a
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import Normalisation, normalise, object_mask
-from fpp_ml_bench.loaders.published.layout import (
+from fpp_ml_bench.loaders.published.mat_files import matrix_bytes
+from fpp_ml_bench.loaders.published.png import png_bytes
+from fpp_ml_bench.loaders.published.tree import (
     BACKGROUND_REMOVED_FOLDERS,
     DEPTH,
     FRINGE,
@@ -30,8 +32,6 @@ from fpp_ml_bench.loaders.published.layout import (
     WRAPPED_PHASE_VARIABLE,
     frame_file,
 )
-from fpp_ml_bench.loaders.published.mat_files import matrix_bytes
-from fpp_ml_bench.loaders.published.png import png_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage import DatasetFolder, depth_range_mm
 from fpp_ml_bench.optics import Direction
@@ -48,18 +48,10 @@ def write_tree(
     ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
     ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
     """
-    with ThreadPoolExecutor(threads) as pool:
-        jobs = [
-            pool.submit(_write_sample, dataset, folder, split, sample)
-            for split in splits for sample in dataset.samples(split)
-        ]  # fmt: skip
-        try:
-            for job in as_completed(jobs):
-                job.result()
-                row_done()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
+    with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
+        for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
+            row_done()
 
 
 def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str) -> None:

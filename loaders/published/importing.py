@@ -1,52 +1,209 @@
-"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build."""
+"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build.
 
-from collections.abc import Callable, Iterator
+`SampleReader` reads a sample, fringe, depth in mm and raw frames, with every check on their contents.
+"""
+
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fpp_ml_bench import __version__
+from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.layout import VARIANT_FOLDERS, layout_error
+from fpp_ml_bench.loaders.published.mat_files import read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.png import read_grey_png
-from fpp_ml_bench.loaders.published.reading import SampleReader
-from fpp_ml_bench.loaders.published.tree import PublishedSample, PublishedTree, scan_tree
-from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, stored_frames
+from fpp_ml_bench.loaders.published.tree import (
+    INFO_VARIABLES,
+    VARIABLES,
+    VARIANT_FOLDERS,
+    PublishedSample,
+    PublishedTree,
+    layout_error,
+    scan_tree,
+)
+from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
 from fpp_ml_bench.loaders.storage import (
     MANIFEST,
     WORK_FOLDER,
     Assembly,
     Manifest,
     Progress,
-    Receipt,
-    Row,
     ShardPlan,
-    ShardWriter,
     assemble,
     plan_shards,
 )
-from fpp_ml_bench.optics import Rig, Sequence, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig
 
 IMPORTED = "imported"
 _CHECK_THREADS = 4
 _MOST_SCANS_TRIED = 6
+AGREEMENT_MM = 0.01
+"""Accepted difference between variants of a depth map: float32 in m is exact to 0.0001 mm, and a wrong unit or file
+differs by mm."""
+_UNIT_SLACK = 10.0
+_ROUNDING = 1e-6
+_SHOWN_MISFITS = 3
+
+
+@contextmanager
+def _listed(problems: list[str]) -> Iterator[None]:
+    """Add a `LayoutError` inside the block to ``problems``."""
+    try:
+        yield
+    except LayoutError as error:
+        problems.append(str(error))
 
 
 @dataclass(frozen=True)
-class ImportShard:
-    """Picklable work of a shard: read and check its samples' files and write the rows, holding one sample in memory."""
+class SampleReader:
+    """Reads the samples of a tree. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
+
+    size: tuple[int, int]
+    variants: tuple[Normalisation, ...]
+    rig: Rig
+    order: FrameOrder | None
+
+    def read(self, sample: PublishedSample) -> Row:
+        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line per wrong file."""
+        row, problems = self._read(sample)
+        if row is None:
+            raise LayoutError("\n".join(problems))
+        return row
+
+    def problems(self, sample: PublishedSample) -> list[str]:
+        """Problems of the sample's files, a line each; empty when the sample can be read."""
+        return self._read(sample)[1]
+
+    def _read(self, sample: PublishedSample) -> tuple[Row | None, list[str]]:
+        problems: list[str] = []
+        fringe, *copies = self._images(sample.fringes, problems)
+        if fringe is not None:
+            problems += [
+                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
+                for path, image in zip(sample.fringes[1:], copies, strict=True)
+                if image is not None and not np.array_equal(image, fringe)
+            ]
+        depth_mm = self._depth_mm(sample, problems)
+        files = self._images(sample.frames, problems)
+        frames = {} if fringe is None else {SINGLE_SHOT_FRAME: fringe}
+        present = [image for image in files if image is not None]
+        if files and len(present) == len(files):
+            if fringe is not None and not np.array_equal(present[0], fringe):
+                problems.append(f"{sample.frames[0]}: differs from the single-shot input {sample.fringes[0]}")
+            if self.order is not None:
+                problems += self._misfits(sample, present, self.order)
+                ordered = self.order.frames(self.rig.sequence)
+                frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
+        if problems or depth_mm is None:
+            return None, problems
+        return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None), problems
+
+    def _images(self, paths: tuple[Path, ...], problems: list[str]) -> list[NDArray[np.uint8] | None]:
+        images: list[NDArray[np.uint8] | None] = [None] * len(paths)
+        for number, path in enumerate(paths):
+            with _listed(problems):
+                images[number] = read_grey_png(path)
+        return images
+
+    def _misfits(self, sample: PublishedSample, files: list[NDArray[np.uint8]], order: FrameOrder) -> list[str]:
+        misfits = check_order(files, order, self.rig)
+        if not misfits:
+            return []
+        fitting = find_order(files, self.rig)
+        hint = "it fits no named order" if fitting is None else f"it has the order {fitting.name}"
+        more = f" (and {len(misfits) - _SHOWN_MISFITS} more)" if len(misfits) > _SHOWN_MISFITS else ""
+        shown = "; ".join(misfits[:_SHOWN_MISFITS])
+        return [f"{sample.frames[0].parent}: not in frame order {order.name}, {hint}: {shown}{more}"]
+
+    def _depth_mm(self, sample: PublishedSample, problems: list[str]) -> NDArray[np.float32] | None:
+        """Depth from the first variant; the other variants and the depth range must agree with it."""
+        maps: list[tuple[Normalisation, Path, NDArray[np.float64]]] = []
+        limits = self._range_mm(sample, problems)
+        for variant, path in zip(self.variants, sample.depths, strict=True):
+            if variant == "individual" and limits is None:
+                continue
+            with _listed(problems):
+                values = read_matrix(path, VARIABLES[variant])
+                maps.append((variant, path, self._to_mm(path, values, variant, limits or (0.0, 0.0))))
+        if not maps or maps[0][1] != sample.depths[0]:
+            return None
+        depth_mm = maps[0][2].astype(np.float32)
+        for variant, path, variant_mm in maps[1:]:
+            difference_mm = _disagreement_mm(variant_mm, depth_mm, variant)
+            if difference_mm > AGREEMENT_MM:
+                problems.append(
+                    f"{path}: differs from {sample.depths[0]} by up to {difference_mm:.3f} mm; expected at "
+                    f"most {AGREEMENT_MM} mm"
+                )
+        if limits is not None and self.variants[0] != "individual":
+            inside = depth_mm[object_mask(depth_mm)]
+            actual = float(inside.min()), float(inside.max())
+            if max(abs(a - b) for a, b in zip(actual, limits, strict=True)) > AGREEMENT_MM:
+                problems.append(
+                    f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {sample.depths[0]} has "
+                    f"{actual[0]:.3f} to {actual[1]:.3f} mm"
+                )
+        return depth_mm
+
+    def _range_mm(self, sample: PublishedSample, problems: list[str]) -> tuple[float, float] | None:
+        with _listed(problems):
+            if sample.info is not None:
+                low, high = (read_scalar(sample.info, name) for name in INFO_VARIABLES)
+                if 0 < low <= high:
+                    return low, high
+                problems.append(f"{sample.info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
+        return None
+
+    def _to_mm(
+        self, path: Path, values: NDArray, variant: Normalisation, limits: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        if values.shape != self.size:
+            raise LayoutError(f"{path}: expected {self.size[0]} x {self.size[1]} like the images, got {values.shape}")
+        if not np.isfinite(values).all():
+            raise LayoutError(f"{path}: {np.count_nonzero(~np.isfinite(values))} pixels are NaN or infinite")
+        if (values < 0).any():
+            raise LayoutError(f"{path}: {np.count_nonzero(values < 0)} pixels are negative; background is 0")
+        inside = object_mask(values)
+        if not inside.any():
+            raise LayoutError(f"{path}: no pixel is above 0, so there is no object")
+        if variant == "individual" and values.max() > 1 + _ROUNDING:
+            raise LayoutError(f"{path}: expected values in [0, 1], got up to {values.max():g}")
+        depth_mm = np.where(inside, denormalise(values, variant, *limits), 0.0)
+        near, far = self.rig.working_range_mm
+        low, high = float(depth_mm[inside].min()), float(depth_mm[inside].max())
+        if low < near / _UNIT_SLACK or high > far * _UNIT_SLACK:
+            unit = "m" if variant == "global" else "mm"
+            raise LayoutError(
+                f"{path}: depths of {low:.4g} to {high:.4g} mm when {VARIABLES[variant]} is read in {unit}; the "
+                f"working range is {near:g} to {far:g} mm, so the file has another unit"
+            )
+        return depth_mm
+
+
+def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float32], variant: Normalisation) -> float:
+    expected = depth_mm.astype(np.float64)
+    if variant == "individual":
+        # By the paper's rule, pixels at the sample's least depth are 0 in this variant.
+        inside = expected[object_mask(expected)]
+        share = normalise(expected, "individual", float(inside.min()), float(inside.max()))
+        expected = np.where(object_mask(share), expected, 0.0)
+    return float(np.abs(variant_mm - expected).max())
+
+
+@dataclass(frozen=True)
+class ImportedRows:
+    """Picklable source of an import's rows: reads and checks the files of one sample after the other."""
 
     samples: dict[str, PublishedSample]
     reader: SampleReader
-    stored: str
 
-    def __call__(self, folder: Path, scratch: Path, plan: ShardPlan, row_done: Callable[[], None]) -> Receipt:
-        sequence = self.reader.rig.sequence
-        writer = ShardWriter(folder, scratch, plan, sequence, self.stored, False, self.reader.size)
-        return writer.write(self._rows(plan), row_done)
-
-    def _rows(self, plan: ShardPlan) -> Iterator[Row]:
+    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
         for stem, _, _ in plan.samples:
             yield self.reader.read(self.samples[stem])
 
@@ -102,13 +259,9 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         size=tree.size,
         stored=stored,
         exact=False,
-        samples={},
-        shards=[],
     )
-    work = ImportShard({sample.sample: sample for sample in tree.all_samples()}, reader, stored)
-    # One byte a frame and one float32 depth map.
-    bytes_per_row = tree.size[0] * tree.size[1] * (len(stored_frames(rig_used.sequence, stored)) + 4)
-    return ImportPlan(tree, reader, Assembly(plans, work, manifest, bytes_per_row))
+    rows = ImportedRows({sample.sample: sample for sample in tree.all_samples()}, reader)
+    return ImportPlan(tree, reader, Assembly(plans, rows, manifest))
 
 
 def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
@@ -144,8 +297,7 @@ def import_notes(manifest: Manifest) -> list[str]:
     if settings["frame_order"]:
         notes.append(f"frame order of the raw scans: {settings['frame_order']}")
         order = parse_order(settings["frame_order"])
-        sequence = Sequence(**manifest.rig["sequence"])
-        first_file = (order or FrameOrder()).frames(sequence)[0]
+        first_file = (order or FrameOrder()).frames(manifest.sequence)[0]
         if first_file.index != SINGLE_SHOT_FRAME:
             notes.append(
                 f"the published single-shot input, A_0.png, is a {first_file.direction} fringe, stored in column "
@@ -191,20 +343,23 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     raise layout_error(tree.root, refusals)
 
 
-def _changed_ns(path: Path) -> int:
-    """When a file last changed, in ns. Unlike the modification time alone, copying or setting times can't reset it."""
-    status = path.stat()
-    return max(status.st_ctime_ns, status.st_mtime_ns)
+def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
+    """A file of the sample that changed after the file ``moment`` was written, or None.
+
+    Unlike the modification time alone, copying or setting times can't reset what is compared here.
+    """
+    written = moment.stat().st_mtime_ns
+    for path in sample.files:
+        status = path.stat()
+        if max(status.st_ctime_ns, status.st_mtime_ns) > written:
+            return path
+    return None
 
 
 def _refuse_changed(folder: Path, tree: PublishedTree) -> None:
-    manifest_path = folder / MANIFEST
-    if not manifest_path.is_file():
-        return
-    finished = manifest_path.stat().st_mtime_ns
-    for sample in tree.all_samples():
-        for path in sample.files:
-            if _changed_ns(path) > finished:
+    if (folder / MANIFEST).is_file():
+        for sample in tree.all_samples():
+            if path := _changed_after(sample, folder / MANIFEST):
                 raise BuildError(
                     f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
                 )
@@ -215,8 +370,5 @@ def _drop_stale_receipts(folder: Path, plan: ImportPlan) -> None:
     samples = {sample.sample: sample for sample in plan.tree.all_samples()}
     for shard_plan in plan.assembly.plans:
         receipt = folder / WORK_FOLDER / f"{shard_plan.name}.json"
-        if receipt.is_file():
-            written = receipt.stat().st_mtime_ns
-            files = (path for stem, _, _ in shard_plan.samples for path in samples[stem].files)
-            if any(_changed_ns(path) > written for path in files):
-                receipt.unlink(missing_ok=True)
+        if receipt.is_file() and any(_changed_after(samples[stem], receipt) for stem, _, _ in shard_plan.samples):
+            receipt.unlink()

@@ -9,8 +9,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +19,14 @@ from fpp_ml_bench.errors import LayoutError
 
 _HEADER_BYTES = 128
 _COMPRESSED, _MATRIX = 15, 14
-_FLAGS, _DIMENSIONS, _NAME = (6,), (5, 6), (1, 16)
+_HEADER_PARTS = (6,), (5, 6), (1, 16)
+"""Element types of a matrix's flags, dimensions and name."""
 _HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _COMPLEX = 0x0800
 _LARGEST_BYTES = 1 << 30
 _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
-
-
-class _Damaged(Exception):
-    """The file is damaged or not supported; the message says how."""
 
 
 def read_matrix(path: Path, variable: str) -> NDArray:
@@ -40,11 +36,9 @@ def read_matrix(path: Path, variable: str) -> NDArray:
     the variable is not a real numeric matrix.
     """
     try:
-        content = path.read_bytes()
+        return parse_matrix(path.read_bytes(), variable)
     except OSError as error:
         raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
-    try:
-        return parse_matrix(content, variable)
     except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
 
@@ -54,11 +48,11 @@ def parse_matrix(content: bytes, variable: str, largest_bytes: int = _LARGEST_BY
 
     No variable is unpacked to more than ``largest_bytes``, and other files that ``content`` refers to are not read.
     """
+    if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
+        return _read_hdf5(content, variable, largest_bytes)
     try:
-        if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
-            return _read_hdf5(content, variable, largest_bytes)
         return _read_v5(content, variable, largest_bytes)
-    except (_Damaged, zlib.error, struct.error) as error:
+    except (zlib.error, struct.error) as error:
         raise LayoutError(str(error)) from error
 
 
@@ -66,7 +60,8 @@ def read_scalar(path: Path, variable: str) -> float:
     """A scalar that MATLAB stores as a 1 x 1 matrix. Raises `LayoutError` as `read_matrix`, or for another shape."""
     matrix = read_matrix(path, variable)
     if matrix.shape != (1, 1) or not np.isfinite(matrix).all():
-        raise LayoutError(f"{path}: {variable}: expected a finite number stored as 1 x 1, got {_shape(matrix)}")
+        shape = " x ".join(map(str, matrix.shape))
+        raise LayoutError(f"{path}: {variable}: expected a finite number stored as 1 x 1, got {shape} {matrix.dtype}")
     return float(matrix[0, 0])
 
 
@@ -79,100 +74,76 @@ def matrix_bytes(values: Mapping[str, NDArray | float]) -> bytes:
     return _WRITTEN_BY.ljust(116) + buffer.getvalue()[116:]
 
 
-def _shape(array: NDArray) -> str:
-    return " x ".join(map(str, array.shape)) + f" {array.dtype}"
-
-
-@dataclass(frozen=True)
-class _Matrix:
-    name: str
-    kind: int
-    complex: bool
-    dimensions: tuple[int, ...]
-    order: str
-    body: memoryview
-
-    def real(self) -> NDArray:
-        if self.kind not in _CLASSES or self.complex:
-            raise _Damaged(f"{self.name}: expected a real numeric matrix, got MATLAB class {self.kind}"
-                           f"{', complex' if self.complex else ''}")  # fmt: skip
-        if len(self.dimensions) != 2:
-            raise _Damaged(f"{self.name}: expected a matrix (rows, columns), got shape {self.dimensions}")
-        kind, data, _ = _element(self.body, self.order)
-        if kind not in _STORED:
-            raise _Damaged(f"{self.name}: unknown data type {kind}; the file is damaged")
-        stored = np.dtype(self.order + _STORED[kind])
-        if len(data) != math.prod(self.dimensions) * stored.itemsize:
-            raise _Damaged(f"{self.name}: {len(data)} bytes do not make {self.dimensions}; the file is damaged")
-        # MATLAB stores whole numbers in the smallest type that fits; the matrix class gives their true type.
-        values = np.frombuffer(data, stored).reshape(self.dimensions, order="F")
-        return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[self.kind]))
-
-
 def _read_v5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
     if len(content) < _HEADER_BYTES:
-        raise _Damaged(f"expected a MATLAB v5 or v7.3 file, got {len(content)} bytes; the file is cut off")
-    mark = content[126:128]
-    order = {b"IM": "<", b"MI": ">"}.get(mark)
+        raise LayoutError(f"expected a MATLAB v5 or v7.3 file, got {len(content)} bytes; the file is cut off")
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None or struct.unpack(order + "H", content[124:126])[0] != 0x0100:
-        raise _Damaged("expected a MATLAB v5 or v7.3 file; the header is neither")
+        raise LayoutError("expected a MATLAB v5 or v7.3 file; the header is neither")
     names = []
-    for matrix in _matrices(memoryview(content)[_HEADER_BYTES:], order, largest_bytes):
-        if matrix.name == variable:
-            return matrix.real()
-        names.append(matrix.name or "(unnamed)")
-    raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
-
-
-def _matrices(content: memoryview, order: str, largest_bytes: int) -> Iterator[_Matrix]:
-    while len(content):
-        kind, data, content = _element(content, order, padded=False)
+    rest = memoryview(content)[_HEADER_BYTES:]
+    while len(rest):
+        kind, data, rest = _element(rest, order, padded=False)
         if kind == _COMPRESSED:
-            kind, data, rest = _element(memoryview(_decompressed(data, largest_bytes)), order)
-            if len(rest):
-                raise _Damaged("a compressed variable holds more than its matrix; the file is damaged")
+            unpacker = zlib.decompressobj()
+            unpacked = unpacker.decompress(data, largest_bytes)
+            if not unpacker.eof:
+                raise LayoutError("a compressed variable is cut off or too large; the file is damaged")
+            kind, data, more = _element(memoryview(unpacked), order)
+            if len(more):
+                raise LayoutError("a compressed variable holds more than its matrix; the file is damaged")
         if kind != _MATRIX:
-            raise _Damaged(f"expected a matrix, got element type {kind}; the file is damaged")
-        yield _matrix(data, order)
+            raise LayoutError(f"expected a matrix, got element type {kind}; the file is damaged")
+        parts = []
+        for expected in _HEADER_PARTS:
+            kind, part, data = _element(data, order)
+            if kind not in expected:
+                raise LayoutError(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
+            parts.append(part)
+        flags, dimensions, name = parts
+        if len(flags) != 8 or len(dimensions) % 4:
+            raise LayoutError("a matrix header has a wrong length; the file is damaged")
+        shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+        if any(length < 0 for length in shape):
+            raise LayoutError(f"a matrix has the shape {shape}; the file is damaged")
+        names.append(bytes(name).decode("latin-1") or "(unnamed)")
+        if bytes(name).decode("latin-1") == variable:
+            return _real_matrix(variable, struct.unpack(order + "II", flags)[0], shape, order, data)
+    raise LayoutError(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
 
 
-def _decompressed(data: memoryview, largest_bytes: int) -> bytes:
-    unpacker = zlib.decompressobj()
-    content = unpacker.decompress(data, largest_bytes)
-    if not unpacker.eof:
-        raise _Damaged("a compressed variable is cut off or too large; the file is damaged")
-    return content
-
-
-def _matrix(data: memoryview, order: str) -> _Matrix:
-    parts = []
-    for expected in (_FLAGS, _DIMENSIONS, _NAME):
-        kind, part, data = _element(data, order)
-        if kind not in expected:
-            raise _Damaged(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
-        parts.append(part)
-    flags, dimensions, name = parts
-    if len(flags) != 8 or len(dimensions) % 4:
-        raise _Damaged("a matrix header has a wrong length; the file is damaged")
-    flag_bits = struct.unpack(order + "II", flags)[0]
-    shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-    if any(length < 0 for length in shape):
-        raise _Damaged(f"a matrix has the shape {shape}; the file is damaged")
-    return _Matrix(bytes(name).decode("latin-1"), flag_bits & 0xFF, bool(flag_bits & _COMPLEX), shape, order, data)
+def _real_matrix(name: str, flags: int, shape: tuple[int, ...], order: str, content: memoryview) -> NDArray:
+    matrix_class = flags & 0xFF
+    if matrix_class not in _CLASSES or flags & _COMPLEX:
+        note = ", complex" if flags & _COMPLEX else ""
+        raise LayoutError(f"{name}: expected a real numeric matrix, got MATLAB class {matrix_class}{note}")
+    if len(shape) != 2:
+        raise LayoutError(f"{name}: expected a matrix (rows, columns), got shape {shape}")
+    kind, data, _ = _element(content, order)
+    if kind not in _STORED:
+        raise LayoutError(f"{name}: unknown data type {kind}; the file is damaged")
+    stored = np.dtype(order + _STORED[kind])
+    if len(data) != math.prod(shape) * stored.itemsize:
+        raise LayoutError(f"{name}: {len(data)} bytes do not make {shape}; the file is damaged")
+    # MATLAB stores whole numbers in the smallest type that fits; the matrix class gives their true type.
+    values = np.frombuffer(data, stored).reshape(shape, order="F")
+    return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[matrix_class]))
 
 
 def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int, memoryview, memoryview]:
     """First data element: its type, its bytes, and the content after it. Elements in a matrix are padded to 8 bytes."""
     if len(content) < 8:
-        raise _Damaged("a data element is cut off; the file is damaged")
+        raise LayoutError("a data element is cut off; the file is damaged")
     kind, length = struct.unpack(order + "II", content[:8])
     if kind >> 16:  # up to four bytes, packed into the tag itself
         kind, length = kind & 0xFFFF, kind >> 16
         if length > 4:
-            raise _Damaged("a small data element is too long; the file is damaged")
+            raise LayoutError("a small data element is too long; the file is damaged")
         return kind, content[4 : 4 + length], content[8:]
     if length > len(content) - 8:
-        raise _Damaged(f"a data element of {length} bytes has only {len(content) - 8}; the file is cut off or damaged")
+        raise LayoutError(
+            f"a data element of {length} bytes has only {len(content) - 8}; the file is cut off or damaged"
+        )
     stop = 8 + (length + 7 & ~7 if padded else length)
     return kind, content[8 : 8 + length], content[stop:]
 
@@ -184,19 +155,19 @@ def _read_hdf5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
         with h5py.File(io.BytesIO(content), "r") as file:
             if variable not in file:
                 names = [name for name in file if not name.startswith("#")]
-                raise _Damaged(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
+                raise LayoutError(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
             if not isinstance(file.get(variable, getlink=True), h5py.HardLink):
-                raise _Damaged(f"{variable} is a link; expected the matrix itself in this file")
+                raise LayoutError(f"{variable} is a link; expected the matrix itself in this file")
             matrix = file[variable]
             if not isinstance(matrix, h5py.Dataset) or matrix.dtype.kind not in "iuf" or matrix.ndim != 2:
-                raise _Damaged(f"{variable}: expected a real numeric matrix (rows, columns)")
+                raise LayoutError(f"{variable}: expected a real numeric matrix (rows, columns)")
             if matrix.is_virtual or matrix.external:
-                raise _Damaged(f"{variable} is stored in other files; expected the matrix itself in this file")
+                raise LayoutError(f"{variable} is stored in other files; expected the matrix itself in this file")
             # HDF5 unpacks whole chunks, and in a damaged file a chunk may be far larger than the matrix.
             unpacked = max(matrix.size, math.prod(matrix.chunks or (1,))) * matrix.dtype.itemsize
             if unpacked > largest_bytes:
-                raise _Damaged(f"{variable}: {matrix.shape} is too large for a depth map")
+                raise LayoutError(f"{variable}: {matrix.shape} is too large for a depth map")
             # MATLAB is column-major, HDF5 row-major: the file holds the transpose.
             return np.ascontiguousarray(np.asarray(matrix).T)
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError) as error:
-        raise _Damaged(f"can't be read as MATLAB v7.3 (HDF5): {error}") from error
+        raise LayoutError(f"can't be read as MATLAB v7.3 (HDF5): {error}") from error

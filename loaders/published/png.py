@@ -7,8 +7,8 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,25 +21,21 @@ _HEADER_BYTES = 33
 COMPRESSION_LEVEL = 1  # twice as fast as 3 on noisy fringes, and 6% larger (measured)
 
 
-class PngHeader(NamedTuple):
-    """``size`` (H, W) in px, bits a channel, colour type of the PNG standard."""
-
-    size: tuple[int, int]
-    bits: int
-    colour: int
+def read_png_size(path: Path) -> tuple[int, int]:
+    """Size (H, W) of a PNG that is 8-bit grey or RGB; raises `LayoutError` naming the file for any other."""
+    return _header(_content(path, _HEADER_BYTES), path)[0]
 
 
-def read_png_header(path: Path) -> PngHeader:
-    """Header of a PNG that is 8-bit grey or RGB; raises `LayoutError` naming the file for any other."""
+def _content(path: Path, most: int = -1) -> bytes:
     try:
         with path.open("rb") as file:
-            start = file.read(_HEADER_BYTES)
+            return file.read(most)
     except OSError as error:
         raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
-    return _header(start, path)
 
 
-def _header(start: bytes, path: Path) -> PngHeader:
+def _header(start: bytes, path: Path) -> tuple[tuple[int, int], int]:
+    """Size (H, W) and colour type."""
     if len(start) < _HEADER_BYTES or not start.startswith(_SIGNATURE) or start[12:16] != b"IHDR":
         raise LayoutError(f"{path}: expected a PNG file, got other content")
     width, height, bits, colour = struct.unpack(">IIBB", start[16:26])
@@ -49,7 +45,7 @@ def _header(start: bytes, path: Path) -> PngHeader:
         raise LayoutError(
             f"{path}: expected a grey PNG, or RGB with equal channels, got {_COLOURS.get(colour, colour)}"
         )
-    return PngHeader((height, width), bits, colour)
+    return (height, width), colour
 
 
 def read_grey_png(path: Path) -> NDArray[np.uint8]:
@@ -58,18 +54,20 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
     Raises `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour
     type, or its channels differ.
     """
-    import cv2
-
+    content = _content(path)
+    size, colour = _header(content, path)
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
-    header = _header(content[:_HEADER_BYTES], path)
-    _check_chunks(content, path)
+        kinds = [kind for kind, _ in png_chunks(content)]
+    except LayoutError as error:
+        raise LayoutError(f"{path}: the PNG {error}") from error
+    if b"tRNS" in kinds:
+        raise LayoutError(f"{path}: has transparent colours; expected plain grey levels")
+    if kinds[-1:] != [b"IEND"] or b"IDAT" not in kinds:
+        raise LayoutError(f"{path}: the PNG is cut off or damaged")
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    channels = (3,) if header.colour == _RGB else ()
-    if image is None or image.dtype != np.uint8 or image.shape != (*header.size, *channels):
-        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_COLOURS[header.colour]} PNG")
+    channels = (3,) if colour == _RGB else ()
+    if image is None or image.dtype != np.uint8 or image.shape != (*size, *channels):
+        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_COLOURS[colour]} PNG")
     if not channels:
         return np.asarray(image, dtype=np.uint8)
     blue, green, red = image[..., 0], image[..., 1], image[..., 2]
@@ -78,36 +76,27 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(blue)
 
 
-def _check_chunks(content: bytes, path: Path) -> None:
-    kinds = list(_chunks(content, path))
-    if b"tRNS" in kinds:
-        raise LayoutError(f"{path}: has transparent colours; expected plain grey levels")
-    if kinds[-1:] != [b"IEND"] or b"IDAT" not in kinds:
-        raise LayoutError(f"{path}: the PNG is cut off or damaged")
+def png_chunks(content: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Kind and data of a PNG's chunks up to its end, the signature not looked at, each with a right checksum.
 
-
-def _chunks(content: bytes, path: Path) -> Iterator[bytes]:
+    Raises `LayoutError` that says, without a subject, what is wrong: "is cut off".
+    """
     view, position = memoryview(content), len(_SIGNATURE)
-    while position < len(view):
-        if len(view) - position < 12:
-            raise LayoutError(f"{path}: the PNG is cut off")
-        length = struct.unpack(">I", view[position : position + 4])[0]
+    kind = b""
+    while position < len(view) and kind != b"IEND":
+        length = struct.unpack(">I", view[position : position + 4])[0] if len(view) - position >= 12 else len(view)
         stop = position + 12 + length
         if stop > len(view):
-            raise LayoutError(f"{path}: the PNG is cut off")
+            raise LayoutError("is cut off")
         if zlib.crc32(view[position + 4 : stop - 4]) != struct.unpack(">I", view[stop - 4 : stop])[0]:
-            raise LayoutError(f"{path}: the PNG is damaged, a checksum does not match")
+            raise LayoutError("is damaged, a checksum does not match")
         kind = bytes(view[position + 4 : position + 8])
-        yield kind
+        yield kind, view[position + 8 : stop - 4]
         position = stop
-        if kind == b"IEND":
-            return
 
 
 def png_bytes(image: NDArray[np.uint8]) -> bytes:
     """A grey image uint8 (H, W) as PNG."""
-    import cv2
-
     done, content = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION_LEVEL])
     if not done:
         raise LayoutError(f"OpenCV could not encode an image of shape {image.shape} as PNG")

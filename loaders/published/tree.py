@@ -1,34 +1,68 @@
-"""Scanning a published tree: its samples and their files, and all errors in the layout that names alone show.
+"""The published tree: its names, and a scan that lists its samples and every error in the layout that names alone show.
 
 Only directory entries and PNG headers are read here; contents are checked when a sample is read
-(`fpp_ml_bench.loaders.published.reading`). Names that begin with a dot, and files beside the folders, are ignored.
+(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored.
 """
 
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name
+from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.layout import (
-    BACKGROUND_REMOVED_FOLDERS,
-    DEPTH,
-    FRINGE,
-    INFO,
-    NOT_STORED,
-    RAW_SCANS,
-    TRAINING,
-    VARIANT_FOLDERS,
-    frame_file,
-    label_of,
-    layout_error,
-)
-from fpp_ml_bench.loaders.published.png import read_png_header
+from fpp_ml_bench.loaders.published.png import read_png_size
 
+TRAINING = "training_datasets"
+RAW_SCANS = "fpp_synthetic_dataset"
+FRINGE, DEPTH = "fringe", "depth"
+INFO = "info_depth_params"
+INFO_VARIABLES = ("depth_min", "depth_max")
+
+VARIANT_FOLDERS: dict[Normalisation, str] = {
+    "raw": "training_data_depth_raw",
+    "global": "training_data_depth_global_normalized",
+    "individual": "training_data_depth_individual_normalized",
+}
+"""Folder of each depth representation; depth in mm is taken from the first that is present."""
+BACKGROUND_REMOVED_FOLDERS: dict[Normalisation, str] = {
+    name: folder.replace("training_data_depth", "training_data_bgremoved_depth")
+    for name, folder in VARIANT_FOLDERS.items()
+}
+VARIABLES: dict[Normalisation, str] = {
+    "raw": "depthMap", "global": "depthMapMeters", "individual": "depthMapNormalized",
+}  # fmt: skip
+WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS = "wrapped_phase.mat", "unwrapped_phase.mat", "z.csv"
+WRAPPED_PHASE_VARIABLE, UNWRAPPED_PHASE_VARIABLE = "wph", "uph"
+NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
+"""Files of a raw scan that are computed from its frames; the import ignores them."""
+
+LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
 FilesBySplit = dict[str, dict[str, Path]]
 """The files of each split by stem (sample name); keys are this package's split names."""
+
+
+def frame_file(index: int) -> str:
+    """File name of frame ``index`` in a raw scan."""
+    return f"A_{index}.png"
+
+
+def _is_sample(stem: str) -> bool:
+    try:
+        return split_sample_name(stem)[1] in VIEWS
+    except ValueError:
+        return False
+
+
+def layout_error(root: object, problems: list[str]) -> LayoutError:
+    """The error that lists the problems of a tree, at most `LISTED_PROBLEMS` of them."""
+    shown = problems[:LISTED_PROBLEMS]
+    if len(problems) > len(shown):
+        shown.append(f"... and {len(problems) - len(shown)} more")
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    return LayoutError("\n  ".join([f"{root}: {count} with the published layout:", *shown]))
 
 
 @dataclass(frozen=True)
@@ -64,14 +98,6 @@ class PublishedTree:
         return [sample for samples in self.samples.values() for sample in samples]
 
 
-def scan_tree(root: Path, frames: int) -> PublishedTree:
-    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
-
-    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself.
-    """
-    return _Scan(root, frames).tree()
-
-
 def _locate(root: Path) -> tuple[Path, Path | None]:
     """Folders of the training data and of the raw scans."""
     if not root.is_dir():
@@ -102,51 +128,53 @@ def _entries(folder: Path) -> list[Path]:
         raise LayoutError(f"{folder}: can't be read ({error.strerror or error})") from error
 
 
+def scan_tree(root: Path, frames: int) -> PublishedTree:
+    """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
+
+    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself.
+    """
+    training, scans_folder = _locate(root)
+    scan = _Scan(training)
+    variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())
+    files = [scan.variant(training / VARIANT_FOLDERS[name]) for name in variants]
+    scan.same_stems(variants, [part[FRINGE] for part in files])
+    info = scan.info(files[0][DEPTH], needed=variants == ("individual",))
+    scans = scan.raw_scans(scans_folder, files[0][FRINGE], frames) if scans_folder else {}
+    samples = {split: scan.samples(split, files, info, scans) for split in PUBLISHED_SPLIT_FOLDERS}
+    samples = {split: part for split, part in samples.items() if part}
+    everything = [sample for part in samples.values() for sample in part]
+    scan.objects(everything)
+    if not samples and not scan.problems:
+        scan.problems.append(f"{training / VARIANT_FOLDERS[variants[0]]}: holds no sample")
+    size = scan.size(everything)
+    if scan.problems:
+        raise layout_error(root, scan.problems)
+    ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
+    if scans_folder:
+        computed = (name for name in NOT_STORED if next(scans_folder.glob(f"*/*/{name}"), None))
+        ignored += [f"{RAW_SCANS}/*/*/{name}" for name in computed]
+    return PublishedTree(root, size, variants, samples, scans_folder is not None, tuple(ignored))
+
+
 class _Scan:
-    def __init__(self, root: Path, frames: int) -> None:
-        self.root, self.frame_count = root, frames
-        self.training, self.scans = _locate(root)
+    """Lists files folder by folder, and collects ``problems``, a line each."""
+
+    def __init__(self, training: Path) -> None:
+        self.training = training
         self.problems: list[str] = []
 
-    def tree(self) -> PublishedTree:
-        variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (self.training / folder).is_dir())
-        pairs = [self._variant(self.training / VARIANT_FOLDERS[name]) for name in variants]
-        self._same_stems(variants, pairs)
-        info = self._info(pairs[0][1], needed=variants == ("individual",))
-        scans = self._raw_scans(pairs[0][0]) if self.scans else {}
-        samples = {split: self._samples(split, pairs, info, scans) for split in PUBLISHED_SPLIT_FOLDERS}
-        samples = {split: split_samples for split, split_samples in samples.items() if split_samples}
-        self._objects(samples)
-        if not samples and not self.problems:
-            self.problems.append(f"{self.training / VARIANT_FOLDERS[variants[0]]}: holds no sample")
-        size = self._sizes(samples)
-        if self.problems:
-            raise layout_error(self.root, self.problems)
-        return PublishedTree(self.root, size, variants, samples, self.scans is not None, self._ignored())
+    def _foreign(self, entry: Path, expected: str) -> None:
+        self.problems.append(f"{entry}: does not belong here; expected {expected}")
 
-    def _variant(self, folder: Path) -> tuple[FilesBySplit, FilesBySplit]:
-        """Fringes and depths of a variant; reports every file without its counterpart."""
-        files: dict[str, FilesBySplit] = {kind: {} for kind in _KINDS}
-        splits = {published: split for split, published in PUBLISHED_SPLIT_FOLDERS.items()}
+    def _folders(self, folder: Path, names: Collection[str], listed: str) -> list[Path]:
+        """Folders called ``names`` in a folder; reports everything else in it."""
+        folders = []
         for entry in _entries(folder):
-            if entry.name not in splits or not entry.is_dir():
-                self._report_foreign(entry, f"expected the folders {', '.join(splits)}")
-                continue
-            for part in _entries(entry):
-                if part.name not in _KINDS or not part.is_dir():
-                    self._report_foreign(part, f"expected the folders {FRINGE} and {DEPTH}")
-            for kind, suffix in _KINDS.items():
-                files[kind][splits[entry.name]] = self._files(entry / kind, suffix)
-        for split in files[FRINGE]:
-            fringes, depths = files[FRINGE][split], files[DEPTH][split]
-            published = folder / PUBLISHED_SPLIT_FOLDERS[split]
-            for stem in sorted(set(fringes) - set(depths)):
-                self.problems.append(f"{published / DEPTH / (stem + '.mat')}: is missing, {fringes[stem]} has no depth")
-            for stem in sorted(set(depths) - set(fringes)):
-                self.problems.append(
-                    f"{published / FRINGE / (stem + '.png')}: is missing, {depths[stem]} has no fringe"
-                )
-        return files[FRINGE], files[DEPTH]
+            if entry.name in names and entry.is_dir():
+                folders.append(entry)
+            else:
+                self._foreign(entry, f"the folders {listed}")
+        return folders
 
     def _files(self, folder: Path, suffix: str) -> dict[str, Path]:
         if not folder.is_dir():
@@ -155,32 +183,45 @@ class _Scan:
         files = {}
         for entry in _entries(folder):
             if entry.suffix != suffix or not entry.is_file():
-                self._report_foreign(entry, f"expected files ending in {suffix}")
-            elif label_of(entry.stem) is None:
+                self._foreign(entry, f"files ending in {suffix}")
+            elif not _is_sample(entry.stem):
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
             else:
                 files[entry.stem] = entry
         return files
 
-    def _report_foreign(self, entry: Path, expected: str) -> None:
-        self.problems.append(f"{entry}: does not belong here; {expected}")
+    def variant(self, folder: Path) -> dict[str, FilesBySplit]:
+        """Fringes and depths of a variant; reports every file without its counterpart."""
+        files: dict[str, FilesBySplit] = {kind: {} for kind in _KINDS}
+        splits = {published: split for split, published in PUBLISHED_SPLIT_FOLDERS.items()}
+        for entry in self._folders(folder, splits, ", ".join(splits)):
+            self._folders(entry, _KINDS, " and ".join(_KINDS))
+            for kind, suffix in _KINDS.items():
+                files[kind][splits[entry.name]] = self._files(entry / kind, suffix)
+        for split in files[FRINGE]:
+            for kind, other in ((DEPTH, FRINGE), (FRINGE, DEPTH)):
+                present = files[other][split]
+                target = folder / PUBLISHED_SPLIT_FOLDERS[split] / kind
+                self.problems += [
+                    f"{target / (stem + _KINDS[kind])}: is missing, {present[stem]} has no {kind}"
+                    for stem in sorted(present.keys() - files[kind][split].keys())
+                ]
+        return files
 
-    def _same_stems(self, variants: tuple[Normalisation, ...], pairs: list[tuple[FilesBySplit, FilesBySplit]]) -> None:
+    def same_stems(self, variants: tuple[Normalisation, ...], fringes: list[FilesBySplit]) -> None:
         """Report samples of the first variant that another variant lacks in the same split, and the reverse."""
-        for name, (fringes, _) in zip(variants[1:], pairs[1:], strict=True):
+        for name, others in zip(variants[1:], fringes[1:], strict=True):
             for split, published in PUBLISHED_SPLIT_FOLDERS.items():
-                first_stems, stems_here = set(pairs[0][0].get(split, {})), set(fringes.get(split, {}))
-                for lacking, holding, stems in (
-                    (name, variants[0], first_stems - stems_here),
-                    (variants[0], name, stems_here - first_stems),
-                ):
+                first, here = fringes[0].get(split, {}).keys(), others.get(split, {}).keys()
+                for lacking, holding, stems in ((name, variants[0], first - here), (variants[0], name, here - first)):
                     folder = self.training / VARIANT_FOLDERS[lacking] / published / FRINGE
                     self.problems += [
                         f"{folder / (stem + '.png')}: is missing; {VARIANT_FOLDERS[holding]} has it in {published}"
                         for stem in sorted(stems)
                     ]
 
-    def _info(self, depths: FilesBySplit, needed: bool) -> FilesBySplit:
+    def info(self, depths: FilesBySplit, needed: bool) -> FilesBySplit:
+        """Files of the depth ranges, one for each depth; reports the absence of what is ``needed``."""
         folder = self.training / INFO
         if not folder.is_dir():
             if needed:
@@ -189,102 +230,86 @@ class _Scan:
                 )
             return {}
         files: FilesBySplit = {}
-        split_folders = {PUBLISHED_SPLIT_FOLDERS[split] for split in depths}
-        for entry in _entries(folder):
-            if entry.name not in split_folders:
-                self._report_foreign(entry, f"expected the folders {', '.join(sorted(split_folders))}")
+        split_folders = sorted(PUBLISHED_SPLIT_FOLDERS[split] for split in depths)
+        self._folders(folder, split_folders, ", ".join(split_folders))
         for split, expected in depths.items():
             part = folder / PUBLISHED_SPLIT_FOLDERS[split] / DEPTH
-            files[split] = self._files(part, ".mat")
+            found = files[split] = self._files(part, ".mat")
             if part.is_dir():
-                missing, extra = set(expected) - set(files[split]), set(files[split]) - set(expected)
-                self.problems += [f"{part / (stem + '.mat')}: is missing" for stem in sorted(missing)]
-                self.problems += [f"{files[split][stem]}: belongs to no sample of this split" for stem in sorted(extra)]
+                missing, extra = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
+                self.problems += [f"{part / (stem + '.mat')}: is missing" for stem in missing]
+                self.problems += [f"{found[stem]}: belongs to no sample of this split" for stem in extra]
         return files
 
-    def _raw_scans(self, fringes: FilesBySplit) -> dict[str, tuple[Path, ...]]:
-        root = self.scans
-        if root is None:
-            return {}
+    def raw_scans(self, root: Path, fringes: FilesBySplit, frames: int) -> dict[str, tuple[Path, ...]]:
+        """Frames of each sample in file order, of which there must be ``frames``."""
         stems_with_depth = {stem for split in fringes.values() for stem in split}
+        names = [frame_file(index) for index in range(frames)]
         scans: dict[str, tuple[Path, ...]] = {}
         for folder in _entries(root):
             if not folder.is_dir():
-                self._report_foreign(folder, "expected one folder per object")
+                self._foreign(folder, "one folder per object")
                 continue
-            for view in _entries(folder):
+            for view in self._folders(folder, VIEWS, ", ".join(VIEWS)):
                 stem = sample_name(folder.name, view.name)
-                if view.name not in VIEWS or not view.is_dir():
-                    self._report_foreign(view, f"expected the folders {', '.join(VIEWS)}")
-                elif stem not in stems_with_depth:
+                if stem not in stems_with_depth:
                     self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
-                else:
-                    scans[stem] = self._frames(view)
+                    continue
+                present = {entry.name: entry for entry in _entries(view)}
+                self.problems += [f"{view / name}: is missing" for name in names if name not in present]
+                for name in sorted(set(present) - set(names) - set(NOT_STORED)):
+                    self._foreign(present[name], f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
+                scans[stem] = tuple(present[name] for name in names if name in present)
         self.problems += [
-            f"{root / label[0] / label[1]}: the raw scan is missing"
-            for stem in sorted(stems_with_depth - set(scans)) if (label := label_of(stem))
-        ]  # fmt: skip
+            f"{root.joinpath(*split_sample_name(stem))}: the raw scan is missing"
+            for stem in sorted(stems_with_depth - set(scans))
+        ]
         return scans
 
-    def _frames(self, folder: Path) -> tuple[Path, ...]:
-        names = [frame_file(index) for index in range(self.frame_count)]
-        present = {entry.name: entry for entry in _entries(folder)}
-        self.problems += [f"{folder / name}: is missing" for name in names if name not in present]
-        for name in sorted(set(present) - set(names) - set(NOT_STORED)):
-            self._report_foreign(present[name], f"expected {names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
-        return tuple(present[name] for name in names if name in present)
-
-    def _samples(
-        self,
-        split: str,
-        pairs: list[tuple[FilesBySplit, FilesBySplit]],
-        info: FilesBySplit,
-        scans: dict[str, tuple[Path, ...]],
+    def samples(
+        self, split: str, files: list[dict[str, FilesBySplit]], info: FilesBySplit, scans: dict[str, tuple[Path, ...]]
     ) -> list[PublishedSample]:
+        """Samples of a split: the benchmark's objects in their order, then all other objects by name."""
         samples = []
-        for stem in pairs[0][0].get(split, {}):
-            label = label_of(stem)
-            if label is None:
-                continue
-            files = [(fringes.get(split, {}).get(stem), depths.get(split, {}).get(stem)) for fringes, depths in pairs]
-            samples.append(
-                PublishedSample(
-                    stem, *label, split,
-                    tuple(fringe for fringe, _ in files if fringe), tuple(depth for _, depth in files if depth),
-                    info.get(split, {}).get(stem), scans.get(stem, ()),
-                )
-            )  # fmt: skip
-        return sorted(samples, key=lambda sample: (*_row_order(sample.object), VIEWS.index(sample.view)))
+        for stem in files[0][FRINGE].get(split, {}):
+            fringes, depths = (
+                tuple(part[kind][split][stem] for part in files if stem in part[kind].get(split, {}))
+                for kind in (FRINGE, DEPTH)
+            )
+            label = split_sample_name(stem)
+            more = info.get(split, {}).get(stem), scans.get(stem, ())
+            samples.append(PublishedSample(stem, *label, split, fringes, depths, *more))
 
-    def _objects(self, samples: dict[str, list[PublishedSample]]) -> None:
+        def place(sample: PublishedSample) -> tuple[int, str, int]:
+            known = OBJECTS.index(sample.object) if sample.object in OBJECTS else len(OBJECTS)
+            return known, sample.object, VIEWS.index(sample.view)
+
+        return sorted(samples, key=place)
+
+    def objects(self, samples: list[PublishedSample]) -> None:
         """Report objects that are in two splits or lack views."""
-        first_samples: dict[str, dict[str, PublishedSample]] = {}
+        first_files: dict[str, dict[str, Path]] = {}
         views: dict[str, set[str]] = {}
-        for sample in (sample for split_samples in samples.values() for sample in split_samples):
+        for sample in samples:
             views.setdefault(sample.object, set()).add(sample.view)
-            first_samples.setdefault(sample.object, {}).setdefault(sample.split, sample)
-        for name, by_split in first_samples.items():
-            first_file, *more_files = (sample.fringes[0] for sample in by_split.values())
-            if more_files:
-                self.problems.append(
-                    f"{first_file}: object {name} is in two splits, see {', '.join(map(str, more_files))}"
-                )
-        for name, object_views in views.items():
-            if missing := [view for view in VIEWS if view not in object_views]:
-                stems = ", ".join(sample_name(name, view) for view in missing)
-                self.problems.append(
-                    f"{next(iter(first_samples[name].values())).fringes[0].parent}: object {name} lacks {stems}"
-                )
+            first_files.setdefault(sample.object, {}).setdefault(sample.split, sample.fringes[0])
+        for name, by_split in first_files.items():
+            first, *others = by_split.values()
+            if others:
+                self.problems.append(f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}")
+        for name, seen in views.items():
+            if missing := [sample_name(name, view) for view in VIEWS if view not in seen]:
+                folder = next(iter(first_files[name].values())).parent
+                self.problems.append(f"{folder}: object {name} lacks {', '.join(missing)}")
 
-    def _sizes(self, samples: dict[str, list[PublishedSample]]) -> tuple[int, int]:
+    def size(self, samples: list[PublishedSample]) -> tuple[int, int]:
         """Image size of most PNG headers; reports every file of another size."""
         sizes: dict[Path, tuple[int, int]] = {}
-        for sample in (sample for split_samples in samples.values() for sample in split_samples):
-            for path in (*sample.fringes, *sample.frames):
-                try:
-                    sizes[path] = read_png_header(path).size
-                except LayoutError as error:
-                    self.problems.append(str(error))
+        for path in (path for sample in samples for path in (*sample.fringes, *sample.frames)):
+            try:
+                sizes[path] = read_png_size(path)
+            except LayoutError as error:
+                self.problems.append(str(error))
         if not sizes:
             return 0, 0
         common = Counter(sizes.values()).most_common(1)[0][0]
@@ -293,15 +318,3 @@ class _Scan:
             for path, size in sizes.items() if size != common
         ]  # fmt: skip
         return common
-
-    def _ignored(self) -> tuple[str, ...]:
-        names = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (self.training / name).is_dir()]
-        if self.scans:
-            computed = (name for name in NOT_STORED if next(self.scans.glob(f"*/*/{name}"), None))
-            names += [f"{RAW_SCANS}/*/*/{name}" for name in computed]
-        return tuple(names)
-
-
-def _row_order(name: str) -> tuple[int, str]:
-    """Sort key of rows: the benchmark's objects in their order, then all other objects by name."""
-    return (OBJECTS.index(name) if name in OBJECTS else len(OBJECTS)), name

@@ -13,24 +13,13 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.raycast import Hits, TracedObject
+from fpp_ml_bench.loaders.render.scene import Lighting
 from fpp_ml_bench.optics import Direction, Rig
 from fpp_ml_bench.portable import power
 from fpp_ml_bench.skipping import skipping_enabled
 
 NEAREST_M = 1e-3
 """A point nearer to a centre of projection is inside that lens and gets no light: the inverse square has no limit."""
-
-
-@dataclass(frozen=True)
-class Lighting:
-    """Exposure and material. ``white_grey``: grey level of a white pattern on a surface that faces the projector at the
-    near end of the working range, so that nothing in range saturates; ``ambient_grey``: light besides the projector."""
-
-    white_grey: float = 225.0
-    ambient_grey: float = 6.0
-    specular: float = 0.15
-    roughness: float = 0.95
-    shadows: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,25 +58,11 @@ class LitPixels:
             return copy
 
         lookup = {
-            direction: PatternLookup(
-                replaced(lookup.index, patch.lookup[direction].index),
-                replaced(lookup.weight, patch.lookup[direction].weight),
-            )
-            for direction, lookup in self.lookup.items()
+            direction: PatternLookup(replaced(here.index, there.index), replaced(here.weight, there.weight))
+            for (direction, here), there in zip(self.lookup.items(), patch.lookup.values(), strict=True)
         }
-        return LitPixels(
-            lookup,
-            replaced(self.gain, patch.gain),
-            replaced(self.ambient, patch.ambient),
-            self.shadow_rays + patch.shadow_rays,
-        )
-
-
-def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -> float:
-    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
-    by the inverse square of the distance."""
-    white = (lighting or Lighting()).white_grey
-    return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
+        gain, ambient = replaced(self.gain, patch.gain), replaced(self.ambient, patch.ambient)
+        return LitPixels(lookup, gain, ambient, self.shadow_rays + patch.shadow_rays)
 
 
 def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
@@ -130,9 +105,9 @@ def light_surface(
         lit[candidates] = ~occluder.shadowed(points_m[candidates], centre_m)
         shadow_rays = candidates.size
     seen = np.isfinite(points_m).all(axis=1)
-    lookup: dict[Direction, PatternLookup] = {
-        direction: PatternLookup.of(coordinate_px, rig.pattern_length(direction))
-        for direction, coordinate_px in _by_direction(u, v)
+    lookup: dict[Direction, PatternLookup] = {  # vertical fringes read u, horizontal ones v
+        "vertical": PatternLookup.of(u, rig.pattern_length("vertical")),
+        "horizontal": PatternLookup.of(v, rig.pattern_length("horizontal")),
     }
     return LitPixels(
         lookup,
@@ -142,11 +117,6 @@ def light_surface(
     )
 
 
-def _by_direction(u: NDArray, v: NDArray) -> tuple[tuple[Direction, NDArray], tuple[Direction, NDArray]]:
-    """Vertical fringes read u, horizontal ones v."""
-    return ("vertical", u), ("horizontal", v)
-
-
 def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:
     """Which projector pixels (n,), (n,) lie on the pattern, outer pixels included whole; NaN does not; bool (n,)."""
     return (u >= -0.5) & (u <= rig.projector.width - 0.5) & (v >= -0.5) & (v <= rig.projector.height - 0.5)
@@ -154,10 +124,14 @@ def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDAr
 
 def background_plane(rig: Rig, lighting: Lighting) -> LitPixels:
     """The empty scene: the plane square to the axis at the rig's background distance, for every pixel of the image."""
+    return light_surface(*_plane(rig), rig, lighting)
+
+
+def _plane(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points and normals of the background plane, (n, 3) each."""
     x, y = (rays.ravel() for rays in rig.camera.rays())
     points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background_m
-    normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), points_m.shape)
-    return light_surface(points_m, normals, rig, lighting)
+    return points_m, np.broadcast_to(np.array([0.0, 0.0, -1.0]), points_m.shape)
 
 
 def lit_object(hits: Hits, rig: Rig, lighting: Lighting, occluder: TracedObject) -> LitPixels:
@@ -186,35 +160,26 @@ class Backdrop:
         """
         if not self._lighting.shadows:
             return self._empty if skipping_enabled() else background_plane(self._rig, self._lighting)
-        points_m = self._points_m
-        candidates = self._may_be_shadowed(traced, covered)
+        points_m, normals = self._plane
+        # Pixels of the plane that are lit, not hidden from the camera, and within the object's bounding box as the
+        # projector sees it.
+        possible = self._empty.gain > 0
+        possible[covered] = False
+        possible &= traced.may_shadow(self._directions, projector_centre_m(self._rig))
+        candidates = np.flatnonzero(possible)
         if not skipping_enabled():
-            plane = light_surface(points_m, self._plane.normals, self._rig, self._lighting, traced)
+            plane = light_surface(points_m, normals, self._rig, self._lighting, traced)
             return LitPixels(plane.lookup, plane.gain, plane.ambient, candidates.size)
         gain = self._empty.gain.copy()
         hidden = traced.shadowed(points_m[candidates], projector_centre_m(self._rig))
         gain[candidates[hidden]] = 0.0
         return LitPixels(self._empty.lookup, gain, self._empty.ambient, candidates.size)
 
-    def _may_be_shadowed(self, traced: TracedObject, covered: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Flat pixels of the plane that are lit, not hidden from the camera, and seen by the projector within the
-        object's bounding box."""
-        possible = self._empty.gain > 0
-        possible[covered] = False
-        possible &= traced.may_shadow(self._directions, projector_centre_m(self._rig))
-        return np.flatnonzero(possible)
-
     @cached_property
-    def _plane(self) -> Hits:
-        pixels = np.arange(self._empty.gain.size, dtype=np.int64)
-        normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (pixels.size, 3))
-        return Hits(pixels, np.full(pixels.size, self._rig.background_m), normals)
-
-    @cached_property
-    def _points_m(self) -> NDArray[np.float64]:
-        return hit_points_m(self._plane, self._rig)
+    def _plane(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return _plane(self._rig)
 
     @cached_property
     def _directions(self) -> NDArray[np.float64]:
         """From the light to each point, float64 (3, n) in metres."""
-        return np.ascontiguousarray((self._points_m - projector_centre_m(self._rig)).T)
+        return np.ascontiguousarray((self._plane[0] - projector_centre_m(self._rig)).T)

@@ -4,21 +4,21 @@ import io
 import logging
 import math
 import struct
-from dataclasses import fields, replace
+from collections import Counter
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
+import yaml
 
 from fpp_ml_bench.constants import OBJECTS, SPLITS
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import file_hash
-from fpp_ml_bench.loaders.render.scene import SolidMesh
-from fpp_ml_bench.loaders.render.settings import UserMesh
+from fpp_ml_bench.loaders.render.objects import object_mesh
+from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
-
-if TYPE_CHECKING:
-    import trimesh
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
@@ -29,12 +29,7 @@ def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
     user = {mesh.name: mesh for mesh in user_meshes}
     if name in user:
         return load_user_mesh(user[name])
-    from fpp_ml_bench.loaders.render.objects import object_mesh
-
-    return _solid(name, object_mesh(name))
-
-
-def _solid(name: str, mesh: "trimesh.Trimesh") -> SolidMesh:
+    mesh = object_mesh(name)
     return SolidMesh(name, np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
 
 
@@ -66,9 +61,7 @@ _READER_ERRORS = (
 )  # fmt: skip
 
 
-def _read_mesh(path: Path) -> "trimesh.Trimesh":
-    import trimesh
-
+def _read_mesh(path: Path) -> trimesh.Trimesh:
     # Its log would put a traceback of its own on the screen; what matters of it is in our message.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     kind = path.suffix.lower().removeprefix(".")
@@ -91,8 +84,6 @@ def _read_mesh(path: Path) -> "trimesh.Trimesh":
 
 def write_ply(mesh: SolidMesh, path: Path) -> None:
     """Write a mesh as binary PLY in metres, object coordinates."""
-    import trimesh
-
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -109,8 +100,6 @@ def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
 
     ``path`` is relative to the list's own folder; ``scale`` takes the file's unit to metres.
     """
-    import yaml
-
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -118,10 +107,9 @@ def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
     if not isinstance(content, list) or not content:
         raise MeshError(f"{path}: expected a list of meshes, each with name and path, got {type(content).__name__}")
     meshes = tuple(_entry(entry, f"{path}, entry {i + 1}", path.parent) for i, entry in enumerate(content))
-    names = [mesh.name for mesh in meshes]
-    for name in names:
-        if names.count(name) > 1:
-            raise MeshError(f"{path}: the name {name!r} is given twice")
+    name, count = Counter(mesh.name for mesh in meshes).most_common(1)[0]
+    if count > 1:
+        raise MeshError(f"{path}: the name {name!r} is given twice")
     return meshes
 
 
@@ -146,24 +134,21 @@ def _entry(entry: object, where: str, folder: Path) -> UserMesh:
     file = folder / str(entry["path"])
     if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file():
         raise MeshError(f"{where}: {file} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
-    split = entry.get("split", "test")
+    split, scale = entry.get("split", "test"), _finite(entry.get("scale", 1.0), f"{where}: scale")
     if split not in SPLITS:
         raise MeshError(f"{where}: split {split!r}, expected {', '.join(SPLITS)}")
-    scale = _finite(entry.get("scale", 1.0), f"{where}: scale")
     if scale <= 0:
         raise MeshError(f"{where}: scale must be above 0, got {scale:g}")
-    base = UserMesh(name=name, path=str(file), scale=scale, split=split, content=file_hash(file))
     triples: dict[str, Any] = {}
     for key in ("rotation_deg", "offset_m"):
-        if key in entry:
-            values = entry[key]
-            if not isinstance(values, list) or len(values) != 3:
-                raise MeshError(f"{where}: {key} must be three numbers, got {values!r}")
-            triples[key] = tuple(_finite(value, f"{where}: {key}") for value in values)
+        values = entry.get(key, [0.0, 0.0, 0.0])
+        if not isinstance(values, list) or len(values) != 3:
+            raise MeshError(f"{where}: {key} must be three numbers, got {values!r}")
+        triples[key] = tuple(_finite(value, f"{where}: {key}") for value in values)
     centre = entry.get("centre", True)
     if not isinstance(centre, bool):
         raise MeshError(f"{where}: centre must be true or false, got {centre!r}")
-    return replace(base, centre=centre, **triples)
+    return UserMesh(name, str(file), scale, centre=centre, split=split, content=file_hash(file), **triples)
 
 
 def _finite(value: object, where: str) -> float:

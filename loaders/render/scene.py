@@ -1,25 +1,126 @@
-"""Where things stand: an object on its turning axis in front of the camera, at a fixed or a drawn distance.
+"""What a build is asked for, and where things stand: settings, light, and an object placed before the camera.
 
+Two builds with equal settings give equal bytes. An object stands on its turning axis, at a fixed or a drawn distance.
 Object coordinates are metres with z up and the turning axis as z. Camera coordinates are the rig's: x right, y down,
 z forward. At angle 0 the object's +x axis points away from the camera (paper Section 3.1: R_z(60 degrees x i)).
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from difflib import get_close_matches
+from hashlib import blake2b
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
-from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.sensor import uniform
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, MM_PER_M, OBJECTS, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.errors import BuildError, MeshError
+from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
+PRESETS: dict[str, tuple[tuple[str, ...], int]] = {"mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE)}
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
 
 _MARGIN_PX = 2.0
+
+
+@dataclass(frozen=True)
+class UserMesh:
+    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, content hash."""
+
+    name: str
+    path: str
+    scale: float = 1.0
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: bool = True
+    split: str = "test"
+    content: str = ""
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """Everything that decides the bytes of a dataset.
+
+    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's and then the users' by name, whatever order
+    they were given in: it is the order of the rows.
+    """
+
+    rig: Rig
+    objects: tuple[str, ...]
+    placement: PlacementRule = "fixed"
+    stored: str = "all"
+    seed: int = 42
+    noise_sigma_grey: float = 1.0
+    shadows: bool = False
+    user_meshes: tuple[UserMesh, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        names = {*OBJECTS, *(mesh.name for mesh in self.user_meshes)}
+        for name in self.objects:
+            if name not in names:
+                near = ", ".join(get_close_matches(name, sorted(names), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
+                raise BuildError(f"unknown object {name!r}; did you mean {near}?")
+        if not self.objects:
+            raise BuildError("no object to build: name at least one")
+        if len(set(self.objects)) != len(self.objects):
+            twice = next(name for name in self.objects if self.objects.count(name) > 1)
+            raise BuildError(f"object {twice!r} is named twice")
+        user_meshes = sorted(self.user_meshes, key=lambda mesh: mesh.name)
+        order = (*OBJECTS, *(mesh.name for mesh in user_meshes))
+        object.__setattr__(self, "user_meshes", tuple(user_meshes))
+        object.__setattr__(self, "objects", tuple(sorted(self.objects, key=order.index)))
+        if self.placement not in PLACEMENTS:
+            raise BuildError(f"placement {self.placement!r}: expected {' or '.join(PLACEMENTS)}")
+        if self.stored not in CONFIGS:
+            raise BuildError(f"frames {self.stored!r}: expected one of {', '.join(CONFIGS)}")
+        if not 0 <= self.noise_sigma_grey <= 50:
+            raise BuildError(f"noise of {self.noise_sigma_grey} grey levels: expected 0 to 50")
+        if not 0 <= self.seed < 2**63:
+            raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
+        self.rig.check_sampling()
+
+    def describe(self) -> dict[str, Any]:
+        """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
+        return {
+            "objects": list(self.objects),
+            "placement": self.placement,
+            "frames": self.stored,
+            "seed": self.seed,
+            "noise_sigma_grey": self.noise_sigma_grey,
+            "shadows": self.shadows,
+            "user_meshes": [
+                {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(mesh).items()
+                 if key != "path"}
+                for mesh in self.user_meshes
+            ],
+        }  # fmt: skip
+
+
+def preset_settings(preset: str, size: int | None = None) -> BuildSettings:
+    """The settings of ``fpp-bench build --preset PRESET [--size SIZE]`` with everything else left at its default."""
+    objects, preset_size = PRESETS[preset]
+    return BuildSettings(rig=paper_rig(size or preset_size), objects=objects)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Exposure and material. ``white_grey``: grey level of a white pattern on a surface that faces the projector at the
+    near end of the working range, so that nothing in range saturates; ``ambient_grey``: light besides the projector."""
+
+    white_grey: float = 225.0
+    ambient_grey: float = 6.0
+    specular: float = 0.15
+    roughness: float = 0.95
+    shadows: bool = False
+
+
+def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -> float:
+    """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
+    by the inverse square of the distance."""
+    white = (lighting or Lighting()).white_grey
+    return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
 
 
 @dataclass(frozen=True)
@@ -29,6 +130,12 @@ class SolidMesh:
     name: str
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
+
+
+def uniform(*name: object) -> float:
+    """A number in [0, 1) that depends only on ``name``."""
+    digest = blake2b("\x1f".join(map(str, name)).encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") / 2.0**64
 
 
 def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:

@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask, object_near_edge
-from fpp_ml_bench.loaders.render.camera import Exposure
-from fpp_ml_bench.loaders.render.illumination import Backdrop, Lighting, LitPixels, lit_object
+from fpp_ml_bench.loaders.render.illumination import Backdrop, LitPixels, lit_object
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, place
-from fpp_ml_bench.loaders.render.sensor import Noise
-from fpp_ml_bench.loaders.render.settings import BuildSettings
-from fpp_ml_bench.loaders.sample import stored_frames
-from fpp_ml_bench.loaders.storage import Row
+from fpp_ml_bench.loaders.render.scene import BuildSettings, Lighting, SolidMesh, place
+from fpp_ml_bench.loaders.render.sensor import Exposure, Noise
+from fpp_ml_bench.loaders.sample import Row, stored_frames
 from fpp_ml_bench.optics import Sequence
 from fpp_ml_bench.skipping import skipping_enabled
 
@@ -24,17 +21,25 @@ INTERIOR_PX = 3
 """Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
 
 
-@dataclass
+@dataclass(frozen=True)
+class TracedView:
+    """An object before the camera: what the rays meet, its light, and the name of the view's noise stream."""
+
+    traced: TracedObject
+    distance_m: float
+    hits: Hits
+    lit: LitPixels
+    stream: tuple[object, ...]
+
+
 class Studio:
     """A rig with its light and background, ready to photograph objects.
 
     One view's frames are held, and overwritten by the next.
     """
 
-    settings: BuildSettings
-
-    def __post_init__(self) -> None:
-        rig, settings = self.settings.rig, self.settings
+    def __init__(self, settings: BuildSettings) -> None:
+        self.settings, rig = settings, settings.rig
         self.lighting = Lighting(shadows=settings.shadows)
         self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
         self.backdrop = Backdrop(rig, self.lighting)
@@ -50,37 +55,44 @@ class Studio:
         pixels alone, and decoded there alone: the bytes there, and so the decoded depth, are the same either way. With
         skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
         """
-        settings, rig = self.settings, self.settings.rig
-        vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
-        traced = TracedObject(mesh, vertices_m)
-        hits = traced.primary(PixelRays.of(rig.camera))
-        lit = lit_object(hits, rig, self.lighting, traced)
-        stream = (settings.seed, mesh.name, view)
-        whole = self.backdrop.behind(traced, hits.pixels).patched(hits.pixels, lit)
-        self.expose(hits, lit, whole, stream)
+        scene = self.trace(mesh, view)
+        whole = self.light(scene)
+        self.expose(scene, whole)
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
-        exact_mm.ravel()[hits.pixels] = hits.depth_m * MM_PER_M
-        seen = object_mask(exact_mm)
-        depth_mm = self.ground_truth_mm(seen)
+        exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
+        depth_mm = self.ground_truth_mm(object_mask(exact_mm))
         measured = {
-            "distance_mm": distance_m * MM_PER_M,
+            "distance_mm": scene.distance_m * MM_PER_M,
             "shadow_rays": whole.shadow_rays,
             **ground_truth_error(depth_mm, exact_mm),
         }
         frames = {index: self._frames[index] for index in self.stored}
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 
-    def expose(self, hits: Hits, lit: LitPixels, whole: LitPixels, stream: tuple[object, ...]) -> None:
-        """Expose a view into the studio's frames: what ``whole`` says of every pixel, ``lit`` of the object's."""
+    def trace(self, mesh: SolidMesh, view: str) -> TracedView:
+        """The object in its place, seen and lit."""
+        settings, rig = self.settings, self.settings.rig
+        vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
+        traced = TracedObject(mesh, vertices_m)
+        hits = traced.primary(PixelRays.of(rig.camera))
+        lit = lit_object(hits, rig, self.lighting, traced)
+        return TracedView(traced, distance_m, hits, lit, (settings.seed, mesh.name, view))
+
+    def light(self, scene: TracedView) -> LitPixels:
+        """Illumination of every pixel of the image: the object's, and the plane's behind it."""
+        return self.backdrop.behind(scene.traced, scene.hits.pixels).patched(scene.hits.pixels, scene.lit)
+
+    def expose(self, scene: TracedView, whole: LitPixels) -> None:
+        """Expose a view into the studio's frames; ``whole`` is the light of every pixel."""
+        pixels = scene.hits.pixels
         images = self._frames.reshape(len(self._frames), -1)
         everything = not skipping_enabled()
         for run in _runs(tuple(range(len(images))) if everything else self.stored):
-            self.exposure.expose(run, whole, self._pixels, stream, images[run.start : run.stop])
+            self.exposure.expose(run, whole, self._pixels, scene.stream, images[run.start : run.stop])
         if self.unstored and not everything:
-            pixels = hits.pixels.astype(np.uint32)
-            exposed = self.exposure.expose(self.unstored, lit, pixels, stream)
+            exposed = self.exposure.expose(self.unstored, scene.lit, pixels.astype(np.uint32), scene.stream)
             for index, values in zip(self.unstored, exposed, strict=True):
-                images[index, hits.pixels] = values
+                images[index, pixels] = values
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
@@ -121,12 +133,12 @@ def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),
         "gt_mae_mm": _mean(np.abs(error)),
-        "gt_rmse_mm": _root(_mean(error**2)),
+        "gt_rmse_mm": _root_mean_square(error),
         "gt_bias_mm": _mean(error),
         "gt_max_mm": float(np.abs(error).max()) if error.size else None,
         "gt_interior_px": int(inside.size),
         "gt_interior_mae_mm": _mean(np.abs(inside)),
-        "gt_interior_rmse_mm": _root(_mean(inside**2)),
+        "gt_interior_rmse_mm": _root_mean_square(inside),
     }
 
 
@@ -134,5 +146,5 @@ def _mean(values: NDArray[np.float64]) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _root(value: float | None) -> float | None:
-    return None if value is None else float(np.sqrt(value))
+def _root_mean_square(values: NDArray[np.float64]) -> float | None:
+    return float(np.sqrt(float((values**2).mean()))) if values.size else None

@@ -9,29 +9,29 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import connection, get_context, parent_process
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.files import exclusive, file_hash, write_atomically
+from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage.card import write_card
-from fpp_ml_bench.loaders.storage.folder_lock import writing
-from fpp_ml_bench.loaders.storage.manifest import MANIFEST, Manifest, ShardFile, describe_file
-from fpp_ml_bench.loaders.storage.shards import ShardPlan
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifest, ShardFile, describe_file
+from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import THREAD_COUNTS
 
 SETTINGS = "settings.json"
-Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
-Work = Callable[[Path, Path, ShardPlan, Callable[[], None]], Receipt]
-"""Writes a shard: (dataset folder, scratch folder, plan, function to call after each row) -> its files and rows.
-Picklable."""
+RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
+"""Makes the rows of a shard, in order, and maybe meshes in the dataset folder. Picklable; a process calls one for all
+its shards, and may hold what they share in it."""
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
 _POLL_S = 0.2
@@ -39,14 +39,13 @@ _POLL_S = 0.2
 
 @dataclass(frozen=True)
 class Assembly:
-    """A dataset to be written: its shard plans, the function that writes a shard, and the manifest without rows."""
+    """A dataset to be written: its shard plans, the source of their rows, and the manifest without rows."""
 
     plans: list[ShardPlan]
-    work: Work
+    rows: RowSource
     manifest: Manifest
-    bytes_per_row: int
     mesh_folder: str | None = None
-    """Folder below the dataset folder into which ``work`` writes a PLY of each object."""
+    """Folder below the dataset folder into which ``rows`` writes a PLY of each object."""
 
     def mesh_paths(self, rows: list[dict[str, Any]]) -> list[str]:
         """Mesh files of the objects that ``rows`` show, relative to the dataset folder."""
@@ -61,6 +60,11 @@ class Assembly:
             name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
         }
 
+    def writer(self, folder: Path, scratch: Path) -> ShardWriter:
+        """The writer of this dataset's shards."""
+        content = self.manifest
+        return ShardWriter(folder, scratch, content.sequence, content.stored, content.exact, content.size)
+
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
     """Write or finish the dataset. Returns the manifest at the end.
@@ -71,7 +75,12 @@ def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress 
     Raises `BuildError` when the folder is in use, holds other files, or can't be written.
     """
     try:
-        return _assemble(folder, assembly, workers, progress)
+        with writing(folder) as scratch:
+            if (folder / MANIFEST).exists():
+                manifest = DatasetFolder(folder).manifest  # every file is there, in full length
+                _compare(folder, {key: asdict(manifest)[key] for key in assembly.key()}, assembly.key())
+                return manifest
+            return _assemble(folder, scratch, assembly, workers, progress)
     except OSError as error:
         raise BuildError(
             f"{folder}: writing failed ({error}); remove the cause (on a full disk: free some space), then run the "
@@ -79,31 +88,48 @@ def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress 
         ) from error
 
 
-def _assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
-    with writing(folder) as scratch:
-        if (folder / MANIFEST).exists():
-            return _finished_manifest(folder, assembly)
-        _check_settings(folder, scratch, assembly)
-        for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
-            leftover.unlink(missing_ok=True)  # the two patterns overlap
-        receipts = {}
-        for plan in assembly.plans:
-            receipt = _receipt(folder, scratch, plan)
-            if receipt and all((folder / name).is_file() for name in assembly.mesh_paths(receipt[1])):
-                receipts[plan.name] = receipt
-        missing = [plan for plan in assembly.plans if plan.name not in receipts]
-        progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
-        _check_space(folder, assembly, missing)
-        for plan, receipt in _run(folder, scratch, assembly.work, missing, workers, progress):
-            _write_receipt(scratch, plan, receipt)
+@contextmanager
+def writing(folder: Path) -> Iterator[Path]:
+    """Lock a dataset folder for its single writer; yields its work folder, which is removed once the manifest is there.
+
+    Raises `BuildError` for a folder that another process is writing, or that holds other files than a dataset.
+    """
+    work = folder / WORK_FOLDER
+    if folder.exists() and not folder.is_dir():
+        raise BuildError(f"{folder}: is a file; give a folder")
+    if folder.is_dir() and not (folder / MANIFEST).exists() and not work.exists() and any(folder.iterdir()):
+        raise BuildError(f"{folder}: holds other files and no dataset; give a new or empty folder")
+    with exclusive(work / "lock", folder, "writing this folder"):
+        try:
+            yield work
+        finally:
+            if (folder / MANIFEST).exists():
+                shutil.rmtree(work, ignore_errors=True)
+
+
+def _assemble(folder: Path, scratch: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
+    _check_settings(folder, scratch, assembly)
+    for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
+        leftover.unlink(missing_ok=True)  # the two patterns overlap
+    receipts = {}
+    for plan in assembly.plans:
+        receipt = _receipt(folder, scratch, plan)
+        if receipt and all((folder / name).is_file() for name in assembly.mesh_paths(receipt[1])):
             receipts[plan.name] = receipt
-        return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
-
-
-def _finished_manifest(folder: Path, assembly: Assembly) -> Manifest:
-    manifest = DatasetFolder(folder).manifest  # every file is there, in full length
-    _compare(folder, {key: asdict(manifest)[key] for key in assembly.key()}, assembly.key())
-    return manifest
+    missing = [plan for plan in assembly.plans if plan.name not in receipts]
+    progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
+    _check_space(folder, assembly, missing)
+    if workers > 1 and len(missing) > 1:
+        written = _write_in_processes(folder, scratch, assembly, missing, workers, progress)
+    else:
+        write = assembly.writer(folder, scratch).write
+        written = ((plan, write(plan, assembly.rows(plan, folder), lambda: progress(1))) for plan in missing)
+    with closing(written):
+        for plan, (files, rows) in written:
+            content = {"files": [asdict(file) for file in files], "rows": rows}
+            write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
+            receipts[plan.name] = files, rows
+    return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
 
 
 def _check_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
@@ -121,20 +147,16 @@ def _check_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
 
 def _compare(folder: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:
     """Raise `BuildError` naming the differences between the folder's settings and the requested settings."""
-    requested = json.loads(json.dumps(requested))
-    stored = json.loads(json.dumps(stored))
+    stored, requested = json.loads(json.dumps(stored)), json.loads(json.dumps(requested))
     differing = []
     for key in requested:
-        if requested[key] == stored.get(key):
-            continue
-        if isinstance(requested[key], dict) and isinstance(stored.get(key), dict):
-            names = sorted(set(requested[key]) | set(stored[key]))
-            differing += [
-                f"{name} (there {_short(stored[key].get(name))}, now {_short(requested[key].get(name))})"
-                for name in names if requested[key].get(name) != stored[key].get(name)
-            ]  # fmt: skip
-        else:
-            differing.append(f"{key} (there {_short(stored.get(key))}, now {_short(requested[key])})")
+        there, now = stored.get(key), requested[key]
+        if not (isinstance(there, dict) and isinstance(now, dict)):
+            there, now = {key: there}, {key: now}
+        differing += [
+            f"{name} (there {_short(there.get(name))}, now {_short(now.get(name))})"
+            for name in sorted({*there, *now}) if there.get(name) != now.get(name)
+        ]  # fmt: skip
     if differing:
         raise BuildError(
             f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete it"
@@ -148,27 +170,18 @@ def _short(value: object) -> str:
 
 def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
     """Receipt of a shard that is finished and whose files are intact, else None."""
-    path = scratch / f"{plan.name}.json"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        files = [ShardFile(**entry) for entry in content["files"]]
-        rows = content["rows"]
-        complete = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
+        content = json.loads((scratch / f"{plan.name}.json").read_text(encoding="utf-8"))
+        files, rows = [ShardFile(**entry) for entry in content["files"]], content["rows"]
+        intact = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
+        planned = [name for name, _, _ in plan.samples]
+        return (files, rows) if intact and [row["sample"] for row in rows] == planned else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return (
-        (files, rows) if complete and [row["sample"] for row in rows] == [name for name, _, _ in plan.samples] else None
-    )
-
-
-def _write_receipt(scratch: Path, plan: ShardPlan, receipt: Receipt) -> None:
-    files, rows = receipt
-    content = {"files": [asdict(file) for file in files], "rows": rows}
-    write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
 
 
 def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
-    needed = sum(len(plan.samples) for plan in missing) * assembly.bytes_per_row
+    needed = sum(len(plan.samples) for plan in missing) * assembly.manifest.row_bytes
     free = shutil.disk_usage(folder).free
     if needed + _RESERVE_BYTES > free:
         raise BuildError(
@@ -177,42 +190,80 @@ def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> 
         )
 
 
-def _run(
-    folder: Path, scratch: Path, work: Work, plans: list[ShardPlan], workers: int, progress: Progress
-) -> Iterator[tuple[ShardPlan, Receipt]]:
-    """Write the shards; yields each when it is finished, in any order."""
-    if workers <= 1 or len(plans) <= 1:
-        for plan in plans:
-            yield plan, work(folder, scratch, plan, lambda: progress(1))
-        return
+def _write_in_processes(
+    folder: Path, scratch: Path, assembly: Assembly, plans: list[ShardPlan], workers: int, progress: Progress
+) -> Generator[tuple[ShardPlan, Receipt], None, None]:
+    """Write the shards in processes that each go from shard to shard; yields each when it is finished, in any order."""
     context = get_context("spawn")
-    rows_done = context.Value("q", 0)
-    reported = 0
-    with (
-        _single_threaded_algebra(),
-        ProcessPoolExecutor(
-            max_workers=min(workers, len(plans)), mp_context=context, initializer=_start_worker, initargs=(rows_done,)
-        ) as pool,
-    ):
-        # The longest shards first, so that no worker is left with a long shard at the end.
-        ordered = sorted(plans, key=lambda plan: -len(plan.samples))
-        futures = {pool.submit(_work_in_worker, work, folder, scratch, plan): plan for plan in ordered}
-        waiting = set(futures)
-        try:
-            while waiting:
-                finished, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                done = rows_done.value
-                progress(done - reported)
-                reported = done
-                for future in finished:
-                    yield futures[future], future.result()
-        except BrokenProcessPool as error:
-            raise BuildError(
-                f"{folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
-                "--workers 1 it needs the least memory"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+    rows_done, reported = context.Value("q", 0), 0
+    # The longest shards first, so that no worker is left with a long shard at the end.
+    waiting = deque(sorted(plans, key=lambda plan: -len(plan.samples)))
+    pipes, processes = [], []
+    try:
+        with _single_threaded_algebra():
+            for _ in range(min(workers, len(plans))):
+                pipe, end = context.Pipe()
+                pipes.append(pipe)
+                processes.append(context.Process(target=_work, args=(end, rows_done, folder, scratch, assembly)))
+                processes[-1].start()
+                end.close()  # the worker's copy is the only one left: when the worker dies, the pipe ends
+        busy = {}
+        for pipe in pipes:
+            busy[pipe] = waiting.popleft()
+            pipe.send(busy[pipe])
+        while busy:
+            ready = connection.wait(list(busy), timeout=_POLL_S)
+            done = rows_done.value
+            progress(done - reported)
+            reported = done
+            for pipe in (pipe for pipe in pipes if pipe in ready):
+                plan, result = busy.pop(pipe), pipe.recv()
+                if isinstance(result, Exception):
+                    raise result
+                if waiting:
+                    busy[pipe] = waiting.popleft()
+                    pipe.send(busy[pipe])
+                yield plan, result
+    except (EOFError, ConnectionError) as error:
+        raise BuildError(
+            f"{folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
+            "--workers 1 it needs the least memory"
+        ) from error
+    finally:
+        for pipe in pipes:
+            pipe.close()  # a worker ends when it has finished its shard
+        for process in processes:
+            process.join()
+
+
+def _work(pipe: Connection, rows_done: Any, folder: Path, scratch: Path, assembly: Assembly) -> None:
+    """Write the shards whose plans come through ``pipe``, counting rows in memory shared with the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    writer = assembly.writer(folder, scratch)
+
+    def row_done() -> None:
+        with rows_done.get_lock():
+            rows_done.value += 1
+
+    with suppress(EOFError, ConnectionError):  # the parent wants no more
+        while True:
+            plan = pipe.recv()
+            result: Receipt | Exception
+            try:
+                result = writer.write(plan, assembly.rows(plan, folder), row_done)
+            except Exception as error:
+                error.add_note(traceback.format_exc())
+                result = error
+            pipe.send(result)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends: an orphan would write into an unlocked folder."""
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 @contextmanager
@@ -228,33 +279,6 @@ def _single_threaded_algebra() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-_rows_done: Any = None
-
-
-def _start_worker(rows_done: Any) -> None:
-    """Count rows in memory shared with the parent, and end with it: an orphan would write into an unlocked folder."""
-    global _rows_done
-    _rows_done = rows_done
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-
-def _work_in_worker(work: Work, folder: Path, scratch: Path, plan: ShardPlan) -> Receipt:
-    return work(folder, scratch, plan, _count_row)
-
-
-def _count_row() -> None:
-    with _rows_done.get_lock():
-        _rows_done.value += 1
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:

@@ -1,17 +1,21 @@
-"""The files by which Hugging Face tools open a dataset folder (card, split list, per-split state), and the rig file.
+"""What describes a dataset: the files by which Hugging Face tools open its folder, the rig file, and its statistics.
 
 ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
 ``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place.
 """
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, features, group_columns, stored_groups
 from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.optics import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
 CARD_HEAD = """\
@@ -60,16 +64,14 @@ def data_version(fingerprint: str) -> str:
 
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
     """Write card, rig and Hugging Face state files of a dataset with finished shards; returns their relative paths."""
-    from fpp_ml_bench.optics import rig_from_dict, save_rig
-
     rig = rig_from_dict(manifest.rig)
     sequence = rig.sequence
     frames = stored_groups(sequence, manifest.stored)[DATA_GROUP]
     columns = group_columns(sequence, DATA_GROUP, frames, manifest.exact)
-    data = [shard for shard in manifest.shards if shard.group == DATA_GROUP]
+    contents: dict[str, Any] = {"dataset_dict.json": {"splits": list(manifest.samples)}}
     for split in manifest.samples:
-        files = [shard.path for shard in data if shard.split == split]
-        state: dict[str, Any] = {
+        files = [shard.path for shard in manifest.shards if (shard.group, shard.split) == (DATA_GROUP, split)]
+        contents[f"{split}/state.json"] = {
             "_data_files": [{"filename": path.split("/")[-1]} for path in files],
             "_fingerprint": manifest.fingerprint[:16],
             "_format_columns": None,
@@ -78,11 +80,12 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
             "_output_all_columns": False,
             "_split": split,
         }
-        info = {"citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
-                "license": "mit"}  # fmt: skip
-        _write_json(folder / split / "state.json", state)
-        _write_json(folder / split / "dataset_info.json", info)
-    _write_json(folder / "dataset_dict.json", {"splits": list(manifest.samples)})
+        contents[f"{split}/dataset_info.json"] = {
+            "citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
+            "license": "mit",
+        }  # fmt: skip
+    for name, content in contents.items():
+        write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
     save_rig(rig, folder / RIG_FILE)
     text = CARD_HEAD + _CARD.format(
         version=data_version(manifest.fingerprint),
@@ -98,9 +101,79 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         package=__version__,
     )
     write_atomically(folder / "README.md", text.encode())
-    states = [f"{split}/{name}" for split in manifest.samples for name in ("state.json", "dataset_info.json")]
-    return ["README.md", "dataset_dict.json", RIG_FILE, *states]
+    return ["README.md", RIG_FILE, *contents]
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_atomically(path, json.dumps(content, indent=1).encode() + b"\n")
+@dataclass(frozen=True)
+class SplitStatistics:
+    """Statistics of a split; lengths in mm, shares from 0 to 1, None where a dataset has no exact depth.
+
+    ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact depth over all
+    object pixels, averaged over samples like every score. ``gt_interior_*``: the same over object pixels 3 px or more
+    from depth edges.
+    """
+
+    split: str
+    samples: int
+    objects: int
+    cover_mean: float
+    cover_min: float
+    cover_max: float
+    depth_range_median_mm: float
+    depth_range_max_mm: float
+    gt_mae_mm: float | None
+    gt_rmse_mm: float | None
+    gt_interior_mae_mm: float | None
+    gt_interior_rmse_mm: float | None
+    gt_max_mm: float | None
+    undecoded_share: float | None
+
+
+def split_statistics(manifest: Manifest) -> list[SplitStatistics]:
+    """Statistics of each split that has rows in the manifest."""
+    return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
+
+
+def whole_statistics(manifest: Manifest) -> SplitStatistics:
+    """Statistics of all rows together, as a split called ``all``."""
+    return _split("all", [row for rows in manifest.samples.values() for row in rows], manifest)
+
+
+def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> SplitStatistics:
+    pixels = manifest.size[0] * manifest.size[1]
+    cover = np.array([row["object_px"] for row in rows]) / pixels
+    ranges = np.array([row["depth_max_mm"] - row["depth_min_mm"] for row in rows])
+
+    def average(key: str) -> float | None:
+        values = [row[key] for row in rows if row.get(key) is not None]
+        return float(np.mean(values)) if values else None
+
+    largest = [row["gt_max_mm"] for row in rows if row.get("gt_max_mm") is not None]
+    exact_px = sum(row.get("exact_px", 0) for row in rows)
+    return SplitStatistics(
+        split=split,
+        samples=len(rows),
+        objects=len({row["object"] for row in rows}),
+        cover_mean=float(cover.mean()),
+        cover_min=float(cover.min()),
+        cover_max=float(cover.max()),
+        depth_range_median_mm=float(np.median(ranges)),
+        depth_range_max_mm=float(ranges.max()),
+        gt_mae_mm=average("gt_mae_mm"),
+        gt_rmse_mm=average("gt_rmse_mm"),
+        gt_interior_mae_mm=average("gt_interior_mae_mm"),
+        gt_interior_rmse_mm=average("gt_interior_rmse_mm"),
+        gt_max_mm=max(largest) if largest else None,
+        undecoded_share=sum(row["undecoded_px"] for row in rows) / exact_px if exact_px else None,
+    )
+
+
+def ground_truth_summary(manifest: Manifest) -> list[str]:
+    """A sentence per split on the error of the decoded ground truth against the exact depth; none for imported data."""
+    return [
+        f"{s.split}: ground truth within {s.gt_mae_mm:.3f} mm MAE, {s.gt_rmse_mm:.3f} mm RMSE of the exact depth "
+        f"({s.gt_interior_mae_mm:.3f} mm 3 px or more from depth edges); {100 * s.undecoded_share:.2f}% of object "
+        "pixels not decodable"
+        for s in split_statistics(manifest)
+        if s.gt_mae_mm is not None and s.gt_interior_mae_mm is not None and s.undecoded_share is not None
+    ]

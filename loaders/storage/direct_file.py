@@ -12,6 +12,8 @@ import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import xxhash
+
 BLOCK_BYTES = 1 << 22
 _BLOCKS = 4
 
@@ -24,8 +26,6 @@ class DirectFile:
     """
 
     def __init__(self, path: Path, thread: ThreadPoolExecutor) -> None:
-        import xxhash
-
         self._hash = xxhash.xxh3_128()
         self._thread = thread
         # Anonymous maps are page-aligned, as direct writes demand.

@@ -5,10 +5,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fpp_ml_bench import optics
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.files import exclusive
+from fpp_ml_bench.loaders import published
+from fpp_ml_bench.loaders.storage.parquet import write_parquet
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 
+MESH_FOLDER = "meshes"
+FORMS = ("parquet", "mat", "meshes", "patterns")
+SAMPLE_FORMS = ("parquet", "mat")
+"""Forms whose progress is counted in samples."""
 _LOCK = ".lock"
 
 
@@ -27,33 +34,22 @@ def exporting(out: Path) -> Iterator[Path]:
     staging = target.with_name(f".{target.name}.export")
     with exclusive(staging / _LOCK, out, "exporting there"):
         try:
-            _clear(staging)
+            for remains in staging.iterdir():
+                if remains.is_dir() and not remains.is_symlink():
+                    shutil.rmtree(remains)
+                elif remains.name != _LOCK:
+                    remains.unlink()
             yield staging
             (staging / _LOCK).unlink()
             staging.replace(target)
-        except OSError as error:
+        except BaseException as error:
             shutil.rmtree(staging, ignore_errors=True)
+            if not isinstance(error, OSError):
+                raise
             raise BuildError(
                 f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
                 "space or choose another disk"
             ) from error
-        except BaseException:
-            shutil.rmtree(staging, ignore_errors=True)
-            raise
-
-
-def _clear(staging: Path) -> None:
-    for entry in staging.iterdir():
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        elif entry.name != _LOCK:
-            entry.unlink()
-
-
-MESH_FOLDER = "meshes"
-FORMS = ("parquet", "mat", "meshes", "patterns")
-SAMPLE_FORMS = ("parquet", "mat")
-"""Forms whose progress is counted in samples."""
 
 
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
@@ -81,20 +77,14 @@ def export(
             folder = staging / form if len(forms) > 1 else staging
             folder.mkdir(exist_ok=True)
             if form == "parquet":
-                from fpp_ml_bench.loaders.storage.parquet import write_parquet
-
                 write_parquet(dataset, folder, splits, threads, progress)
             elif form == "mat":
-                from fpp_ml_bench.loaders.published import write_tree
-
-                write_tree(dataset, folder, splits, threads, lambda: progress(1))
+                published.write_tree(dataset, folder, splits, threads, lambda: progress(1))
             elif form == "meshes":
                 for path in meshes:
                     shutil.copyfile(path, folder / path.name)
             else:
-                from fpp_ml_bench.optics import export_patterns
-
-                export_patterns(dataset.rig, folder)
+                optics.export_patterns(dataset.rig, folder)
 
 
 def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:

@@ -5,7 +5,6 @@ builds of the same settings: no date, no path, no machine.
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import Any
 from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.optics import Sequence
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
@@ -58,8 +59,8 @@ class Manifest:
     size: tuple[int, int]
     stored: str
     exact: bool
-    samples: dict[str, list[dict[str, Any]]]
-    shards: list[ShardFile]
+    samples: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    shards: list[ShardFile] = field(default_factory=list)
     others: list[OtherFile] = field(default_factory=list)
     schema_version: str = SCHEMA_VERSION
 
@@ -70,6 +71,21 @@ class Manifest:
         for key in ("others", "generator"):
             content.pop(key)
         return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+    @property
+    def sequence(self) -> Sequence:
+        return Sequence(**self.rig["sequence"])
+
+    @property
+    def stored_frames(self) -> tuple[int, ...]:
+        """Indices of the frames on disk, ascending."""
+        return stored_frames(self.sequence, self.stored)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's images: one a pixel and stored frame, four a depth map."""
+        depths = 8 if self.exact else 4
+        return self.size[0] * self.size[1] * (len(self.stored_frames) + depths)
 
     @property
     def files(self) -> tuple[ShardFile | OtherFile, ...]:
@@ -119,10 +135,3 @@ def read_manifest(folder: Path) -> Manifest:
 def describe_file(folder: Path, path: Path) -> OtherFile:
     """Manifest entry of a file below the dataset folder."""
     return OtherFile(path.relative_to(folder).as_posix(), path.stat().st_size, file_hash(path))
-
-
-def dataset_files(folder: Path) -> Iterator[Path]:
-    """Every file below a dataset folder, sorted, without the builder's own work folder and lock."""
-    for path in sorted(folder.rglob("*")):
-        if WORK_FOLDER not in path.relative_to(folder).parts and (path.is_file() or path.is_symlink()):
-            yield path

@@ -1,14 +1,16 @@
 """Writing shards: the rows of a few objects, an Arrow stream file per column group, completely or not at all."""
 
+import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
@@ -19,8 +21,8 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     LABELS,
     RANGE,
-    SINGLE_SHOT_FRAME,
-    arrow_schema,
+    Row,
+    features,
     group_columns,
     stored_groups,
 )
@@ -28,27 +30,10 @@ from fpp_ml_bench.loaders.storage.direct_file import DirectFile
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.optics import Sequence
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
-
-
-@dataclass
-class Row:
-    """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest.
-
-    The images' memory may be reused as soon as the writer takes the next row.
-    """
-
-    sample: str
-    object: str
-    view: str
-    frames: dict[int, NDArray[np.uint8]]
-    depth_mm: NDArray[np.float32]
-    depth_exact_mm: NDArray[np.float32] | None
-    measured: dict[str, Any] = field(default_factory=dict)
+Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
+"""Files of a written shard, and per row its labels and measurements."""
 
 
 @dataclass(frozen=True)
@@ -82,50 +67,69 @@ def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> l
     return plans
 
 
+def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
+    """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``.
+
+    Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
+    metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
+    """
+    fields = []
+    described = features(columns, size)
+    types = {"string": pa.string(), "float32": pa.float32(), "uint8": pa.uint8()}
+    for name, feature in described.items():
+        kind = types[feature["dtype"]]
+        if feature["_type"] == "Array2D":
+            metadata = {
+                b"ARROW:extension:name": b"datasets.features.features.Array2DExtensionType",
+                b"ARROW:extension:metadata": json.dumps([feature["shape"], feature["dtype"]]).encode(),
+            }
+            fields.append(pa.field(name, pa.list_(pa.list_(kind)), metadata=metadata))
+        else:
+            fields.append(pa.field(name, kind))
+    return pa.schema(fields, metadata={b"huggingface": json.dumps({"info": {"features": described}}).encode()})
+
+
 class ShardWriter:
-    """Writes the files of a shard. Rows come in plan order; pixels are copied once, into reused batch buffers."""
+    """Writes shards of one dataset, one after the other. Pixels are copied once, into buffers that all shards reuse.
+
+    ``sequence``, ``stored``, ``exact`` and ``size`` (H, W) are the dataset's, as in its `Manifest`; unfinished files
+    lie in ``scratch``.
+    """
 
     def __init__(
-        self, folder: Path, scratch: Path, plan: ShardPlan, sequence: Sequence, stored: str, exact: bool,
-        size: tuple[int, int],
-    ) -> None:  # fmt: skip
-        self._folder, self._scratch, self._plan = folder, scratch, plan
-        self._sequence, self._exact, self._size = sequence, exact, size
+        self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
+    ) -> None:
+        self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
         self._groups = stored_groups(sequence, stored)
+        self._schemas = {
+            group: arrow_schema(group_columns(sequence, group, frames, exact), size)
+            for group, frames in self._groups.items()
+        }
+        self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
+        # Mapping 200 MB of new pages for every shard takes longer than filling them.
+        self._buffers: dict[str, NDArray] = {}
 
-    def write(
-        self, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None
-    ) -> tuple[list[ShardFile], list[dict[str, Any]]]:
-        """Write all rows and call ``row_done`` after each; returns the files and, per row, its labels and measurements.
+    def write(self, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None) -> Receipt:
+        """Write the rows of ``plan``, which come in its order, and call ``row_done`` after each.
 
         Raises `BuildError` when the disk is full or can't be written; no unfinished file is left.
         """
-        import pyarrow as pa
-
-        stem = f"{self._plan.name}.{os.getpid()}"
-        temporary = {group: self._scratch / f"{stem}.{group}.tmp" for group in self._groups}
+        temporary = {group: self._scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._groups}
         try:
-            described, sinks = self._write_streams(rows, temporary, row_done)
+            described, sinks = self._write_streams(plan, rows, temporary, row_done)
             files = []
             for group, path in temporary.items():
-                target = self._folder / self._plan.path(group)
+                target = self._folder / plan.path(group)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
-                files.append(
-                    ShardFile(
-                        path=self._plan.path(group),
-                        split=self._plan.split,
-                        group=group,
-                        first_row=self._plan.first_row,
-                        rows=len(self._plan.samples),
-                        bytes=sinks[group].size,
-                        xxh3_128=sinks[group].xxh3_128,
-                    )
-                )
+                place = (plan.path(group), plan.split, group, plan.first_row, len(plan.samples))
+                files.append(ShardFile(*place, bytes=sinks[group].size, xxh3_128=sinks[group].xxh3_128))
         except (OSError, pa.ArrowException) as error:
+            number = getattr(error, "errno", None)
+            reason = os.strerror(number) if number else error
             raise BuildError(
-                f"{self._folder / self._plan.path(DATA_GROUP)}: can't be written ({_reason(error)}); free some space "
-                "or choose another disk, then run the same command again: it resumes"
+                f"{self._folder / plan.path(DATA_GROUP)}: can't be written ({reason}); free some space or choose "
+                "another disk, then run the same command again: it resumes"
             ) from error
         finally:
             for path in temporary.values():
@@ -133,113 +137,78 @@ class ShardWriter:
         return files, described
 
     def _write_streams(
-        self, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
+        self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
     ) -> tuple[list[dict[str, Any]], dict[str, DirectFile]]:
-        import pyarrow as pa
-
-        schemas = {
-            group: arrow_schema(group_columns(self._sequence, group, frames, self._exact), self._size)
-            for group, frames in self._groups.items()
-        }
         with ThreadPoolExecutor(1) as thread, ExitStack() as files:
             sinks: dict[str, DirectFile] = {}
             for group, path in paths.items():
                 sinks[group] = DirectFile(path, thread)
                 files.callback(sinks[group].close)
             writers = {
-                group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schemas[group]) for group, sink in sinks.items()
+                group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
+                for group, sink in sinks.items()
             }
             described = []
-            data = _DataBatch(len(self._plan.samples), self._size)
-            for row in self._checked(rows):
+            data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
+            for number, row in enumerate(_in_order(plan, rows)):
                 low_mm, high_mm = depth_range_mm(row.depth_mm, row.sample)
-                described.append(
-                    {
-                        "sample": row.sample,
-                        "object": row.object,
-                        "view": row.view,
-                        "object_px": int(np.count_nonzero(object_mask(row.depth_mm))),
-                        "depth_min_mm": low_mm,
-                        "depth_max_mm": high_mm,
-                        **row.measured,
-                    }
-                )
-                data.add(row, (low_mm, high_mm), self._plan.split, self._sequence)
-                # All frames but the first are written at once, one row per batch, and not held in memory.
+                labels = {"sample": row.sample, "object": row.object, "view": row.view}
+                object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
+                measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
+                described.append({**labels, **measured})
+                for values, value in zip(data.values(), (*labels.values(), plan.split, low_mm, high_mm), strict=True):
+                    values.append(value)
+                # The data group is one batch of all rows. All frames but the first are written at once, one row per
+                # batch, and not held in memory.
                 for group, frames in self._groups.items():
+                    images: dict[str, Any] = {
+                        self._sequence.frames[index].column: row.frames[index] for index in frames
+                    }
                     if group != DATA_GROUP:
-                        images = [self._image(row, index)[None] for index in frames]
-                        writers[group].write_batch(_record_batch(images, schemas[group]))
+                        batch = [self._checked(image, column)[None] for column, image in images.items()]
+                        writers[group].write_batch(_record_batch(batch, self._schemas[group]))
+                        continue
+                    images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
+                    for column in self._images:
+                        image = self._checked(images[column], column)
+                        self._buffer(column, len(plan.samples))[number] = image
                 row_done()
-            writers[DATA_GROUP].write_batch(data.record_batch(schemas[DATA_GROUP]))
+            schema = self._schemas[DATA_GROUP]
+            columns = [data.get(name) or self._buffer(name, len(plan.samples)) for name in schema.names]
+            writers[DATA_GROUP].write_batch(_record_batch(columns, schema))
             for writer in writers.values():
                 writer.close()
         return described, sinks
 
-    def _checked(self, rows: Iterable[Row]) -> Iterator[Row]:
-        rows = iter(rows)
-        for planned, _, _ in self._plan.samples:
-            row = next(rows, None)
-            if row is None or row.sample != planned:
-                received = "nothing" if row is None else f"sample {row.sample!r}"
-                raise BuildError(f"shard {self._plan.name}: expected sample {planned!r}, got {received}")
-            yield row
+    def _buffer(self, column: str, rows: int) -> NDArray:
+        if column not in self._buffers or len(self._buffers[column]) < rows:
+            self._buffers[column] = np.empty((rows, *self._size), _dtype(column))
+        return self._buffers[column][:rows]
 
-    def _image(self, row: Row, index: int) -> NDArray[np.uint8]:
-        return _checked_image(row.frames[index], self._size, self._sequence.frames[index].column)
-
-
-_buffers: dict[tuple[str, tuple[int, int]], NDArray] = {}
-"""Memory of `_DataBatch`, reused for all shards: mapping 200 MB of new pages takes longer than filling them."""
+    def _checked(self, image: NDArray | None, column: str) -> NDArray:
+        """The image, after a check of shape and dtype: Arrow takes over its memory unchecked."""
+        if image is None or image.shape != self._size or image.dtype != _dtype(column):
+            received = "nothing" if image is None else f"{image.dtype} {image.shape}"
+            raise BuildError(f"column {column}: expected {_dtype(column)} {self._size}, got {received}")
+        return image
 
 
-class _DataBatch:
-    """The batch of the ``data`` group: labels and copies of frame 0 and the depth maps of all rows of a shard."""
-
-    def __init__(self, rows: int, size: tuple[int, int]) -> None:
-        self._rows, self._size, self._filled = rows, size, 0
-        self._values: dict[str, list[Any]] = {}
-
-    def _buffer(self, column: str, dtype: np.dtype) -> NDArray:
-        buffer = _buffers.get((column, self._size))
-        if buffer is None or len(buffer) < self._rows or buffer.dtype != dtype:
-            buffer = _buffers[column, self._size] = np.empty((self._rows, *self._size), dtype=dtype)
-        return buffer[: self._rows]
-
-    def add(self, row: Row, range_mm: tuple[float, float], split: str, sequence: Sequence) -> None:
-        """Copy the columns of the group from a row."""
-        values: dict[str, Any] = dict(zip(LABELS, (row.sample, row.object, row.view, split), strict=True))
-        values.update(zip(RANGE, range_mm, strict=True))
-        for name, value in values.items():
-            self._values.setdefault(name, []).append(value)
-        first_column = sequence.frames[SINGLE_SHOT_FRAME].column
-        images: dict[str, NDArray] = {first_column: row.frames[SINGLE_SHOT_FRAME], DEPTH: row.depth_mm}
-        if row.depth_exact_mm is not None:
-            images[DEPTH_EXACT] = row.depth_exact_mm
-        for column, image in images.items():
-            self._buffer(column, image.dtype)[self._filled] = _checked_image(image, self._size, column)
-        self._filled += 1
-
-    def record_batch(self, schema: "pa.Schema") -> "pa.RecordBatch":
-        """The batch; its images stay in the shared buffers until the next shard."""
-        columns: list[Any] = [
-            self._values.get(name) or _buffers[name, self._size][: self._rows] for name in schema.names
-        ]
-        return _record_batch(columns, schema)
+def _dtype(column: str) -> np.dtype:
+    return np.dtype(np.float32 if column in (DEPTH, DEPTH_EXACT) else np.uint8)
 
 
-def _checked_image(image: NDArray, size: tuple[int, int], column: str) -> NDArray:
-    """The image, after a check of shape and dtype: Arrow takes over its memory unchecked."""
-    dtype = np.dtype(np.float32 if column in (DEPTH, DEPTH_EXACT) else np.uint8)
-    if image.shape != size or image.dtype != dtype:
-        raise BuildError(f"column {column}: expected {dtype} {size}, got {image.dtype} {image.shape}")
-    return image
+def _in_order(plan: ShardPlan, rows: Iterable[Row]) -> Iterator[Row]:
+    rows = iter(rows)
+    for planned, _, _ in plan.samples:
+        row = next(rows, None)
+        if row is None or row.sample != planned:
+            received = "nothing" if row is None else f"sample {row.sample!r}"
+            raise BuildError(f"shard {plan.name}: expected sample {planned!r}, got {received}")
+        yield row
 
 
-def _record_batch(columns: list[Any], schema: "pa.Schema") -> "pa.RecordBatch":
+def _record_batch(columns: list[Any], schema: pa.Schema) -> pa.RecordBatch:
     """Columns in the schema's order: images as arrays (rows, H, W), used without a copy; all others as lists."""
-    import pyarrow as pa
-
     arrays = [
         pa.array(column, field.type) if isinstance(column, list) else _image_column(column, field.type)
         for column, field in zip(columns, schema, strict=True)
@@ -247,10 +216,8 @@ def _record_batch(columns: list[Any], schema: "pa.Schema") -> "pa.RecordBatch":
     return pa.record_batch(arrays, schema=schema)
 
 
-def _image_column(images: NDArray, kind: "pa.DataType") -> "pa.Array":
+def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
     """Images (rows, H, W) as a list of lists, on the same memory."""
-    import pyarrow as pa
-
     rows, height, width = images.shape
     images = np.ascontiguousarray(images)
     values = pa.Array.from_buffers(kind.value_type.value_type, images.size, [None, pa.py_buffer(images)])
@@ -274,8 +241,3 @@ def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, f
             f"sample {sample!r}: its depth map has no pixel above 0 mm; expected an object in the working range"
         )
     return float(inside.min()), float(inside.max())
-
-
-def _reason(error: BaseException) -> str:
-    number = getattr(error, "errno", None)
-    return os.strerror(number) if number else str(error)

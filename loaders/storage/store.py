@@ -1,15 +1,17 @@
-"""Reading a dataset folder by memory map: views of single images without a copy; needs only NumPy and pyarrow.
+"""Reading a dataset folder by memory map, without a copy: single images as views, or as a ``datasets.Dataset``.
 
-The evaluator, the classical method, the torch dataset and the pictures read datasets through this module.
-`fpp_ml_bench.load_dataset` opens the same files as a ``datasets.Dataset``.
+The evaluator, the classical method, the torch dataset and the pictures read through `DatasetFolder`, which needs only
+NumPy and pyarrow. Plain ``datasets.load_dataset`` copies what it reads into its cache, and its Arrow builder can't
+leave columns out; `load_dataset` joins the tables of the column groups, and a frame is read only when its row is.
 """
 
 import ctypes
 import mmap
 import sys
+from collections.abc import Iterable
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +19,21 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import SPLITS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, available_configs, stored_groups
-from fpp_ml_bench.loaders.storage.manifest import Manifest, ShardFile, read_manifest
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    available_configs,
+    config_columns,
+    features,
+    stored_groups,
+)
+from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
+from fpp_ml_bench.optics import CONFIGS, Rig, Sequence, rig_from_dict
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from fpp_ml_bench.optics import Rig
-
+    from datasets import Dataset, DatasetDict
 
 ALL_SPLITS = "all"
 
@@ -37,9 +45,14 @@ class DatasetFolder:
     processes map the files themselves.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self._attach(Path(path), read_manifest(Path(path)))
-        for shard in self.manifest.shards:
+    def __init__(self, path: str | Path, check: bool = True) -> None:
+        """With ``check`` off, the folder opens even if some of its files are missing or cut."""
+        self.path = Path(path)
+        self.manifest = read_manifest(self.path)
+        self._batches: dict[str, list[pa.RecordBatch]] = {}
+        self._images: dict[tuple[str, str], list[NDArray]] = {}
+        self._maps: dict[str, pa.Buffer] = {}
+        for shard in self.manifest.shards if check else ():
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
             if size != shard.bytes:
@@ -47,20 +60,6 @@ class DatasetFolder:
                 raise DatasetError(
                     f"{file}: expected {shard.bytes} bytes, {found_size}; build or copy the dataset again"
                 )
-
-    def _attach(self, path: Path, manifest: Manifest) -> None:
-        self.path = path
-        self.manifest = manifest
-        self._batches: dict[str, list[pa.RecordBatch]] = {}
-        self._images: dict[tuple[str, str], list[NDArray]] = {}
-        self._maps: dict[str, pa.Buffer] = {}
-
-    @classmethod
-    def unchecked(cls, path: Path, manifest: Manifest) -> "DatasetFolder":
-        """Open the folder even if some of its files are missing; for `fpp_ml_bench.loaders.storage.verification`."""
-        dataset = cls.__new__(cls)
-        dataset._attach(path, manifest)
-        return dataset
 
     def forget(self, shard: ShardFile) -> None:
         """Close the memory maps of a file."""
@@ -83,15 +82,13 @@ class DatasetFolder:
         return self.manifest.size
 
     @cached_property
-    def rig(self) -> "Rig":
+    def rig(self) -> Rig:
         """The rig whose camera took the images."""
-        from fpp_ml_bench.optics import rig_from_dict
-
         return rig_from_dict(self.manifest.rig)
 
     @cached_property
     def sequence(self) -> Sequence:
-        return Sequence(**self.manifest.rig["sequence"])
+        return self.manifest.sequence
 
     @property
     def configs(self) -> tuple[str, ...]:
@@ -168,7 +165,7 @@ class DatasetFolder:
             "--frames all"
         )
 
-    def frames(self, sample: str, indices: "tuple[int, ...] | range | list[int]") -> list[NDArray[np.uint8]]:
+    def frames(self, sample: str, indices: Iterable[int]) -> list[NDArray[np.uint8]]:
         """Several frames of a sample, each uint8 (H, W), in the order of ``indices``."""
         return [self.frame(sample, index) for index in indices]
 
@@ -177,7 +174,6 @@ class DatasetFolder:
 
         Called after each sample of a split, it keeps the memory from growing with the number of samples.
         """
-
         split, row = self._find(sample)
         for shard in self.manifest.shards:
             mapped_file = self._maps.get(shard.path)
@@ -191,7 +187,10 @@ class DatasetFolder:
 
     def _image(self, sample: str, group: str, column: str) -> NDArray:
         split, row = self._find(sample)
-        return self._row_of(self._shard(split, group, row), column, row)
+        for shard in self.manifest.shards:
+            if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
+                return self._row_of(shard, column, row)
+        raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
 
     def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
         """Image of row ``row`` of the split, from the file that holds it."""
@@ -201,12 +200,6 @@ class DatasetFolder:
                 return images[row]
             row -= len(images)
         raise DatasetError(f"{self.path / shard.path}: fewer rows than its manifest says; run: fpp-bench verify")
-
-    def _shard(self, split: str, group: str, row: int) -> ShardFile:
-        for shard in self.manifest.shards:
-            if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
-                return shard
-        raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
 
     def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
         """Record batches of a file, memory-mapped."""
@@ -277,3 +270,66 @@ def release_pages(view: NDArray[Any], address: int, size: int) -> None:
     begin = max(start // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES, address // page * page)
     end = min(-(-stop // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES, -(-(address + size) // page) * page)
     madvise(begin, end - begin, _MADV_DONTNEED)
+
+
+@overload
+def load_dataset(folder: str | Path, config: str = ..., *, split: str) -> "Dataset": ...
+@overload
+def load_dataset(folder: str | Path, config: str = ..., split: None = ...) -> "DatasetDict": ...
+def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
+    """Open a built or imported dataset folder as a ``datasets.Dataset``, or every split as a ``DatasetDict``.
+
+    Parameters
+    ----------
+    folder : dataset folder written by ``fpp-bench build`` or ``fpp-bench import``.
+    config : ``single_shot`` (frame 0), ``horizontal``, ``vertical``, ``sinusoidal`` or ``all``. Columns: ``sample,
+        object, view, split``, one uint8 (H, W) ``frame_NN`` column per frame, ``depth`` and, for generated data,
+        ``depth_exact`` (float32 (H, W), mm, 0 = background), ``depth_min``, ``depth_max`` (mm).
+    split : ``train``, ``validation`` or ``test``; None for all of them.
+
+    Raises `DatasetError` for a folder that is not a finished dataset, an unknown or unstored configuration or split.
+
+    Examples
+    --------
+    >>> train = load_dataset("data/mini", "single_shot", split="train")        # doctest: +SKIP
+    >>> train.with_format("numpy")[0]["depth"].max()                            # doctest: +SKIP
+    """
+    dataset = DatasetFolder(folder)
+    if config not in CONFIGS:
+        raise DatasetError(f"unknown configuration {config!r}; there are {', '.join(CONFIGS)}")
+    if config not in dataset.configs:
+        raise DatasetError(
+            f"{folder}: configuration {config!r} is not stored; this dataset has {', '.join(dataset.configs)}. Build "
+            f"it with --frames {config} or --frames all"
+        )
+    if split is not None:
+        dataset.samples(split)
+        if split not in dataset.splits:
+            raise DatasetError(f"split {split!r}: expected one of {', '.join(dataset.splits)}, or None for all")
+        return _joined_split(dataset, config, split)
+    from datasets import DatasetDict
+
+    return DatasetDict({name: _joined_split(dataset, config, name) for name in dataset.splits})
+
+
+def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
+    from datasets import Dataset, DatasetInfo, Features
+    from datasets.splits import NamedSplit
+    from datasets.table import ConcatenationTable, MemoryMappedTable, concat_tables
+
+    columns = config_columns(dataset.sequence, config, dataset.has_exact)
+    tables = []
+    for group in stored_groups(dataset.sequence, dataset.manifest.stored):
+        shards = [s for s in dataset.manifest.shards if s.split == split and s.group == group]
+        files = [MemoryMappedTable.from_file(str(dataset.path / shard.path)) for shard in shards]
+        names = [name for name in files[0].column_names if name in columns]
+        if names:
+            tables.append(concat_tables([file.select(names) for file in files], axis=0))
+    table = tables[0] if len(tables) == 1 else ConcatenationTable.from_tables(tables, axis=1)
+    info = DatasetInfo(
+        features=Features.from_dict(features(columns, dataset.size)), config_name=config,
+        dataset_name="fpp-ml-bench",
+    )  # fmt: skip
+    # `datasets` caches later transforms by this fingerprint: it depends on the data, not on the path.
+    fingerprint = f"{dataset.fingerprint[:16]}-{config}-{split}"
+    return Dataset(table.select(columns), info=info, split=NamedSplit(split), fingerprint=fingerprint)

@@ -2,31 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import xxhash
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
-from fpp_ml_bench.loaders.sample import (
-    DATA_GROUP,
-    DEPTH,
-    DEPTH_EXACT,
-    LABELS,
-    RANGE,
-    arrow_schema,
-    group_columns,
-    stored_groups,
-)
-from fpp_ml_bench.loaders.storage.manifest import GENERATED, MANIFEST, Manifest, ShardFile, dataset_files, read_manifest
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, group_columns, stored_groups
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
+from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics import Sequence
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 ImagePlaces = dict[str, list[tuple[str, str, str]]]
 """Hash of an image -> where it stands: (split, sample, column)."""
@@ -40,38 +30,39 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     in two splits, none lacks a view, the benchmark's own objects are in their split; no image appears in two splits.
     Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file.
     """
-    manifest = read_manifest(folder)
-    findings = foreign_files(folder, manifest)
+    opened = DatasetFolder(folder, check=False)
+    manifest = opened.manifest
+    findings = _foreign_files(folder, manifest)
     places: ImagePlaces = {}
-    opened = None
     for file in manifest.files:
-        damage = file_damage(folder, file.path, file.bytes, file.xxh3_128)
+        damage = _file_damage(folder / file.path, file.bytes, file.xxh3_128)
         if damage:
             findings.append(damage)
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
-            opened = opened or DatasetFolder.unchecked(folder, manifest)
             try:
                 findings += _shard_findings(opened, file, places)
             except DatasetError as error:  # no Arrow file, or images of another size
                 findings.append(str(error))
         progress(1)
-    return findings + coverage_findings(manifest) + split_findings(manifest) + duplicate_images(places)
+    return findings + _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(places)
 
 
-def foreign_files(folder: Path, manifest: Manifest) -> list[str]:
+def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
     """Files that the manifest does not know; the caches that ``datasets`` itself leaves there are not counted."""
-    listed = {MANIFEST, *(shard.path for shard in manifest.shards), *(other.path for other in manifest.others)}
-    return [
-        f"{path}: is not part of this dataset; remove it"
-        for path in dataset_files(folder)
-        if path.relative_to(folder).as_posix() not in listed and not path.name.startswith("cache-")
-    ]
+    listed = {MANIFEST, *(file.path for file in manifest.files)}
+    findings = []
+    for path in sorted(folder.rglob("*")):
+        relative = path.relative_to(folder)
+        if WORK_FOLDER in relative.parts or not (path.is_file() or path.is_symlink()):
+            continue
+        if relative.as_posix() not in listed and not path.name.startswith("cache-"):
+            findings.append(f"{path}: is not part of this dataset; remove it")
+    return findings
 
 
-def file_damage(folder: Path, name: str, size: int, expected_hash: str) -> str | None:
+def _file_damage(path: Path, size: int, expected_hash: str) -> str | None:
     """What is wrong with one file, or None."""
-    path = folder / name
     if not path.is_file():
         return f"{path}: is missing; copy or build the dataset again"
     if path.stat().st_size != size:
@@ -83,8 +74,6 @@ def file_damage(folder: Path, name: str, size: int, expected_hash: str) -> str |
 
 def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces) -> list[str]:
     """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
-    import xxhash
-
     path = opened.path / shard.path
     manifest = opened.manifest
     rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
@@ -111,7 +100,7 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
     return findings
 
 
-def _types(schema: "pa.Schema") -> "list[tuple[str, pa.DataType]]":
+def _types(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
     """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
     return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
 
@@ -127,7 +116,7 @@ def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray
     return []
 
 
-def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: "list[pa.RecordBatch]") -> list[str]:
+def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: list[pa.RecordBatch]) -> list[str]:
     findings = []
     stored = [record for batch in batches for record in batch.select([*LABELS, *RANGE]).to_pylist()]
     for row, labels in zip(rows, stored, strict=True):
@@ -138,12 +127,11 @@ def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: "li
     return findings
 
 
-def coverage_findings(manifest: Manifest) -> list[str]:
+def _coverage_findings(manifest: Manifest) -> list[str]:
     """Rows that no file holds, or more than one: every group's files must follow on from each other."""
     findings = []
-    sequence = Sequence(**manifest.rig["sequence"])
     for split, rows in manifest.samples.items():
-        for group in stored_groups(sequence, manifest.stored):
+        for group in stored_groups(manifest.sequence, manifest.stored):
             files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
             held = [row for shard in files for row in range(shard.first_row, shard.first_row + shard.rows)]
             if held != list(range(len(rows))):
@@ -151,7 +139,7 @@ def coverage_findings(manifest: Manifest) -> list[str]:
     return findings
 
 
-def split_findings(manifest: Manifest) -> list[str]:
+def _split_findings(manifest: Manifest) -> list[str]:
     """Rules of the split by object, checked on the manifest's rows."""
     findings = []
     home: dict[str, str] = {}
@@ -175,7 +163,7 @@ def split_findings(manifest: Manifest) -> list[str]:
     return findings
 
 
-def duplicate_images(places: ImagePlaces) -> list[str]:
+def _duplicate_images(places: ImagePlaces) -> list[str]:
     """Images that stand in more than one split, by the hash of their pixels."""
     findings = []
     for copies in places.values():

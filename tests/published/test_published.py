@@ -11,10 +11,12 @@ from published_trees import (
     SPLITS,
     TRAINING,
     VIEWS,
+    command,
     depth_of,
     depth_path,
     fringe_of,
     fringe_path,
+    imported,
     info_path,
     make_tree,
     v73_bytes,
@@ -22,18 +24,11 @@ from published_trees import (
     write_png,
 )  # fmt: skip
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.published.importing import plan_import
 from fpp_ml_bench.optics import paper_rig, save_rig
 
 ALL_VARIANTS = ("raw", "global", "individual")
-
-
-def imported(tree, out, workers=1, **settings):
-    import_tree(out, plan_import(tree, **settings), workers)
-    return DatasetFolder(out)
 
 
 def refusal(tree, out):
@@ -175,6 +170,16 @@ def cut(path):
 STEM = "power_drill_A60"
 PNG, MAT = f"{STEM}.png", f"{STEM}.mat"
 RAW = TRAINING / FOLDERS["raw"]
+
+
+def png(tree, image, **place):
+    write_png(fringe_path(tree, **place), image)
+
+
+def mat(tree, variant="raw", **values):
+    write_mat(depth_path(tree, variant=variant), **values)
+
+
 BROKEN = {
     "object in two splits": (move_object, "train/fringe/mug_A0.png: object mug is in two splits"),
     "a view is missing": (remove_view, f"object power_drill lacks {STEM}"),
@@ -194,35 +199,23 @@ BROKEN = {
     "png damaged": (lambda t: flip(fringe_path(t), 200), f"{PNG}: the PNG is damaged"),
     "no png at all": (lambda t: fringe_path(t).write_bytes(b"P5 24 24 255 "), f"{PNG}: expected a PNG"),
     "png empty": (lambda t: fringe_path(t).write_bytes(b""), f"{PNG}: expected a PNG"),
-    "png of 16 bits": (
-        lambda t: write_png(fringe_path(t), fringe_of(STEM).astype(np.uint16) * 257),
-        f"{PNG}: expected an 8-bit PNG, got 16 bits",
-    ),
-    "png with alpha": (
-        lambda t: write_png(fringe_path(t), np.full((24, 24, 4), 255, np.uint8)),
-        f"{PNG}: expected a grey PNG",
-    ),
+    "png of 16 bits": (lambda t: png(t, np.uint16(fringe_of(STEM))), f"{PNG}: expected an 8-bit PNG, got 16 bits"),
+    "png with alpha": (lambda t: png(t, np.zeros((24, 24, 4), np.uint8)), f"{PNG}: expected a grey PNG"),
     "png in colour": (rgb_with_a_colour, f"{PNG}: an RGB image whose channels differ"),
-    "png of another size": (lambda t: write_png(fringe_path(t), fringe_of(STEM)[:20]), f"{PNG}: expected 24 x 24 px"),
+    "png of another size": (lambda t: png(t, fringe_of(STEM)[:20]), f"{PNG}: expected 24 x 24 px"),
     "mat cut off": (lambda t: cut(depth_path(t)), f"{MAT}: a data element"),
     "mat damaged": (lambda t: flip(depth_path(t), -20), f"{MAT}: "),
     "no mat at all": (lambda t: depth_path(t).write_bytes(b"1,2,3" * 90), f"{MAT}: expected a MATLAB"),
     "wrong variable": (
-        lambda t: write_mat(depth_path(t), depthMapMeters=depth_of(STEM)),
+        lambda t: mat(t, depthMapMeters=depth_of(STEM)),
         f"{MAT}: expected the variable depthMap, got depthMapMeters",
     ),
-    "depth of another size": (
-        lambda t: write_mat(depth_path(t), depthMap=depth_of(STEM)[:, :20]),
-        f"{MAT}: expected 24 x 24",
-    ),
+    "depth of another size": (lambda t: mat(t, depthMap=depth_of(STEM)[:, :20]), f"{MAT}: expected 24 x 24"),
     "depth NaN": (lambda t: set_pixel(depth_path(t), np.nan), f"{MAT}: 1 pixels are NaN"),
     "depth infinite": (lambda t: set_pixel(depth_path(t), np.inf), f"{MAT}: 1 pixels are NaN"),
     "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
-    "depth empty": (lambda t: write_mat(depth_path(t), depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
-    "depth in metres": (
-        lambda t: write_mat(depth_path(t), depthMap=depth_of(STEM) / 1000),
-        f"{MAT}: depths of 1.7",
-    ),
+    "depth empty": (lambda t: mat(t, depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
+    "depth in metres": (lambda t: mat(t, depthMap=depth_of(STEM) / 1000), f"{MAT}: depths of 1.7"),
 }
 
 
@@ -234,19 +227,15 @@ def test_a_broken_tree_is_refused_and_the_file_named(tmp_path, case):
     assert message in refusal(tree, tmp_path / "out")
 
 
-def normalised_path(tree):
-    return depth_path(tree, variant="individual")
-
-
 BROKEN_VARIANTS = {
     "metres in mm": (
         ("global",),
-        lambda t: write_mat(depth_path(t, variant="global"), depthMapMeters=depth_of(STEM)),
+        lambda t: mat(t, "global", depthMapMeters=depth_of(STEM)),
         "so the file has another unit",
     ),
     "normalised above 1": (
         ("individual",),
-        lambda t: write_mat(normalised_path(t), depthMapNormalized=depth_of(STEM)),
+        lambda t: mat(t, "individual", depthMapNormalized=depth_of(STEM)),
         "in [0, 1]",
     ),
     "variants disagree": (
@@ -258,7 +247,7 @@ BROKEN_VARIANTS = {
     ),
     "fringes of variants differ": (
         ("raw", "global"),
-        lambda t: write_png(fringe_path(t, variant="global"), fringe_of("bowl_A0")),
+        lambda t: png(t, fringe_of("bowl_A0"), variant="global"),
         f"global_normalized/test/fringe/{PNG}: expected the same image as",
     ),
     "variants split differently": (
@@ -380,10 +369,6 @@ def test_a_finished_import_is_left_alone_unless_the_tree_changed(tmp_path):
     write_mat(depth_path(tree), depthMap=depth_of("bowl_A0"))
     with pytest.raises(BuildError, match=r"power_drill_A60\.mat changed"):
         imported(tree, tmp_path / "out")
-
-
-def command(*words):
-    return main([str(word) for word in words])
 
 
 def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):

@@ -12,9 +12,9 @@ from fpp_ml_bench.constants import MINI_OBJECTS, OBJECTS, SPLITS, TEST_OBJECTS, 
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build, plan_build
 from fpp_ml_bench.loaders.render.meshes import single_mesh
-from fpp_ml_bench.loaders.render.settings import PRESETS, BuildSettings
-from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
-from fpp_ml_bench.loaders.storage import DatasetFolder, Row, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.render.scene import PRESETS, BuildSettings
+from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
+from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
 
 
@@ -128,7 +128,7 @@ def test_full_preset_is_the_papers_set():
     assert rows == {"train": 240, "validation": 30, "test": 30}
     frames = stored_frames(PAPER_SEQUENCE, "all")
     assert len(frames) * sum(rows.values()) == 15_600
-    assert assembly.bytes_per_row == 960 * 960 * (52 + 8)
+    assert assembly.manifest.row_bytes == 960 * 960 * (52 + 8)
     for split in SPLITS:
         shards = [(p.first_row, len(p.samples)) for p in assembly.plans if p.split == split]
         assert [first_row for first_row, _ in shards] == list(np.cumsum([0, *(count for _, count in shards)])[:-1])
@@ -204,7 +204,7 @@ def row(sample="bowl_A0", depth=None, frames=None):
 
 def write(tmp_path, rows):
     (plan,) = plan_shards("train", {"bowl": [("bowl_A0", "bowl", "A0")]})
-    return ShardWriter(tmp_path, tmp_path, plan, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(rows)
+    return ShardWriter(tmp_path, tmp_path, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(plan, rows)
 
 
 @pytest.mark.parametrize(

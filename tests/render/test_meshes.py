@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from fpp_ml_bench.constants import OBJECTS
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, read_mesh_list, single_mesh, solid_mesh, write_ply
-from fpp_ml_bench.loaders.render.settings import UserMesh
+from fpp_ml_bench.loaders.render.scene import UserMesh
 
 SUFFIXES = ("obj", "ply", "stl", "glb")
 

@@ -10,16 +10,16 @@ import pytest
 from scipy import stats
 
 from fpp_ml_bench.compiled import SWITCH
-from fpp_ml_bench.loaders.render.camera import Exposure
 from fpp_ml_bench.loaders.render.illumination import LitPixels, PatternLookup
+from fpp_ml_bench.loaders.render.scene import uniform
 from fpp_ml_bench.loaders.render.sensor import (
+    Exposure,
     Noise,
     hash_pixels,
     normal_table,
     quantise,
     standard_normal,
     stream_keys,
-    uniform,
 )
 from fpp_ml_bench.optics import paper_rig, pattern_image
 

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xxhash
+from disks import small_disk
 
 from fpp_ml_bench.loaders.storage import direct_file
 from fpp_ml_bench.loaders.storage.direct_file import DirectFile
@@ -142,18 +142,5 @@ def test_short_writes_are_completed(tmp_path, small_blocks, monkeypatch):
 
 
 def test_really_full_disk(tmp_path, small_blocks):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    try:
-        mounted = subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)], capture_output=True
-        ).returncode == 0  # fmt: skip
-    except OSError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting a small file system needs privileges")
-    try:
-        with pytest.raises(OSError, match="No space left"):
-            write(disk / "x", [noise(1 << 20)])
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
+    with small_disk(tmp_path / "disk", "400k") as disk, pytest.raises(OSError, match="No space left"):
+        write(disk / "x", [noise(1 << 20)])

@@ -10,17 +10,15 @@ import pytest
 import scipy.io
 import trimesh
 from conftest import TINY_OBJECTS, file_bytes
-from published_trees import write_png
+from published_trees import command, imported, write_png
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.loaders.published import FrameOrder, import_notes, import_tree, parse_order, plan_import
+from fpp_ml_bench.loaders.published import FrameOrder, import_notes, parse_order
 from fpp_ml_bench.loaders.published import export as export_tree
 from fpp_ml_bench.loaders.sample import config_columns
 from fpp_ml_bench.loaders.storage.exporting import chosen_splits, export
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
 
 TRAINING = Path("training_datasets")
@@ -28,15 +26,6 @@ SCANS = Path("fpp_synthetic_dataset")
 NAMES = {"train": "train", "validation": "val", "test": "test"}
 SAMPLE = "power_drill_A60"
 PIXELS = 176 * 176
-
-
-def command(*words):
-    return main([str(word) for word in words])
-
-
-def imported(tree, out, **settings):
-    import_tree(out, plan_import(tree, **settings), workers=1)
-    return DatasetFolder(out)
 
 
 @pytest.fixture(scope="module")

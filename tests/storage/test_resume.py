@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
+from disks import small_disk
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError
@@ -274,16 +275,16 @@ def test_lock_is_free_after_an_error(tmp_path, monkeypatch):
 # ---- dying workers
 
 
-def die(folder, scratch, plan, row_done):
+def die(plan, folder):
     if plan.split == "validation":
         os._exit(9)  # as the system ends a process that took too much memory
-    return assembly_of(half_settings()).work(folder, scratch, plan, row_done)
+    return assembly_of(half_settings()).rows(plan, folder)
 
 
 def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_path, uninterrupted):
     folder = tmp_path / "set"
     assembly = assembly_of(half_settings())
-    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.bytes_per_row, assembly.mesh_folder)
+    broken = Assembly(assembly.plans, die, assembly.manifest, assembly.mesh_folder)
     with pytest.raises(BuildError, match="worker process died"):
         assemble(folder, broken, workers=2)
     assert not (folder / "manifest.json").exists()
@@ -294,40 +295,27 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
 # ---- full disks
 
 
-def can_mount(folder, size):
-    return subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True
-    ).returncode == 0  # fmt: skip
-
-
 @pytest.fixture
-def small_disk(tmp_path):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    try:
-        mounted = can_mount(folder, "1500k")
-    except OSError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting a small file system needs privileges; the test with a file-size limit covers the case")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+def full_disk(tmp_path):
+    """Where it can't be mounted, the test with a file-size limit covers the case."""
+    with small_disk(tmp_path / "disk", "1500k") as folder:
+        yield folder
 
 
-def test_full_disk_is_refused_beforehand(small_disk, capsys):
-    arguments = ["build", str(small_disk / "set"), "--size", str(TINY_SIZE), "--objects", "cork", "--workers", "1"]
+def test_full_disk_is_refused_beforehand(full_disk, capsys):
+    arguments = ["build", str(full_disk / "set"), "--size", str(TINY_SIZE), "--objects", "cork", "--workers", "1"]
     assert main(arguments) == 2
     message = capsys.readouterr().err
-    assert "GB free" in message and str(small_disk) in message
-    assert not final_shards(small_disk)
+    assert "GB free" in message and str(full_disk) in message
+    assert not final_shards(full_disk)
 
 
-def test_disk_that_fills_up_during_the_build(small_disk, uninterrupted, monkeypatch, capsys):
+def test_disk_that_fills_up_during_the_build(full_disk, uninterrupted, monkeypatch, capsys):
     """A real ENOSPC in the second shard; after freeing space the same command resumes."""
     monkeypatch.setattr(assembling, "_check_space", lambda *_: None)
-    folder = small_disk / "set"
+    folder = full_disk / "set"
     for filler_kb in (300, 0):  # 1.2 MB without the filler: one shard fits, not two
-        filler = small_disk / "filler"
+        filler = full_disk / "filler"
         filler.write_bytes(b"x" * 1024 * filler_kb)
         with pytest.raises(BuildError, match=r"No space left on device.*resumes"):
             build(folder, half_settings(), workers=1)
@@ -336,7 +324,7 @@ def test_disk_that_fills_up_during_the_build(small_disk, uninterrupted, monkeypa
         assert not list(folder.rglob("*.tmp"))
         assert not (folder / "manifest.json").exists()
         filler.unlink()
-    subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
+    subprocess.run(["mount", "-o", "remount,size=20m", str(full_disk)], check=True)
     build(folder, half_settings(), workers=1)
     assert file_bytes(folder) == uninterrupted
 

@@ -10,17 +10,14 @@ Source: own shapes after the names of the YCB and warehouse objects that the pap
 
 import difflib
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.objects import boxes, containers, paint, small_things, tools, vessels
+from fpp_ml_bench.loaders.render.objects import boxes, containers, household, tools
 from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
-
-if TYPE_CHECKING:
-    import trimesh
 
 __all__ = ["BUILDERS", "object_mesh"]
 
@@ -39,59 +36,57 @@ BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
     "pudding_box": (boxes.pudding_box, 2.7),
     "gelatin_box": (boxes.gelatin_box, 3.3),
     "potted_meat_can": (containers.potted_meat_can, 2.65),
-    "banana": (vessels.banana, 3.0),
-    "pitcher": (vessels.pitcher, 1.85),
+    "banana": (household.banana, 3.0),
+    "pitcher": (household.pitcher, 1.85),
     "bleach_cleanser": (containers.bleach_cleanser, 1.35),
-    "bowl": (vessels.bowl, 2.6),
-    "mug": (vessels.mug, 3.2),
+    "bowl": (household.bowl, 2.6),
+    "mug": (household.mug, 3.2),
     "power_drill": (tools.power_drill, 1.72),
     "wood_block": (boxes.wood_block, 2.1),
     "scissors": (tools.scissors, 2.6),
-    "marker": (small_things.marker, 4.0),
+    "marker": (household.marker, 4.0),
     "large_clamp": (tools.large_clamp, 2.15),
-    "eyeglasses": (small_things.eyeglasses, 2.55),
+    "eyeglasses": (household.eyeglasses, 2.55),
     "open_book": (boxes.open_book, 1.65),
     "spray_bottle": (containers.spray_bottle, 1.6),
-    "cleaning_bucket": (vessels.cleaning_bucket, 1.5),
+    "cleaning_bucket": (household.cleaning_bucket, 1.5),
     "container_bottle": (containers.container_bottle, 1.8),
     "container_tin": (containers.container_tin, 1.32),
     "vial": (containers.vial, 4.6),
-    "lighting_candles": (vessels.lighting_candles, 1.75),
+    "lighting_candles": (household.lighting_candles, 1.75),
     "magazine_stack": (boxes.magazine_stack, 1.27),
     "wooden_boards": (boxes.wooden_boards, 1.0),
-    "paint_container_bottle": (paint.paint_container_bottle, 3.0),
-    "paint_container_jar": (paint.paint_container_jar, 1.68),
-    "paint_container_spraycan": (paint.paint_container_spraycan, 2.05),
-    "paint_container_tube_small": (paint.paint_container_tube_small, 4.35),
-    "paint_container_tube": (paint.paint_container_tube, 2.88),
-    "paint_container_tube_large": (paint.paint_container_tube_large, 1.78),
+    "paint_container_bottle": (containers.paint_container_bottle, 3.0),
+    "paint_container_jar": (containers.paint_container_jar, 1.68),
+    "paint_container_spraycan": (containers.paint_container_spraycan, 2.05),
+    "paint_container_tube_small": (containers.paint_container_tube_small, 4.35),
+    "paint_container_tube": (containers.paint_container_tube, 2.88),
+    "paint_container_tube_large": (containers.paint_container_tube_large, 1.78),
     "paint_brush": (tools.paint_brush, 2.35),
     "paint_brush_large": (tools.paint_brush_large, 2.1),
     "pallet_knife": (tools.pallet_knife, 2.15),
     "pallet_knife_large": (tools.pallet_knife_large, 1.95),
     "spraygun": (tools.spraygun, 1.45),
-    "paint_thinner": (paint.paint_thinner, 1.7),
-    "battery": (small_things.battery, 4.9),
-    "battery_case": (small_things.battery_case, 4.2),
-    "chalk_stick": (small_things.chalk_stick, 4.9),
-    "pen": (small_things.pen, 4.2),
+    "paint_thinner": (containers.paint_thinner, 1.7),
+    "battery": (household.battery, 4.9),
+    "battery_case": (household.battery_case, 4.2),
+    "chalk_stick": (household.chalk_stick, 4.9),
+    "pen": (household.pen, 4.2),
     "cork": (containers.cork, 4.5),
     "clamp": (tools.clamp, 2.0),
     "boxcutter": (tools.boxcutter, 2.5),
     "hammer": (tools.hammer, 1.8),
-    "duct_tape": (vessels.duct_tape, 2.4),
+    "duct_tape": (household.duct_tape, 2.4),
 }
 
 
-def object_mesh(name: str) -> "trimesh.Trimesh":
+def object_mesh(name: str) -> trimesh.Trimesh:
     """Mesh of one of the 50 objects, at the size it has in the scene.
 
     Metres, z up, outward faces, watertight. The bounding box is centred at the origin and the turning axis is z; the
     camera of the first view looks along +x. The same name gives the same bytes at every call. Raises
     :class:`MeshError` for a name that is not one of ``constants.OBJECTS``. Source: own.
     """
-    import trimesh
-
     if name not in BUILDERS:
         near = difflib.get_close_matches(name, BUILDERS, n=3, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(BUILDERS)}"

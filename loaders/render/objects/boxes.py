@@ -5,6 +5,7 @@ import numpy as np
 from fpp_ml_bench.loaders.render.objects.solids import (
     Solid,
     block,
+    curve,
     cut,
     disc,
     facing,
@@ -17,7 +18,6 @@ from fpp_ml_bench.loaders.render.objects.solids import (
     text_plate,
     union,
 )
-from fpp_ml_bench.loaders.render.objects.sweeps import curve
 
 
 def _carton(width: float, height: float, depth: float, lines: list[tuple[str, float, float]], *art: Solid) -> Solid:

@@ -7,22 +7,26 @@ from fpp_ml_bench.loaders.render.objects.solids import (
     Solid,
     ball,
     block,
+    curve,
     cut,
     disc,
     facing,
     laid,
     lathe,
+    loft,
     place,
     plate,
     polygon,
     rectangle,
     ring,
     rod,
+    skin,
     softened,
     stroke,
+    superellipse,
+    tube,
     union,
 )
-from fpp_ml_bench.loaders.render.objects.sweeps import curve, loft, skin, superellipse, tube
 
 
 def hammer() -> Solid:
@@ -257,10 +261,7 @@ def spraygun() -> Solid:
     ]), 3)  # fmt: skip
     grip = union(plate(grip_outline, 18), plate(grip_outline.offset(-4), 25))
     hook = plate(stroke([(-18, 66), (-26, 84), (-38, 86)], 8), 8)
-    trigger = plate(
-        stroke(curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)]), 9),
-        13,
-    )
+    trigger = plate(stroke(curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)]), 9), 13)
     pivot = rod((-33, 64, -21), (-33, 64, 21), 6)
     stem = union(
         rod((-22, 60, 0), (-34, 102, 0), 10), place(rod((0, 0, 0), (0, 0, 10), 15), (-34, 100, 0), (-90, 0, 0))

@@ -10,14 +10,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from conftest import TINY_SIZE, tiny_settings
-from synthetic import SyntheticShard, make
+from synthetic import SyntheticRows, make
 
 import fpp_ml_bench
 from fpp_ml_bench.constants import OBJECTS, VIEWS, split_sample_name
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import load_dataset
 from fpp_ml_bench.loaders.render import build
-from fpp_ml_bench.loaders.sample import arrow_schema, config_columns, features
+from fpp_ml_bench.loaders.sample import config_columns, features
+from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
@@ -96,7 +97,7 @@ def test_rows_of_several_shards_keep_their_order_every_way(tmp_path):
             for column in ("depth", "depth_exact"):
                 np.testing.assert_array_equal(formatted[row][column], folder_read.depth_mm(expected[row], column))
             np.testing.assert_array_equal(formatted[row]["frame_00"], folder_read.frame(expected[row], 0))
-    alone = SyntheticShard().row(expected[30], *split_sample_name(expected[30]))
+    alone = SyntheticRows().row(expected[30], *split_sample_name(expected[30]))
     np.testing.assert_array_equal(folder_read.frame(expected[30], 0), alone.frames[0])
     np.testing.assert_array_equal(folder_read.depth_mm(expected[30]), alone.depth_mm)
 
