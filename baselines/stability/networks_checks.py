@@ -7,10 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fpp_ml_bench.baselines.method import method
-from fpp_ml_bench.baselines.networks import build
-from fpp_ml_bench.baselines.networks.base import in_full_precision
-from fpp_ml_bench.baselines.networks.blocks import RECENTRED_FROM, InstanceNorm
+from fpp_ml_bench.baselines.method import load_method
+from fpp_ml_bench.baselines.networks import RECENTRED_FROM, InstanceNorm, build, in_full_precision
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings, TorchCalibrationLayer
 from fpp_ml_bench.baselines.stability.case import Outcome, worst
 from fpp_ml_bench.baselines.stability.losses_checks import directional, one_thread, seeded
@@ -176,7 +174,7 @@ def phase_output(name: str, image: str) -> Outcome:
         "checkerboard": lambda: 255.0 * (np.indices((side, side)).sum(axis=0) % 2),
     }[image]()
     try:
-        phase_method = method(name, rig)
+        phase_method = load_method(name, rig)
         frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
         frames[phase_method.frames_used[0]] = grey.astype(np.uint8)
         measurement = phase_method.measure(frames)  # type: ignore[attr-defined]

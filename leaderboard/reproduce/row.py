@@ -18,7 +18,7 @@ from fpp_ml_bench.leaderboard.rows import Entry, read_entry, write_row
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+    from fpp_ml_bench.baselines.networks import NetworkMethod
 
 SPLIT, TARGET = "test", "depth"
 REPEATS = 20

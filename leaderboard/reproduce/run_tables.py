@@ -10,7 +10,7 @@ from pathlib import Path
 from textwrap import shorten
 from time import perf_counter
 
-from fpp_ml_bench.baselines.networks.model import Model, load
+from fpp_ml_bench.baselines.networks import Model, load
 from fpp_ml_bench.baselines.training import SCORING, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.files import exclusive, write_atomically

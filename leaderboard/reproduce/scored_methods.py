@@ -1,7 +1,7 @@
 """A trained network as the methods that are scored: its bare output, and its metric twins."""
 
-from fpp_ml_bench.baselines.networks.model import Model
-from fpp_ml_bench.baselines.networks.network_method import NetworkMethod, Setting
+from fpp_ml_bench.baselines.method import Setting
+from fpp_ml_bench.baselines.networks import Model, NetworkMethod
 from fpp_ml_bench.baselines.training import TrainingRun
 from fpp_ml_bench.leaderboard.reproduce.plan import Job, Variant
 

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+from fpp_ml_bench.baselines.networks import save_with_heads
 from fpp_ml_bench.baselines.training import DONE, RECIPE, WEIGHTS, Recipe, TrainingRun
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
