@@ -283,7 +283,7 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
         raise WeightsError(
             f"{_shown(path)}: expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a "
             "pickle can run code; load it where you trust it and write it with "
-            "fpp_ml_bench.baselines.training.save_weights"
+            "fpp_ml_bench.baselines.training.weights.save_weights"
         )
     try:
         length = int.from_bytes(data[:8], "little")
