@@ -1,2 +1,12 @@
+from .classical import ClassicalMethod as ClassicalMethod
+from .method import METHODS as METHODS
+from .method import Method as Method
+from .method import known_weights as known_weights
+from .method import load_method as load_method
 from .networks import build as build
 from .networks.model import load as load
+from .run import explain_predict as explain_predict
+from .run import predict_split as predict_split
+from .timing import check_target as check_target
+from .timing import time_method as time_method
+from .timing import write_timing as write_timing

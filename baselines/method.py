@@ -1,82 +1,129 @@
-"""The methods that ``fpp-bench predict`` knows, by name, and what each of them must offer."""
+"""What a method is, the methods that ``fpp-bench predict`` knows by name, and loading any of them."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__
-from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench import __version__, baselines
+from fpp_ml_bench.baselines import networks, phase_network, phase_route, training
+from fpp_ml_bench.errors import PredictionError, WeightsError
+from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics import Rig
 
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.training import ModelConfig, NetConfig
 
-class Method(Protocol):
+Frames = Sequence[NDArray[np.uint8] | None]
+"""A captured sequence by frame number, with None for frames that are not needed."""
+Setting = str | int | float | bool | None
+NO_SEEDS: Mapping[str, int] = {}
+
+
+class Method(ABC):
     """A frame stack in, a depth map out.
 
-    A method may also have: ``units`` of what it predicts (default ``mm``), ``uses_ground_truth_mask`` (it is given
-    frames that are 0 outside the object; default no), ``seeds``, ``packages`` whose versions matter (default numpy and
-    numba), ``predict_reported`` and ``summary`` (a report of every sample, see `fpp_ml_bench.baselines.run`),
-    ``predict_batch``, ``device`` and ``parameters`` (see `fpp_ml_bench.baselines.timing`), ``weights_config`` (see
-    `fpp_ml_bench.baselines.training.provenance_of_data`), and ``mode`` and ``target``, how its row is scored.
+    name: what it is called on the command line. title: name of the submission, with the settings that matter.
+    frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     """
 
-    @property
-    def name(self) -> str:
-        """What the method is called on the command line."""
+    name: str
+    title: str
+    frames_used: tuple[int, ...]
+    settings: Mapping[str, Setting]
+
+    uses_ground_truth_range: bool = False
+    """Whether it is given depth_min and depth_max of the sample it predicts."""
+    uses_ground_truth_mask: bool = False
+    """Whether it is given frames that are 0 outside the object."""
+    units: Units = "mm"
+    mode: Mode = "standard"
+    """The scoring mode that its row is made with."""
+    target: Target = "depth_exact"
+    """What its row is scored against; for a network the decoded depth, which is what it was trained on."""
+    packages: tuple[str, ...] = ("numpy", "numba")
+    """Packages whose versions matter."""
+    seeds: Mapping[str, int] = NO_SEEDS
+    device: str = "cpu"
+    parameters: int = 0
+    """Numbers that were learned."""
+    weights_config: "ModelConfig | NetConfig | None" = None
+    """What its weights file says of the network and its training data."""
+    batched: bool = False
+    """Whether `predict_batch` takes all samples at once."""
+    reports: bool = False
+    """Whether `predict_reported` reports."""
+    crops: bool = False
+    """Whether there is a `crop`."""
+
+    @abstractmethod
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in `units`, 0 = background or not measured; frames not in `frames_used` may be None."""
+
+    def predict_batch(self, stacks: Sequence[Frames]) -> Sequence[NDArray[np.float32]] | NDArray[np.float32]:
+        """`predict` of several samples, one after another unless `batched`."""
+        return [self.predict(frames) for frames in stacks]
+
+    def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """`predict`, and a report of the sample as JSON."""
+        return self.predict(frames), {}
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        """Rows and columns outside which nothing is computed, where the method ``crops``."""
+        raise NotImplementedError
+
+    def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+        """Summary of a split's reports, for the settings of the submission."""
+        return {}
 
     @property
-    def title(self) -> str:
-        """Name of the submission, with the settings that matter."""
-
-    @property
-    def frames_used(self) -> tuple[int, ...]:
-        """Frames that must be captured, ascending."""
-
-    @property
-    def uses_ground_truth_range(self) -> bool:
-        """Whether the method is given depth_min and depth_max of the sample it predicts."""
-
-    @property
-    def settings(self) -> Mapping[str, str | int | float | bool | None]:
-        """Everything needed to run it again."""
-
-    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background or not measured; frames not in `frames_used` are None."""
+    def software(self) -> dict[str, str]:
+        """Versions of this package, Python and the packages that the method computes with."""
+        versions = {package: version(package) for package in self.packages}
+        return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
 
 
-METHODS = ("classical", "phase", "phase-net")
-"""The methods by name; with the weights of a network from image to depth it is a `NetworkMethod`."""
+def _phase(rig: Rig, **options: Any) -> Method:
+    return (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(rig, **options)
 
 
-def method(name: str, rig: Rig, **options: Any) -> Method:
-    """Method ``name`` for a rig; raises `FppBenchError` for an unknown one."""
-    if name == "classical":
-        from fpp_ml_bench.baselines.classical import ClassicalMethod
-
-        return ClassicalMethod(rig, **options)
-    if name == "phase" and "error_mm" in options:
-        from fpp_ml_bench.baselines.phase_route import FewestFrames
-
-        fewest_frames: Method = FewestFrames(rig, **options)
-        return fewest_frames
-    if name == "phase":
-        from fpp_ml_bench.baselines.phase_route import PhaseMethod
-
-        phase_route: Method = PhaseMethod(rig, **options)
-        return phase_route
-    if name == "phase-net":
-        from fpp_ml_bench.baselines.phase_network import PhaseNetMethod
-
-        phase_net: Method = PhaseNetMethod(rig, **options)
-        return phase_net
-    raise FppBenchError(f"unknown method {name!r}; there are {', '.join(METHODS)}")
+METHODS: Mapping[str, Callable[..., Method]] = {
+    "classical": lambda rig, **options: baselines.ClassicalMethod(rig, **options),
+    "phase": _phase,
+    "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **options),
+}
+"""The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
+`NetworkMethod`."""
 
 
-def software_of(method: Method) -> dict[str, str]:
-    """Versions of this package, Python and the packages that ``method`` computes with."""
-    packages: tuple[str, ...] = getattr(method, "packages", ("numpy", "numba"))
-    versions = {package: version(package) for package in packages}
-    return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
+def load_method(name_or_path: str | Path, rig: Rig, **options: Any) -> Method:
+    """A method for images of ``rig``: one of `METHODS`, or the trained network of weights that come with the package
+    or of a ``.safetensors`` file.
+
+    ``options`` are those of the method's class; a network also takes ``device`` (``cpu``, ``cuda``, ...).
+
+    >>> from fpp_ml_bench.baselines import load_method
+    >>> depth_mm = load_method("phase", dataset.rig).predict(frames)    # doctest: +SKIP
+
+    Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
+    """
+    if name_or_path in METHODS:
+        return METHODS[str(name_or_path)](rig, **options)
+    model = networks.load(known_weights(name_or_path), options.pop("device", None))
+    return networks.NetworkMethod(model, sequence=rig.sequence, **options)
+
+
+def known_weights(name_or_path: str | Path) -> Path:
+    """Path of the weights file that ``name_or_path`` means. `PredictionError` for an unknown name lists the known."""
+    try:
+        return training.weights_path(name_or_path)
+    except WeightsError:
+        raise PredictionError(
+            f"unknown method {str(name_or_path)!r}; there are {', '.join((*METHODS, *training.shipped_names()))}, and "
+            "every .safetensors file of trained weights"
+        ) from None

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Method, software_of
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, check_submission
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, Submission, check_submission
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
@@ -38,8 +39,8 @@ def predict_split(
     """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or
     the method's own units, and ``submission.yaml`` last.
 
-    A method that offers ``predict_reported(frames) -> (prediction, report)`` and ``summary(reports)`` gets its reports
-    written beside, by sample, as `REPORTS_FILE`, and the summary into the submission's settings.
+    The reports of a method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them
+    into the submission's settings.
 
     A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
     run that is not counted warms caches and compiled code up. The submission gives the median over the split.
@@ -49,23 +50,23 @@ def predict_split(
     """
     samples = opened.samples(split)
     _prepare(out, samples)
-    seconds, reports = [], {}
-    reported = getattr(method, "predict_reported", None)
+    seconds: list[float] = []
+    reports: dict[str, dict[str, Any]] = {}
     for number, sample in enumerate(samples):
         frames = captured_frames(opened, method, sample)
         if number == 0:
             method.predict(frames)
         started = perf_counter()
-        if reported is None:
-            depth_mm = method.predict(frames)
-        else:
-            depth_mm, reports[sample] = reported(frames)
+        depth_mm, reports[sample] = method.predict_reported(frames)
         seconds.append(perf_counter() - started)
         _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", depth_mm, opened.size)
         progress(1)
     median = statistics.median(seconds)
-    summary = _write_reports(out / REPORTS_FILE, method, reports) if reports else {}
-    _write_submission(out / SUBMISSION_FILE, method, median, summary)
+    summary: dict[str, Any] = {}
+    if method.reports:
+        write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+        summary = method.summary(list(reports.values()))
+    write_submission(out / SUBMISSION_FILE, check_submission(out, _described(method, median, summary)))
     return Run(len(samples), median)
 
 
@@ -77,7 +78,7 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
     frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
     for index in method.frames_used:
         frame = opened.frame(sample, index).copy()
-        if getattr(method, "uses_ground_truth_mask", False):
+        if method.uses_ground_truth_mask:
             frame *= object_mask(opened.depth_mm(sample))
         frames[index] = frame
     opened.release(sample)
@@ -112,33 +113,27 @@ def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int
     temporary.replace(path)
 
 
-def _write_reports(path: Path, method: Any, reports: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Write what the method reports of each sample; returns its summary of them."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(reports, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    temporary.replace(path)
-    summary: dict[str, Any] = method.summary(list(reports.values()))
-    return summary
-
-
-def _write_submission(path: Path, method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> None:
-    content: dict[str, Any] = {
+def _described(method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> dict[str, Any]:
+    """What the submission says of ``method`` and the run."""
+    return {
         "name": method.title,
         "method": method.name,
-        "units": getattr(method, "units", "mm"),
+        "units": method.units,
         "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
-        **({"uses_ground_truth_mask": True} if getattr(method, "uses_ground_truth_mask", False) else {}),
+        **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
         "seconds_per_sample": float(f"{seconds_per_sample:.6g}"),
         "seconds_source": "measured",
         "hardware": describe_hardware().to_dict(),
-        "software": software_of(method),
+        "software": method.software,
         "settings": {**method.settings, **summary},
-        **({"seeds": dict(seeds)} if (seeds := getattr(method, "seeds", {})) else {}),
+        **({"seeds": dict(method.seeds)} if method.seeds else {}),
     }
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(check_submission(path.parent, content).to_yaml(), encoding="utf-8")
-    temporary.replace(path)
+
+
+def write_submission(path: Path, submission: Submission) -> None:
+    """Write ``submission.yaml``, complete or not at all."""
+    write_atomically(path, submission.to_yaml().encode("utf-8"))
 
 
 COUNTED_SAMPLES = 6
@@ -148,69 +143,41 @@ COUNTED_SAMPLES = 6
 def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explanation:
     """The account of a run of ``method`` over ``split``. Takes as long as predicting some samples again."""
     samples = opened.samples(split)
-    stored = stored_frames(opened.sequence, opened.manifest.stored)
-    lines = [_frames(opened, method, samples, [index for index in stored if index not in method.frames_used])]
-    count = min(COUNTED_SAMPLES, len(samples))
-    counted = [samples[i * len(samples) // count] for i in range(count)]
-    if isinstance(method, ClassicalMethod):
-        lines += _second_direction(opened, method, counted, len(samples))
-    elif getattr(method, "route", None) is not None:
-        lines.append(_outside_crop(opened, method, counted, len(samples)))
     height, width = opened.size
-    about = f"{method.title}; {len(samples)} samples of {width}x{height} px"
-    return explained("predict", about, lines)
-
-
-def _frames(opened: DatasetFolder, method: Method, samples: list[str], unused: list[int]) -> LeftOut:
-    height, width = opened.size
+    unused = [i for i in stored_frames(opened.sequence, opened.manifest.stored) if i not in method.frames_used]
     sample = samples[len(samples) // 2]
     seconds = seconds_of(lambda: [frame.copy() for frame in opened.frames(sample, unused)]) if unused else None
     opened.release(sample)
-    return LeftOut(
+    lines = [LeftOut(
         "frames that the method does not use", "frames", len(method.frames_used) * len(samples),
         len(unused) * len(samples), len(unused) * len(samples) * height * width,
         None if seconds is None else seconds * len(samples),
         f"processor seconds of reading them for one sample ({sample}) now, times the samples",
-    )  # fmt: skip
-
-
-def _second_direction(
-    opened: DatasetFolder, method: ClassicalMethod, counted: list[str], samples: int
-) -> list[LeftOut]:
-    if method.direction != "both":
-        return []
-    height, width = opened.size
-    decoded_px, skipped_px, seconds = 0, 0, 0.0
-    for sample in counted:
-        frames = captured_frames(opened, method, sample)
-        with skipping(True):
-            second_px = method.decode(frames, reasons=False).second_px
-        saved = saved_by(lambda frames=frames: method.predict(frames), 1, 1)  # type: ignore[misc]
-        decoded_px, skipped_px = decoded_px + second_px, skipped_px + height * width - second_px
-        seconds += saved or 0.0
-    scale = samples / len(counted)
-    frames_each = len(method.frames_used) // 2
-    return [
-        LeftOut(
-            "second direction where the first shows no object", "pixels", round(decoded_px * scale),
-            round(skipped_px * scale), round(skipped_px * scale) * frames_each, seconds * scale,
-            f"{len(counted)} of {samples} samples predicted again now with skipping off and on, and scaled up",
-        )
-    ]  # fmt: skip
-
-
-def _outside_crop(opened: DatasetFolder, method: Any, counted: list[str], samples: int) -> LeftOut:
-    height, width = opened.size
-    inside = 0
-    for sample in counted:
-        frames = captured_frames(opened, method, sample)
-        images = [frames[index] for index in method.frames_used]
-        crop = method.route.observe(images if len(images) > 1 else images[0]).crop
-        inside += (crop[0].stop - crop[0].start) * (crop[1].stop - crop[1].start)
-    scale = samples / len(counted)
-    return LeftOut(
-        "local fits and orders far from the object", "pixels", round(inside * scale),
-        round((len(counted) * height * width - inside) * scale), None, None,
-        f"pixels counted on {len(counted)} of {samples} samples; the crop is part of the method, so there is no run "
-        "without it to measure against",
-    )  # fmt: skip
+    )]  # fmt: skip
+    count = min(COUNTED_SAMPLES, len(samples))
+    stacks = (captured_frames(opened, method, samples[i * len(samples) // count]) for i in range(count))
+    scale, how = len(samples) / count, f"{count} of {len(samples)} samples"
+    done, left_out, saved_s = 0, 0, 0.0
+    if isinstance(method, ClassicalMethod) and method.direction == "both":
+        for frames in stacks:
+            with skipping(True):
+                second_px = method.decode(frames, reasons=False).second_px
+            saved_s += saved_by(lambda: method.predict(frames), 1, 1) or 0.0  # noqa: B023  called at once
+            done, left_out = done + second_px, left_out + height * width - second_px
+        pixels = round(left_out * scale)
+        lines.append(LeftOut(
+            "second direction where the first shows no object", "pixels", round(done * scale), pixels,
+            pixels * (len(method.frames_used) // 2), saved_s * scale,
+            f"{how} predicted again now with skipping off and on, and scaled up",
+        ))  # fmt: skip
+    elif method.crops:
+        for frames in stacks:
+            rows, columns = method.crop(frames)
+            done += (rows.stop - rows.start) * (columns.stop - columns.start)
+        lines.append(LeftOut(
+            "local fits and orders far from the object", "pixels", round(done * scale),
+            round((count * height * width - done) * scale), None, None,
+            f"pixels counted on {how}; the crop is part of the method, so there is no run without it to measure "
+            "against",
+        ))  # fmt: skip
+    return explained("predict", f"{method.title}; {len(samples)} samples of {width}x{height} px", lines)

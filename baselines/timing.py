@@ -5,20 +5,19 @@ import gc
 import resource
 import statistics
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Method, software_of
-from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.run import captured_frames, write_submission
 from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing, read_result, write_result
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
@@ -26,8 +25,6 @@ WARM_UP = 3
 _MIB = 2.0**20
 _CLEAR_PEAK = "5"
 """What resets the kernel's high-water mark of the resident set, written to ``/proc/self/clear_refs`` (proc(5))."""
-
-Frames = Sequence[NDArray[np.uint8] | None]
 
 
 def time_method(
@@ -41,8 +38,7 @@ def time_method(
     """Time ``method`` on images of ``split``: see `Timing` for what each figure means.
 
     Frames are in memory before the clock starts, at most ``batch`` sequences of them: neither reading nor writing
-    counts. A method may offer ``predict_batch(list of frames)``, ``device`` (``"cpu"`` or ``"cuda..."``) and
-    ``parameters``; without them it runs one image after another, on the CPU, and has none.
+    counts.
 
     Raises `DatasetError` for an empty split, or when the dataset lacks a frame that the method needs.
     """
@@ -53,33 +49,31 @@ def time_method(
         raise ValueError(f"expected a batch and repeats of at least 1, got {batch} and {repeats}")
     # A batch larger than the split holds its samples again: views, which cost no memory.
     stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
-    device = str(getattr(method, "device", "cpu"))
-    synchronise = _synchronise(device)
+    gpu = _Gpu(method.device)
 
     def latency_s(number: int) -> float:
-        synchronise()
+        gpu.synchronise()
         started = perf_counter()
         method.predict(stacks[number % len(stacks)])
-        synchronise()
+        gpu.synchronise()
         return perf_counter() - started
 
     for number in range(WARM_UP):
         latency_s(number)
     working_mib = _added_by(lambda: latency_s(0))
-    _reset_gpu_peak(device)
+    gpu.reset_peak()
     latencies_ms = []
     for number in range(repeats):
         latencies_ms.append(1000 * latency_s(number))
         progress(1)
-    run_batch, batched = _batch_runner(method)
     batch_stacks: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
     rates = []
     for number in range(1 + max(1, -(-repeats // batch))):
-        synchronise()
+        gpu.synchronise()
         started = perf_counter()
-        run_batch(batch_stacks)
-        synchronise()
-        if number or not batched:  # the first batch warms the batched path up
+        method.predict_batch(batch_stacks)
+        gpu.synchronise()
+        if number or not method.batched:  # the first batch warms the batched path up
             rates.append(batch / (perf_counter() - started))
     low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
     return Timing(
@@ -89,31 +83,23 @@ def time_method(
         latency_p95_ms=_digits(high),
         repeats=repeats,
         batch=batch,
-        batched=batched,
+        batched=method.batched,
         throughput_per_s=_digits(statistics.median(rates)),
         peak_memory_mib=round(_peak_mib(), 1),
         working_memory_mib=None if working_mib is None else round(working_mib, 1),
-        gpu_memory_mib=_gpu_peak_mib(device),
-        parameters=int(getattr(method, "parameters", 0)),
+        gpu_memory_mib=gpu.peak_mib(),
+        parameters=method.parameters,
         frames=len(method.frames_used),
         image_size=list(opened.size),
-        device=device,
+        device=method.device,
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
-        software=software_of(method),
+        software=method.software,
     )
 
 
 def _digits(value: float) -> float:
     """Four significant digits: more would be noise."""
     return float(f"{value:.4g}")
-
-
-def _batch_runner(method: Method) -> tuple[Callable[[list[Frames]], Any], bool]:
-    """A function that predicts a batch, and whether it takes all images in one call."""
-    at_once = getattr(method, "predict_batch", None)
-    if at_once is not None:
-        return at_once, True
-    return lambda stacks: [method.predict(frames) for frames in stacks], False
 
 
 def _peak_mib() -> float:
@@ -148,28 +134,28 @@ def _status_mib(key: str) -> float:
     return float(fields[key].split()[0]) / 1024
 
 
-def _synchronise(device: str) -> Callable[[], object]:
-    """A function that waits until the device has finished: calls to a GPU return before their work is done."""
-    if not device.startswith("cuda"):
-        return lambda: None
-    import torch
+class _Gpu:
+    """What is measured on a GPU; nothing for a method that runs on the processor."""
 
-    return lambda: torch.cuda.synchronize(device)
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.cuda: Any = None
+        if device.startswith("cuda"):
+            import torch
 
+            self.cuda = torch.cuda
 
-def _reset_gpu_peak(device: str) -> None:
-    if device.startswith("cuda"):
-        import torch
+    def synchronise(self) -> None:
+        """Wait until the device has finished: calls to a GPU return before their work is done."""
+        if self.cuda is not None:
+            self.cuda.synchronize(self.device)
 
-        torch.cuda.reset_peak_memory_stats(device)
+    def reset_peak(self) -> None:
+        if self.cuda is not None:
+            self.cuda.reset_peak_memory_stats(self.device)
 
-
-def _gpu_peak_mib(device: str) -> float | None:
-    if not device.startswith("cuda"):
-        return None
-    import torch
-
-    return round(torch.cuda.max_memory_allocated(device) / _MIB, 1)
+    def peak_mib(self) -> float | None:
+        return None if self.cuda is None else round(self.cuda.max_memory_allocated(self.device) / _MIB, 1)
 
 
 def check_target(path: Path, method: Method) -> None:
@@ -207,7 +193,7 @@ def write_timing(path: Path, timing: Timing) -> None:
         return
     submission = Submission.model_validate({**_described(path).model_dump(mode="json"), **measured})
     try:
-        write_atomically(path, submission.to_yaml().encode("utf-8"))
+        write_submission(path, submission)
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
 

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import cv2
 import numpy as np
 
-from fpp_ml_bench.baselines.method import Method, method
+from fpp_ml_bench.baselines.method import Method, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.errors import FppBenchError
@@ -109,7 +109,7 @@ def point(dataset: DatasetFolder, split: str, setting: str, work: Path) -> Point
     name, options = SETTINGS[setting]
     path = work / f"{setting.replace(' ', '-')}.json"
     try:
-        predictor = method(name, dataset.rig, **options)
+        predictor = load_method(name, dataset.rig, **options)
     except (FppBenchError, ImportError) as reason:
         print(f"{setting}: left out ({reason})")
         return None

@@ -18,7 +18,7 @@ import torch
 from phase_pictures import draw_panels
 from phase_route_stages import SHOWN
 
-from fpp_ml_bench.baselines.networks.model import load
+from fpp_ml_bench.baselines.networks import load
 from fpp_ml_bench.baselines.phase_network import DEFAULT, AnsweredObservation, Levers, NetworkRoute, PhaseNetMethod
 from fpp_ml_bench.baselines.phase_route import TAU, Measurement
 from fpp_ml_bench.depth import object_mask

@@ -24,11 +24,17 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics import VIEWS_PER_OBJECT, SceneSet, measure
-from fpp_ml_bench.baselines.method import METHODS, Method, method
-from fpp_ml_bench.baselines.networks.inference import fringe_batch, probed, represent
-from fpp_ml_bench.baselines.networks.metric_twin import TWINS
-from fpp_ml_bench.baselines.networks.model import Model, load
-from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.networks import (
+    TWINS,
+    Model,
+    NetworkMethod,
+    fringe_batch,
+    load,
+    probed,
+    represent,
+    torch_threads,
+)
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError
@@ -64,7 +70,7 @@ class SharedAnswers:
         model, key = self.model, blake2b(fringe.tobytes()).digest()
         if key not in self._answers:
             batch = fringe_batch([fringe], model.config.image_size, model.config.name)
-            with torch.inference_mode(), probed(model.network) as probe:
+            with torch_threads(1), torch.inference_mode(), probed(model.network) as probe:
                 values = represent(model.network, batch, model.config.name).float()
                 answers: dict[str | None, torch.Tensor] = {"oracle": values}
                 if model.config.normalisation != "individual":
@@ -113,7 +119,7 @@ class Materials:
         about = entry.result.submission
         if about.method in METHODS:
             scenes = self.scenes_of(entry, anywhere=True)
-            return method(about.method, scenes.dataset.rig, **_options(about.settings)), scenes
+            return load_method(about.method, scenes.dataset.rig, **_options(about.settings)), scenes
         weights_sha256 = about.settings.get("weights_sha256")
         if not isinstance(weights_sha256, str) or weights_sha256 not in self.weights:
             raise FppBenchError("its weights are missing" if weights_sha256 else "not a method of this package")

@@ -6,14 +6,14 @@ import statistics
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training import Recipe, environment, load_recipe, open_data
-from fpp_ml_bench.baselines.training.engine import _Training
+from fpp_ml_bench.baselines.training import DepthTraining, Recipe, load_recipe, open_data, reproducible
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
 from fpp_ml_bench.loaders.published import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.training import FringeDepth
@@ -51,7 +51,7 @@ class Ours:
     def __init__(self, job: Job) -> None:
         recipe = recipe_of(job, compiled=torch.cuda.is_available())
         surround(job)
-        self.engine = _Training(recipe, *open_data(recipe, job.data), job.scratch / "ours")
+        self.engine = DepthTraining(recipe, *open_data(recipe, job.data), job.scratch / "ours")
         for module in self.engine.objective.modules.values():
             module.train()
 
@@ -60,7 +60,7 @@ class Ours:
         return self.engine.loader
 
     def step(self, batch: FringeDepth) -> torch.Tensor:
-        return self.engine._step(batch)["loss"]
+        return self.engine.step(batch)["loss"]
 
 
 class Plain:
@@ -127,7 +127,7 @@ _surroundings = contextlib.ExitStack()
 def surround(job: Job) -> None:
     """Apply to this process the settings that the engine applies around a training."""
     _set_threads(job)
-    _surroundings.enter_context(environment.reproducible(recipe_of(job, compiled=False)))
+    _surroundings.enter_context(reproducible(recipe_of(job, compiled=False).precision))
 
 
 def _set_threads(job: Job) -> None:
@@ -183,10 +183,12 @@ def step_seconds(job: Job) -> float | None:
     """Median seconds of the engine's step on random images in place; None where the memory does not suffice."""
 
     class Nothing:
+        source = SimpleNamespace(fingerprint="")
+
         def __len__(self) -> int:
             return job.batch
 
-    training = _Training(recipe_of(job, compiled=False), Nothing(), Nothing(), job.scratch)  # type: ignore[arg-type]
+    training = DepthTraining(recipe_of(job, compiled=False), Nothing(), Nothing(), job.scratch)  # type: ignore[arg-type]
     image = torch.rand(job.batch, 1, job.size, job.size, device=training.accelerator.device)
     rows = torch.arange(job.batch)
     batch = FringeDepth(image, image * (image > 0.9), torch.zeros(job.batch, 2), rows, rows)
@@ -194,10 +196,10 @@ def step_seconds(job: Job) -> float | None:
         module.train()
     seconds: list[float] = []
     try:
-        float(training._step(batch)["loss"])
+        float(training.step(batch)["loss"])
         while len(seconds) < 3 or (sum(seconds) < ENOUGH_S and len(seconds) < 30):
             started = perf_counter()
-            float(training._step(batch)["loss"])
+            float(training.step(batch)["loss"])
             seconds.append(perf_counter() - started)
     except torch.cuda.OutOfMemoryError:
         return None

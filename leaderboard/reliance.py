@@ -20,7 +20,7 @@ def check_same_method(entry: Entry, method: "Method") -> None:
     pairs: dict[str, tuple[object, object]] = {
         "method": (about.method, method.name),
         "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
-        "units": (about.units, getattr(method, "units", "mm")),
+        "units": (about.units, method.units),
     }
     for key, value in method.settings.items():
         if key in about.settings and key not in _OF_THE_MACHINE:

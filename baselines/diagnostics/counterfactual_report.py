@@ -90,7 +90,7 @@ def _scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Path) ->
     truth, before = predictor.true_depth(original.depth_mm, target), predictor.predict(original.scene)
     columns = _figure_columns(predictor, scenes, truth, target)
     box = _box(np.logical_or.reduce([mask for *_, mask in columns]))
-    index, masked = predictor.method.frames_used[0], bool(getattr(predictor.method, "uses_ground_truth_mask", False))
+    index, masked = predictor.method.frames_used[0], predictor.method.uses_ground_truth_mask
     unit = "mm" if predictor.in_mm else "share of range"
     margin = 0.5 * (float(np.ptp(truth[target])) or 1.0)
     depths = float(truth[target].min()) - margin, float(truth[target].max()) + margin

@@ -34,6 +34,10 @@ class DepthMethod(Protocol):
 
     @property
     def frames_used(self) -> tuple[int, ...]: ...
+    @property
+    def units(self) -> str: ...
+    @property
+    def uses_ground_truth_mask(self) -> bool: ...
 
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]: ...
 
@@ -54,11 +58,11 @@ class ScenePredictor:
 
     def __init__(self, method: DepthMethod, renderer: SceneRenderer) -> None:
         self.method, self.renderer = method, renderer
-        units = getattr(method, "units", "mm")
+        units = method.units
         if units not in ("mm", "normalised"):
             raise DiagnosisError(f"units {units!r}: reliance is measured for predictions in mm, or normalised")
         self.units: Literal["mm", "normalised"] = "mm" if units == "mm" else "normalised"
-        self._masked = bool(getattr(method, "uses_ground_truth_mask", False))
+        self._masked = method.uses_ground_truth_mask
 
     @property
     def in_mm(self) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import METHODS, Method, method
+from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.depth import Normalisation, object_mask
 from fpp_ml_bench.errors import DiagnosisError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Units
@@ -95,7 +95,7 @@ class Subject:
 
     def input_batch(self, stacks: Sequence[Frames]) -> "Tensor":
         """`input_tensor` of several samples: float32 (B, 1, H, W)."""
-        from fpp_ml_bench.baselines.networks.inference import fringe_batch
+        from fpp_ml_bench.baselines.networks import fringe_batch
 
         if self.network is None:
             raise DiagnosisError(f"{self.name} has no network, so there is no input to it")
@@ -156,7 +156,7 @@ def subject(
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
     if name in METHODS:
         _refuse_options(name, layers=layers, frame=frame)
-        return subject_of_method(method(name, dataset.rig), dataset)
+        return subject_of_method(load_method(name, dataset.rig), dataset)
     return _weights(name, dataset, layers, frame, threads)
 
 
@@ -166,12 +166,12 @@ def subject_of_method(depth_method: Method, dataset: "DatasetFolder") -> Subject
         name=depth_method.name,
         title=depth_method.title,
         sha256=_digest(depth_method.name, depth_method.settings),
-        units=getattr(depth_method, "units", "mm"),
+        units=depth_method.units,
         image_size=dataset.size,
         frames_used=depth_method.frames_used,
         direction=direction_of(dataset, depth_method.frames_used),
         predict_frames=depth_method.predict,
-        uses_ground_truth_mask=getattr(depth_method, "uses_ground_truth_mask", False),
+        uses_ground_truth_mask=depth_method.uses_ground_truth_mask,
     )
 
 
@@ -188,16 +188,17 @@ def _weights(
             f"unknown model {name!r}; there are {names}, every .safetensors file of trained weights, and your own "
             "module as file.py:factory"
         ) from None
-    from fpp_ml_bench.baselines.networks.model import load
+    import torch
 
+    from fpp_ml_bench.baselines.networks import NetworkMethod, load
+
+    torch.set_num_threads(threads)
     model = load(path, "cpu")
     if model.config.image_size != dataset.size:
         raise WeightsError(
             f"{path}: was trained at {model.config.image_size} px (H x W), {dataset.path} has images of {dataset.size} "
             "px; give a dataset built at the weights' size"
         )
-    from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-
     network_method = NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence)
     return subject_of_network(network_method, dataset, layers)
 

@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.diagnostics.subjects import (
     direction_of,
     select_layers,
 )
-from fpp_ml_bench.baselines.networks.inference import fringe_batch
+from fpp_ml_bench.baselines.networks import fringe_batch
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import DiagnosisError, FppBenchError
 from fpp_ml_bench.files import printable

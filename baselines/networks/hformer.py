@@ -8,13 +8,14 @@ from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.networks.base import (
     FringeNetwork,
+    ResidualBlock,
+    TransformerLayer,
     in_full_precision,
     initialise_convolutions,
     initialise_tokens,
     rate,
     whole,
 )
-from fpp_ml_bench.baselines.networks.blocks import ResidualBlock, TransformerLayer
 
 HEADS = (1, 1, 2, 4)
 ENCODER_DEPTHS = (1, 1, 2, 2)

@@ -5,24 +5,233 @@
 >>> depth_mm = model.predict(fringe)                    # uint8 (H, W) -> float32 (H, W)    # doctest: +SKIP
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks import build
-from fpp_ml_bench.baselines.networks.inference import Fringe, fringe_batch, probed, represent
-from fpp_ml_bench.baselines.networks.metric_twin import TWINS, RangeHeads, Twin, heads_from_tensors
+from fpp_ml_bench.baselines.networks.base import FringeNetwork
+from fpp_ml_bench.baselines.networks.registry import build
 from fpp_ml_bench.baselines.training import ModelConfig, open_weights, weights_path
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import PredictionError, WeightsError
+from fpp_ml_bench.loaders.training import unit_range
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.networks.base import FringeNetwork
+Fringe = NDArray[np.uint8] | NDArray[np.floating[Any]]
+
+
+def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trained_on: str) -> Tensor:
+    """Images (B, H, W), uint8 or float in [0, 1], as the network's input: float32 (B, 1, H, W) in [0, 1], on the CPU.
+
+    ``size`` (H, W) is what the network ``trained_on`` was trained at. Raises `PredictionError` for another size, shape
+    or dtype, and for values that are NaN or outside [0, 1].
+    """
+    images = [np.asarray(image) for image in fringes]
+    if not images:
+        raise PredictionError("expected at least one fringe image, got none")
+    batch = torch.empty(len(images), 1, *size)
+    for number, image in enumerate(images):
+        _check_image(image, size, trained_on)
+        row = batch[number, 0].numpy()
+        if image.dtype == np.uint8:
+            unit_range(np.ascontiguousarray(image), row)
+        else:
+            row[...] = image
+    return batch
+
+
+def _check_image(image: NDArray[Any], size: tuple[int, int], trained_on: str) -> None:
+    if image.ndim != 2:
+        raise PredictionError(f"expected one fringe image (H, W), got shape {image.shape}; give a single grey channel")
+    if image.shape != size:
+        raise PredictionError(
+            f"expected a fringe image of {size[0]}x{size[1]} px (H x W), the size {trained_on} was trained at, got "
+            f"{image.shape[0]}x{image.shape[1]}: the fringe period in px depends on the size, so a network works at "
+            "one size only; use weights of that size, or a dataset built at this one"
+        )
+    if image.dtype == np.uint8:
+        return
+    if not np.issubdtype(image.dtype, np.floating):
+        raise PredictionError(f"expected a fringe image in uint8 (0 to 255) or float (0 to 1), got {image.dtype}")
+    low, high = float(image.min()), float(image.max())
+    if not (low >= 0 and high <= 1):  # NaN fails this too
+        raise PredictionError(
+            f"expected a float fringe image within [0, 1], got values from {low:g} to {high:g}; divide grey levels by "
+            "their largest possible value (255 for 8 bits), and leave no NaN"
+        )
+
+
+def represent(network: nn.Module, fringe: Tensor, name: str) -> Tensor:
+    """Output (B, 1, H, W) of ``network``; `PredictionError` where it holds a value that is not finite."""
+    output: Tensor = network(fringe)
+    not_finite = int((~output.isfinite()).sum())
+    if not_finite:
+        raise PredictionError(
+            f"{name}: the network gave {not_finite} of {output.numel()} values that are NaN or infinite; its weights "
+            "come from a training that diverged, or the precision it runs in is too low: train it again"
+        )
+    return output
+
+
+class Probe:
+    """Outputs of two layers of a network for the last batch: see `probed`."""
+
+    def __init__(self) -> None:
+        self.outputs: dict[str, Tensor] = {}
+
+    def pooled(self) -> Tensor:
+        """Mean and spread over the pixels of each bottleneck channel, float64 (B, 2 C), on the CPU."""
+        layer = self.outputs["bottleneck"].double().flatten(2)
+        return torch.cat([layer.mean(2), layer.std(2, correction=0)], dim=1).cpu()
+
+    def pixels(self, size: tuple[int, int]) -> Tensor:
+        """Features of the last decoder layer (B, C, H, W) at ``size``; bilinear where the layer is coarser."""
+        layer = self.outputs["last"]
+        if layer.shape[2:] == size:
+            return layer
+        return functional.interpolate(layer, size=size, mode="bilinear", align_corners=False)
+
+
+@contextmanager
+def probed(network: FringeNetwork) -> Iterator[Probe]:
+    """Record the outputs of the bottleneck and the last decoder layer for every batch inside this block."""
+    probe = Probe()
+    layers = network.probe_layers
+
+    def record(name: str, layer: str) -> Any:
+        def hook(module: nn.Module, inputs: object, output: Tensor) -> None:
+            probe.outputs[name] = output
+
+        return layers[layer].register_forward_hook(hook)
+
+    handles = [record("bottleneck", "bottleneck"), record("last", network.last_layer)]
+    try:
+        yield probe
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+Twin = Literal["mean", "predicted"]
+TWINS: tuple[Twin, ...] = get_args(Twin)
+
+
+@dataclass(frozen=True)
+class HeadReport:
+    """How the heads do on the validation split.
+
+    Range errors are means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is the
+    intersection of predicted and true object over their union, all pixels pooled, at the threshold of ``predicted``.
+    The ridge's strength and the thresholds were chosen on these same pairs, so the test split does a little worse.
+    """
+
+    mean_range_error_mm: float
+    predicted_range_error_mm: float
+    mask_iou: float
+    mean_overall_mae_mm: float
+    predicted_overall_mae_mm: float
+    ridge_strength: float
+
+    def to_tensor(self) -> Tensor:
+        return torch.tensor(list(asdict(self).values()), dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class RangeHeads:
+    """Metric depth from an individually normalised network that is not told the sample's depth range.
+
+    Such a network puts out v in [0, 1], and mm are v (D_max - D_min) + D_min. The *metric twin* of its row (own
+    definition) replaces the range of the test sample, which only the ground truth knows, by either
+
+    - ``mean``: D_min and D_max averaged over the training split;
+    - ``predicted``: a ridge regression from the mean and spread of each bottleneck channel to (D_min, D_max - D_min).
+
+    Both also need an object mask, because v = 0 means both background and D_min: a logistic regression on the features
+    of the last decoder layer (a 1x1 convolution). Depth is v span + D_min, held within the training set's range and a
+    quarter of its width to either side, where the mask says object, and 0 elsewhere. The network itself stays as it is;
+    `fpp_ml_bench.baselines.networks.range_heads.fit_heads` fits the heads.
+
+    Ranges and limits in mm, float64; ``F`` pooled and ``C`` per-pixel features.
+
+    mean_range_mm (2,): D_min, D_max. range_weight (F, 2), range_bias (2,): to (D_min, span). mask_weight (C,),
+    mask_bias (): the logit of being object. mask_threshold (2,): least logit of an object pixel, for each of `TWINS`.
+    limits_mm (2,): what depth is held within. report (6,): a `HeadReport`.
+    """
+
+    mean_range_mm: Tensor
+    range_weight: Tensor
+    range_bias: Tensor
+    mask_weight: Tensor
+    mask_bias: Tensor
+    mask_threshold: Tensor
+    limits_mm: Tensor
+    report: Tensor
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """As stored in a weights file."""
+        return dict(vars(self))
+
+    @property
+    def validation(self) -> HeadReport:
+        return HeadReport(*self.report.tolist())
+
+    def depth_range_mm(self, probe: Probe, twin: Twin) -> Tensor:
+        """D_min and span of the probed batch, float64 (B, 2); a span is never below 0."""
+        pooled = probe.pooled()
+        if twin == "mean":
+            low, high = self.mean_range_mm.tolist()
+            return torch.tensor([[low, high - low]], dtype=torch.float64).expand(len(pooled), 2)
+        predicted = pooled @ self.range_weight + self.range_bias
+        return torch.stack([predicted[:, 0], predicted[:, 1].clamp(min=0)], dim=1)
+
+    def logits(self, probe: Probe, size: tuple[int, int]) -> Tensor:
+        """Logit of being object of each pixel of the probed batch, float32 (B, 1, H, W)."""
+        features = probe.pixels(size).float()
+        weight, bias = (part.to(features.device, torch.float32) for part in (self.mask_weight, self.mask_bias))
+        return functional.conv2d(features, weight[None, :, None, None], bias[None])
+
+    def unmasked_mm(self, values: Tensor, depth_range_mm: Tensor) -> Tensor:
+        """v span + D_min, held within the limits: ``values`` (B, 1, H, W), ``depth_range_mm`` (B, 2) -> float32 mm."""
+        least, most = self.limits_mm.tolist()
+        low, span = depth_range_mm.to(values.device, torch.float32).T[:, :, None, None, None]
+        return (values * span + low).clamp(least, most)
+
+    def depth_mm(self, values: Tensor, probe: Probe, twin: Twin) -> Tensor:
+        """Depth of the probed batch, float32 (B, 1, H, W) in mm, 0 = background."""
+        depth = self.unmasked_mm(values.float(), self.depth_range_mm(probe, twin))
+        threshold = float(self.mask_threshold[TWINS.index(twin)])
+        is_object = self.logits(probe, (values.shape[2], values.shape[3])) >= threshold
+        return torch.where(is_object, depth, 0.0)
+
+
+def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads | None:
+    """The heads stored with the weights ``name``; None without any. `WeightsError` for what can't be heads."""
+    if not tensors:
+        return None
+    fields = RangeHeads.__dataclass_fields__
+    differing = [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]
+    if differing:
+        raise WeightsError(
+            f"{name}: expected the range heads {', '.join(fields)}, differs in {differing[0]}; fit them again"
+        )
+    features = tensors["range_weight"].shape[0] if tensors["range_weight"].dim() == 2 else 0
+    channels = tensors["mask_weight"].numel()
+    shapes = {
+        "mean_range_mm": (2,), "range_weight": (features, 2), "range_bias": (2,), "mask_weight": (channels,),
+        "mask_bias": (), "mask_threshold": (2,), "limits_mm": (2,), "report": (len(HeadReport.__dataclass_fields__),),
+    }  # fmt: skip
+    for key, shape in shapes.items():
+        if tuple(tensors[key].shape) != shape or tensors[key].dtype != torch.float64:
+            actual = f"{tensors[key].dtype} {tuple(tensors[key].shape)}"
+            raise WeightsError(f"{name}: range head {key}: expected float64 {shape}, got {actual}; fit the heads again")
+    return RangeHeads(**tensors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +241,7 @@ class Model:
     ``sha256`` is that of the weights file.
     """
 
-    network: "FringeNetwork"
+    network: FringeNetwork
     config: ModelConfig
     heads: RangeHeads | None
     device: torch.device

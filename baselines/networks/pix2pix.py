@@ -3,8 +3,13 @@
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_normal, whole
-from fpp_ml_bench.baselines.networks.blocks import InstanceNorm
+from fpp_ml_bench.baselines.networks.base import (
+    FringeNetwork,
+    InstanceNorm,
+    in_full_precision,
+    initialise_normal,
+    whole,
+)
 
 DOWNSAMPLINGS = 4
 RESIDUAL_BLOCKS = 9
@@ -45,9 +50,7 @@ class Generator(nn.Sequential):
 
         super().__init__()
         self.stem = normed(_convolution(1, width, 7, reflect=True), width)
-        self.down = nn.Sequential(
-            *(normed(_convolution(c // 2, c, 3, stride=2), c) for c in widths[1:]),
-        )
+        self.down = nn.Sequential(*(normed(_convolution(c // 2, c, 3, stride=2), c) for c in widths[1:]))
         self.bottleneck = nn.Sequential(*(GeneratorBlock(widths[-1]) for _ in range(RESIDUAL_BLOCKS)))
         self.up = nn.Sequential(
             *(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, output_padding=1), c) for c in reversed(widths[:-1]))

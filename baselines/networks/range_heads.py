@@ -1,7 +1,7 @@
-"""Fitting the range heads (`metric_twin`) to a frozen network: closed forms, a few seconds."""
+"""Fitting the range heads (`RangeHeads`) to a frozen network: closed forms, a few seconds."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork
-from fpp_ml_bench.baselines.networks.inference import Probe, probed, represent
-from fpp_ml_bench.baselines.networks.metric_twin import TWINS, HeadReport, RangeHeads
-from fpp_ml_bench.baselines.training import ModelConfig
+from fpp_ml_bench.baselines.networks.model import TWINS, HeadReport, Probe, RangeHeads, load, probed, represent
+from fpp_ml_bench.baselines.training import ModelConfig, save_weights
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import WeightsError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -65,9 +64,6 @@ def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str
 
     Raises as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written.
     """
-    from fpp_ml_bench.baselines.networks.model import load
-    from fpp_ml_bench.baselines.training import save_weights
-
     model = load(weights)
     save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
 
@@ -242,18 +238,13 @@ def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, 
     return weight, parameters.detach()[-1] - centre @ weight
 
 
-@dataclass
 class _Tally:
     """Change of the absolute error by every threshold on the logit, summed in bins of `LOGIT_STEP`."""
 
-    bins: int = round(2 * LOGIT_LIMIT / LOGIT_STEP)
-    gain: NDArray[np.float64] = field(init=False)
-    inside: NDArray[np.float64] = field(init=False)
-    outside: NDArray[np.float64] = field(init=False)
-    without: float = 0.0
-
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
+        self.bins = round(2 * LOGIT_LIMIT / LOGIT_STEP)
         self.gain, self.inside, self.outside = (np.zeros(self.bins) for _ in range(3))
+        self.without = 0.0
 
     def add(self, logits: NDArray, depth_mm: NDArray, target_mm: NDArray) -> None:
         """Pixels (B, H, W): logit, depth that they get as object, true depth."""

@@ -1,10 +1,24 @@
-"""UNet, the paper's baseline (section 5.3.1): four levels down, four up, instance normalisation."""
+"""The U-shaped networks: UNet, the paper's baseline (section 5.3.1), with four levels down, four up and instance
+normalisation; TransUNet (section 5.6), the UNet with a vision transformer for its bottleneck; and ResUNet (section
+5.6), of residual blocks on four levels, with batch normalisation."""
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, in_full_precision, initialise_convolutions, rate, whole
-from fpp_ml_bench.baselines.networks.blocks import DoubleConvolution, Join
+from fpp_ml_bench.baselines.networks.base import (
+    DoubleConvolution,
+    FringeNetwork,
+    Join,
+    ResidualBlock,
+    TransformerLayer,
+    in_full_precision,
+    initialise_convolutions,
+    initialise_tokens,
+    rate,
+    whole,
+)
+from fpp_ml_bench.errors import NetworkError
 
 
 class UShape(FringeNetwork):
@@ -63,3 +77,116 @@ class UNet(UShape):
         bottleneck = DoubleConvolution(8 * width, 16 * width)
         initialise_convolutions(bottleneck)
         super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout)
+
+
+LAYERS = 8
+HEADS = 12
+MLP_RATIO = 4
+
+
+class TokenBottleneck(nn.Module):
+    """Patches of a map through a transformer and back, (B, c_in, m, m) -> (B, c_out, m, m).
+
+    Each p x p patch of all ``c_in`` channels becomes one token of ``channels`` numbers, a learned position is added,
+    pre-norm layers and a last layer norm follow, and one linear layer turns a token into its p x p x ``c_out`` patch.
+    """
+
+    def __init__(self, c_in: int, c_out: int, channels: int, map_size: int, patch: int) -> None:
+        super().__init__()
+        self.grid = map_size // patch
+        self.patch = patch
+        self.embed = nn.Conv2d(c_in, channels, patch, patch)
+        self.position = nn.Parameter(torch.empty(1, self.grid**2, channels))
+        self.layers = nn.Sequential(*(TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
+        self.norm = nn.LayerNorm(channels)
+        self.unembed = nn.Linear(channels, c_out * patch**2)
+        initialise_tokens(self)
+        for weight in (self.position, self.embed.weight):
+            nn.init.trunc_normal_(weight, std=0.02)
+        if self.embed.bias is not None:
+            nn.init.zeros_(self.embed.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        tokens = self.embed(x).flatten(2).transpose(1, 2) + self.position
+        patches = self.unembed(self.norm(self.layers(tokens)))
+        return functional.pixel_shuffle(
+            patches.transpose(1, 2).reshape(-1, patches.shape[2], self.grid, self.grid), self.patch
+        )
+
+
+class TransUNet(UShape):
+    """Encoder and decoder of the UNet around 8 transformer layers of 12 heads; 116,162,881 parameters at the defaults.
+
+    width: channels of the first level; tokens have 12 x width numbers. map_size: side of the bottleneck map, 1/16 of
+    the image side (60 for 960 px). patch: side of a patch in that map, a divisor of ``map_size``. The learned
+    positions tie the network to images of 16 x map_size px a side. Probe layers as the UNet's.
+    """
+
+    name = "transunet"
+
+    def __init__(self, *, width: int = 64, patch: int = 6, map_size: int = 60) -> None:
+        width = whole(self.name, "width", width)
+        patch = whole(self.name, "patch", patch)
+        map_size = whole(self.name, "map_size", map_size, least=2)
+        if map_size % patch:
+            raise NetworkError(f"{self.name}: patch must divide map_size; they were {patch} and {map_size}")
+        bottleneck = TokenBottleneck(8 * width, 16 * width, 12 * width, map_size, patch)
+        super().__init__(width, bottleneck, patch=patch, map_size=map_size)
+
+    def check_size(self, height: int, width: int) -> None:
+        side = self.stride * int(self.options["map_size"])
+        if (height, width) != (side, side):
+            raise NetworkError(
+                f"{self.name} was built for images of {side}x{side} px (map_size {self.options['map_size']}); it was "
+                f"given {height}x{width}; build it with map_size = image side / {self.stride} for another size"
+            )
+
+
+class ResUNet(FringeNetwork):
+    """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120.
+
+    The paper's four levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but
+    the first starts with stride 2. Convolutions start Kaiming-normal (fan out). Probe layers: enc1..enc4, bottleneck,
+    dec3..dec1 (dec1 at full resolution, ``width`` channels).
+    """
+
+    name = "resunet"
+    stride = 8
+    last_layer = "dec1"
+
+    def __init__(self, *, width: int = 120) -> None:
+        width = whole(self.name, "width", width)
+        super().__init__(width=width)
+        widths = [width * 2**level for level in range(4)]
+        self.encoder = nn.ModuleList(
+            nn.Sequential(ResidualBlock(c_in, c_out, 1 if c_in == 1 else 2), ResidualBlock(c_out, c_out))
+            for c_in, c_out in zip([1, *widths], widths, strict=False)
+        )
+        self.bottleneck = nn.Sequential(*(ResidualBlock(widths[3], widths[3]) for _ in range(2)))
+        self.decoder = nn.ModuleList(
+            Join(
+                2 * c_out,
+                c_out,
+                nn.Sequential(ResidualBlock(2 * c_out, c_out), ResidualBlock(c_out, c_out)),
+                skip_first=False,
+            )
+            for c_out in reversed(widths[:3])
+        )
+        self.head = nn.Conv2d(width, 1, 1)
+        initialise_convolutions(self)
+
+    @property
+    def probe_layers(self) -> dict[str, nn.Module]:
+        layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
+        layers["bottleneck"] = self.bottleneck
+        return layers | {f"dec{3 - step}": block for step, block in enumerate(self.decoder)}
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        x, skips = fringe, []
+        for block in self.encoder:
+            x = block(x)
+            skips.append(x)
+        x = self.bottleneck(skips.pop())
+        for block in self.decoder:
+            x = block(x, skips.pop())
+        return in_full_precision(self.head, x)

@@ -1,11 +1,11 @@
+from .method import DEFAULT as DEFAULT
+from .method import NetFile as NetFile
 from .method import PhaseNetMethod as PhaseNetMethod
+from .method import load_net as load_net
+from .method import save_net as save_net
 from .network import PhaseNet as PhaseNet
-from .recipe import Recipe as Recipe
 from .route import AnsweredObservation as AnsweredObservation
 from .route import Levers as Levers
 from .route import NetworkRoute as NetworkRoute
-from .trainer import train_phase_net as train_phase_net
-from .weights import DEFAULT as DEFAULT
-from .weights import NetConfig as NetConfig
-from .weights import load_net as load_net
-from .weights import save_net as save_net
+from .training import Recipe as Recipe
+from .training import train_phase_net as train_phase_net

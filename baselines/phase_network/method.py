@@ -1,23 +1,76 @@
-"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
+"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given.
 
-from collections.abc import Sequence
+Its weights file holds the network in half precision.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.networks import torch_threads
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_network.weights import DEFAULT, NetConfig, NetFile, load_net
 from fpp_ml_bench.baselines.phase_route import Measurement, Settings
-from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.baselines.training import PHASE_NETWORKS, NetConfig, read_file, weights_path, write_file
+from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError, WeightsError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.optics import Direction, Rig
 
+SHIPPED = Path(__file__).resolve().parent / "weights"
+"""Folder of the weights that come with the package."""
+DEFAULT = "phase-net"
 PERIOD_TOLERANCE = 2.2
 """Factor by which an image's fringe period in px may differ from that of the training images."""
 
 
-class PhaseNetMethod:
+@dataclass(frozen=True)
+class NetFile:
+    """A checked file and the network in it, ready to run."""
+
+    path: Path
+    config: NetConfig
+    network: PhaseNet
+    sha256: str
+
+
+def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
+    """Write ``network`` to ``path`` in half precision, complete or not at all; the file's SHA-256.
+
+    Raises `WeightsError` for tensors that are not finite in half precision, and for a path that can't be written.
+    """
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        tensors[name] = tensor.detach().cpu().half() if tensor.is_floating_point() else tensor
+        if not bool(tensors[name].isfinite().all()):
+            raise WeightsError(f"{path}: {name} is not finite in half precision; the training diverged")
+    return write_file(path, PHASE_NETWORKS, config, tensors)
+
+
+def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile:
+    """Configuration and network of shipped weights or of a file, float32; ``folded``: for inference alone
+    (`PhaseNet.folded`), False to train on.
+
+    Raises `WeightsError`, naming the file, the expected and the actual content and the cure, for a file that is absent,
+    damaged, of another kind or version, or whose tensors do not fit its configuration.
+    """
+    path = weights_path(name_or_path, SHIPPED)
+    shown = printable(str(path), 500)
+    config, tensors, digest = read_file(path, PHASE_NETWORKS)
+    try:
+        network = PhaseNet(**config.options)
+        network.load_state_dict({name: t.float() if t.is_floating_point() else t for name, t in tensors.items()})
+    except (NetworkError, TypeError, ValueError, RuntimeError) as error:
+        raise WeightsError(f"{shown}: its tensors are not those of its network: {printable(str(error), 300)}") from None
+    if not all(bool(torch.isfinite(t).all()) for t in network.state_dict().values()):
+        raise WeightsError(f"{shown}: holds values that are not finite; copy or train it again")
+    return NetFile(path, config, network.folded() if folded else network, digest)
+
+
+class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
 
     ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
@@ -26,11 +79,9 @@ class PhaseNetMethod:
     """
 
     name = "phase-net"
-    uses_ground_truth_range = False
-    units = "mm"
     target = "depth"
+    crops = True
     packages = ("numpy", "numba", "torch")
-    device = "cpu"
 
     def __init__(
         self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile = DEFAULT,
@@ -52,55 +103,36 @@ class PhaseNetMethod:
                 f"image, this rig's have {image_period_px:.1f} px, beyond a factor of {PERIOD_TOLERANCE}; train "
                 "weights for it (fpp-bench train phase-net), or use the measured route (phase)"
             )
-        route_levers = levers or Levers(shading=shading)
         config = self.file.config
+        route_levers = levers or Levers(shading=shading)
         self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, route_levers, config.lead)
-
-    @property
-    def frames_used(self) -> tuple[int, ...]:
-        """The frame that must be captured."""
-        return (self.rig.sequence.sinusoids(self.options.direction)[0],)
-
-    @property
-    def title(self) -> str:
-        blind = "" if self.options.shading else ", without brightness"
-        more = "" if self.file.config.name == DEFAULT else f" ({self.file.config.name})"
-        return f"Phase route, one {self.options.direction} fringe; order, mask and correction learned{more}{blind}"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {
-            "direction": self.options.direction, "shading": self.options.shading,
-            "min_confidence": self.options.min_confidence, "weights": self.file.config.name,
-            "weights_sha256": self.file.sha256, "mask_threshold": self.file.config.threshold,
-            "order_lead": self.file.config.lead, "threads": self.threads,
+        self.weights_config = config
+        self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
+        self.frames_used = (rig.sequence.sinusoids(direction)[0],)
+        more = "" if config.name == DEFAULT else f" ({config.name})"
+        blind = "" if shading else ", without brightness"
+        self.title = f"Phase route, one {direction} fringe; order, mask and correction learned{more}{blind}"
+        self.settings = {
+            "direction": direction, "shading": shading, "min_confidence": min_confidence, "weights": config.name,
+            "weights_sha256": self.file.sha256, "mask_threshold": config.threshold, "order_lead": config.lead,
+            "threads": threads,
         }  # fmt: skip
 
-    @property
-    def weights_config(self) -> NetConfig:
-        """What the weights file says of the network and its training data."""
-        return self.file.config
-
-    @property
-    def parameters(self) -> int:
-        """Numbers that were learned."""
-        return sum(parameter.numel() for parameter in self.file.network.parameters())
-
-    def measure(self, frames: Sequence[NDArray[np.uint8] | None]) -> Measurement:
+    def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        import torch
+        with torch_threads(self.threads):
+            return self.route.measure(self._image(frames))
 
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        return self.route.geometry.route.observe(self._image(frames)).crop
+
+    def _image(self, frames: Frames) -> NDArray[np.uint8]:
         (index,) = self.frames_used
         image = frames[index] if index < len(frames) else None
         if image is None:
             raise DecodeError(f"frame {index} is missing: phase-net needs that one fringe")
-        before = torch.get_num_threads()
-        torch.set_num_threads(self.threads)
-        try:
-            return self.route.measure(image)
-        finally:
-            torch.set_num_threads(before)
+        return image
 
-    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]:
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
         return self.measure(frames).depth_mm

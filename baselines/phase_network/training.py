@@ -1,218 +1,342 @@
-"""The training loop: windows, three losses, checkpoints, and validation in mm on whole images."""
+"""Training phase-net, from dataset to weights file: windows of images, three losses, validation in mm on whole images.
 
+``out`` holds the files of the engine and, at the end, phase-net.safetensors instead of the checkpoint.
+"""
+
+import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines.phase_network.inputs import Geometry
+from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.recipe import Recipe
-from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, decided_order, network_answers
-from fpp_ml_bench.baselines.phase_network.samples import Sample
-from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window, draw
-from fpp_ml_bench.baselines.phase_route import TAU
-from fpp_ml_bench.baselines.training import optimizer_tensors, read_checkpoint, restore_optimizer, save_checkpoint
-from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.optics import Direction
+from fpp_ml_bench.baselines.phase_network.route import network_answers
+from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of, unions_of
+from fpp_ml_bench.baselines.phase_network.validation import chosen_lead, chosen_threshold, score, scores, with_lead
+from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Variation, Window, draw
+from fpp_ml_bench.baselines.phase_route import Settings
+from fpp_ml_bench.baselines.training import (
+    CHECKPOINT,
+    Display,
+    NetConfig,
+    Panel,
+    Record,
+    Training,
+    claim_folder,
+    reproducible,
+    training_benchmark,
+)
+from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import DIRECTIONS, Direction
 
-CHECKPOINT_FILE = "checkpoint.safetensors"
+WEIGHTS = "phase-net.safetensors"
 SMALL_RAD = 0.05
 """Error of the phase below which its loss is quadratic."""
 IMPOSSIBLE = -1e4
 """Logit of an order that puts its pixel out of the working range: finite, for gradients to stay so."""
 LARGEST_GRADIENT = 50.0
+VALIDATED_SHARE = 5
+"""Every so many-th validation image is scored during training."""
 
 
 @dataclass(frozen=True)
-class Batch:
-    """`Window`s as tensors with a leading axis B."""
+class Recipe:
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
 
-    x: Tensor
-    exists: Tensor
-    order: Tensor
-    correction_rad: Tensor
-    fitted: Tensor
-    target: Tensor
-    mask_valid: Tensor
+    ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
+    ``unions``: images that join several objects, made from each sample (see `unions`); ``weight_*``: of the losses;
+    ``averaged``: decay of the weights' moving average, which is what the weights file holds.
+    Raises `RecipeError` for values that train nothing.
+    """
 
-    @classmethod
-    def of(cls, windows: list[Window]) -> "Batch":
-        stacked = {
-            name: np.stack([getattr(window, name) for window in windows]) for name in Window.__dataclass_fields__
-        }
-        tensors = {name: torch.from_numpy(values) for name, values in stacked.items()}
-        tensors["x"] = tensors["x"].contiguous(memory_format=torch.channels_last)
-        return cls(**tensors)
+    name: str = "phase-net"
+    steps: int = 5000
+    batch: int = 6
+    window: int = 160
+    rate: float = 3e-3
+    warm_up: int = 100
+    decay: float = 1e-4
+    averaged: float = 0.995
+    seed: int = 42
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
+    bound_rad: float = math.pi / 2
+    directions: tuple[Direction, ...] = DIRECTIONS
+    unions: int = 1
+    weight_order: float = 2.0
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    validate_every: int = 500
+    vary: Variation = field(default_factory=Variation)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "window", "validate_every"):
+            if not getattr(self, name) >= 1:
+                raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        if not 0 <= self.unions <= 100:
+            raise RecipeError(f"unions {self.unions!r}: expected 0 to 100 for every sample")
+        if not self.rate > 0 or not 0 <= self.averaged < 1:
+            raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+        if not self.directions or any(direction not in DIRECTIONS for direction in self.directions):
+            raise RecipeError(f"directions {self.directions}: expected some of {', '.join(DIRECTIONS)}")
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate of step 0, 1, ..."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain mapping of everything."""
+        return json.loads(json.dumps(asdict(self)))
+
+    @property
+    def digest(self) -> str:
+        """Hex digest of everything."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
-@dataclass(frozen=True)
-class TrainedNetwork:
-    """The averaged network after ``steps``, and a record of every validation."""
+Batch = dict[str, Tensor]
+"""The fields of `Window` with a leading axis B."""
 
-    network: PhaseNet
-    history: list[dict[str, Any]]
-    steps: int
+
+def batch_of(windows: list[Window]) -> Batch:
+    """The windows as tensors."""
+    fields = Window.__dataclass_fields__
+    batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
+    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
+    return batch
 
 
 def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str, Tensor]:
     """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad."""
-    order, inside, correction = network(batch.x)
-    logits = torch.where(batch.exists, order, torch.tensor(IMPOSSIBLE))
-    pixels = batch.fitted.sum().clamp(min=1)
-    by_order = functional.cross_entropy(logits, batch.order, ignore_index=IGNORED, reduction="sum") / pixels
-    by_pixel = functional.binary_cross_entropy_with_logits(inside, batch.target.float(), reduction="none")
-    by_mask = (by_pixel * batch.mask_valid).sum() / batch.mask_valid.sum().clamp(min=1)
-    target_rad = batch.correction_rad.clamp(-bound_rad, bound_rad)
+    order, inside, correction = network(batch["x"])
+    logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
+    pixels = batch["fitted"].sum().clamp(min=1)
+    by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum") / pixels
+    by_pixel = functional.binary_cross_entropy_with_logits(inside, batch["target"].float(), reduction="none")
+    by_mask = (by_pixel * batch["mask_valid"]).sum() / batch["mask_valid"].sum().clamp(min=1)
+    target_rad = batch["correction_rad"].clamp(-bound_rad, bound_rad)
     by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
-    return {"order": by_order, "mask": by_mask, "phase": (by_phase * batch.fitted).sum() / pixels}
+    return {"order": by_order, "mask": by_mask, "phase": (by_phase * batch["fitted"]).sum() / pixels}
 
 
-def scores(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> dict[str, float]:
-    """Means of `score` over the samples."""
-    rows = []
-    for sample in samples:
-        geometry, scene = geometries[sample.direction], sample.scene.single()
-        rows.append(score(network_answers(network, scene, geometry), sample, geometry))
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+class WindowObjective:
+    """The weighted losses of a `PhaseNet`, and the moving average of its weights, updated after every step."""
+
+    def __init__(self, network: PhaseNet, recipe: Recipe) -> None:
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.bound_rad = recipe.bound_rad
+        self.weights = {"order": recipe.weight_order, "mask": recipe.weight_mask, "phase": recipe.weight_phase}
+        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+
+    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
+        parts = losses(self.modules["network"], batch, self.bound_rad)
+        total = torch.stack([self.weights[name] * parts[name] for name in self.weights]).sum()
+        yield "network", total, {name: value.detach() for name, value in parts.items()}
+        self.averaged.update_parameters(self.modules["network"])
 
 
-def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
-    """Scores of one whole image with ``threshold`` on the mask's logit.
+class PhaseNetTraining(Training):
+    """`Training` in intervals between two validations, on windows drawn from ``samples``, on the processor.
 
-    ``object_mae_mm`` counts a missed pixel with its whole depth; ``right_mae_mm`` is the MAE of the pixels with the
-    right order; ``wrong_percent`` and ``missed_percent`` are shares of the object's pixels; ``invented_kpx``:
-    background pixels with a depth, in thousands."""
-    scene = sample.scene.single()
-    layer = geometry.layer.at(scene.crop)
-    order, inside = decided_order(answers, scene), decided_mask(answers, scene, threshold)
-    base_residual = layer.residual_phase(scene.phase_rad, scene.order)
-    true_mm = layer.depth_of_residual_mm(base_residual + sample.missing_rad)
-    phase_change = TAU * (order - scene.order) + answers.correction_rad
-    predicted_mm = np.nan_to_num(layer.depth_of_residual_mm(base_residual + phase_change))
-    target = sample.target
-    phase_error = phase_change - sample.missing_rad
-    error = np.where(inside, np.minimum(np.abs(predicted_mm - true_mm), true_mm), true_mm)[target]
-    wrong = (np.abs(phase_error) > np.pi)[target]
-    detected = inside[target]
-    return {
-        "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[detected & ~wrong].mean()),
-        "wrong_percent": 100 * float(wrong.mean()),
-        "missed_percent": 100 * float((~detected).mean()),
-        "invented_kpx": float((inside & ~target).sum()) / 1000,
-    }
+    ``start``: the network whose weights it starts from (None: random ones). ``report`` is given every new record.
+    Raises `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint of another recipe.
+    """
+
+    largest_gradient = LARGEST_GRADIENT
+
+    def __init__(
+        self, recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry],
+        out: Path, report: Callable[[Record], None] = lambda record: None, start: PhaseNet | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
+        self.recipe, self.samples, self.validation, self.geometries = recipe, samples, validation, geometries
+        self.name = self.title = recipe.name
+        self.report = report
+        network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad)
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if start is not None:
+            if start.options != network.options:
+                raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+            network.load_state_dict(start.state_dict())
+        self.objective = self.windows = WindowObjective(network, recipe)
+        self.bare = {"network": network, "averaged": self.windows.averaged}
+        optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        self.windows.modules["network"], prepared = self.accelerator.prepare(network, optimizer)
+        self.optimizers = {"network": prepared}
+        self.resume()
+
+    @property
+    def network(self) -> PhaseNet:
+        """The averaged network, to be used."""
+        averaged: PhaseNet = self.windows.averaged.module.eval()  # type: ignore[assignment]
+        return averaged
+
+    @property
+    def steps_done(self) -> int:
+        return self.history[-1]["step"] if self.history else 0
+
+    @property
+    def _next_validation(self) -> int:
+        """Step after which the coming interval ends."""
+        every = self.recipe.validate_every
+        return min((self.steps_done // every + 1) * every, self.recipe.steps)
+
+    @property
+    def total_steps(self) -> int:
+        return self.recipe.steps
+
+    @property
+    def over(self) -> bool:
+        return self.steps_done >= self.recipe.steps
+
+    def rate(self, number: int) -> float:
+        return self.recipe.rate_at(self.steps_done + number)
+
+    def batches(self) -> Iterator[Batch]:
+        """The batches up to the next validation: each is a function of seed and step alone, made one step ahead."""
+        first, last, recipe = self.steps_done, self._next_validation, self.recipe
+
+        def make(step: int) -> Batch:
+            random = np.random.default_rng([recipe.seed, step])
+            one = partial(draw, self.samples, self.geometries, recipe.window, recipe.vary, random)
+            return batch_of([one() for _ in range(recipe.batch)])
+
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(make, first)
+            for step in range(first, last):
+                batch = coming.result()
+                if step + 1 < last:
+                    coming = pool.submit(make, step + 1)
+                yield batch
+
+    def diverged(self, name: str, value: float, number: int, label: None) -> str:
+        return f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start again"
+
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        seconds, steps = perf_counter() - began, self._next_validation
+        record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
+        record |= {f"loss_{name}": value for name, value in losses.items()}
+        return record | (scores(self.network, self.validation, self.geometries) if self.validation else {})
+
+    def recorded(self, record: Record) -> None:
+        self.report(record)
+
+    def progress(self) -> str:
+        return f"step {self.steps_done}/{self.recipe.steps}  phase {self.history[-1]['loss_phase']:.4g}"
+
+    def panels(self) -> list[Panel]:
+        def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
+            return Panel.of(title, self.history, "step", labels, log)
+
+        return [
+            panel("training losses", {f"loss_{name}": name for name in self.windows.weights}, log=True),
+            panel("validation MAE, mm", {"object_mae_mm": "object", "right_mae_mm": "right order"}),
+            panel("validation, % of object pixels", {"wrong_percent": "wrong order", "missed_percent": "missed"}),
+        ]
 
 
-def batches(
-    samples: list[Sample], geometries: dict[Direction, Geometry], recipe: Recipe, first: int
-) -> Iterator[Batch]:
-    """Batch of step ``first``, ``first + 1``, ...: each is a function of seed and step alone, made one step ahead."""
+@dataclass(frozen=True)
+class Trained:
+    """The weights file, scores on the whole validation split, and the mask threshold that was chosen there.
+    ``weights`` is None for a training that stopped because its minutes were over."""
 
-    def make(step: int) -> Batch:
-        random = np.random.default_rng([recipe.seed, step])
-        return Batch.of([draw(samples, geometries, recipe.window, recipe.vary, random) for _ in range(recipe.batch)])
-
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(make, first)
-        for step in range(first, recipe.steps):
-            batch = coming.result()
-            if step + 1 < recipe.steps:
-                coming = pool.submit(make, step + 1)
-            yield batch
+    weights: Path | None
+    steps: int
+    threshold: float
+    validation: dict[str, float]
 
 
-def train(
-    recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry], out: Path,
-    report: Callable[[list[dict[str, Any]]], None] = lambda history: None,
-    advance: Callable[[int], None] = lambda steps: None,
-    minutes: float | None = None, start: PhaseNet | None = None,
-) -> TrainedNetwork:  # fmt: skip
-    """Train to the recipe's end, or to the first validation after ``minutes``, from the checkpoint in ``out`` where
-    there is one, else from the weights of ``start`` or none.
+def train_phase_net(
+    recipe: Recipe, dataset: Path, out: Path, *, extra: Path | None = None, start: Path | None = None,
+    minutes: float | None = None, show: bool = False, print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:  # fmt: skip
+    """Train on the dataset's training split, and on that of ``extra`` where it is given, starting from the weights in
+    ``start`` or from random ones; the same call resumes a training that was stopped.
 
-    Raises `TrainingError` for a checkpoint of another recipe, and for losses that diverge.
+    ``show``: progress on stderr; ``print_line`` is given a line for every validation.
+
+    Raises `DatasetError` for a dataset without the frames in question, `TrainingError` for a folder of another recipe
+    or dataset.
     """
     started = perf_counter()
-    torch.manual_seed(recipe.seed)
-    network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad)
-    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    if start is not None:
-        if start.options != network.options:
-            raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
-        network.load_state_dict(start.state_dict())
-    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
-    averaged_network: PhaseNet = averaged.module  # type: ignore[assignment]
-    optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
-    history: list[dict[str, Any]] = []
-    first = _restore(out / CHECKPOINT_FILE, recipe, network, averaged, optimizer, history)
-    advance(first)
-    weights = {"order": recipe.weight_order, "mask": recipe.weight_mask, "phase": recipe.weight_phase}
-    sums, interval_started = dict.fromkeys(weights, 0.0), perf_counter()
-    network.train()
-    for step, batch in enumerate(batches(samples, geometries, recipe, first), start=first):
-        for group in optimizer.param_groups:
-            group["lr"] = recipe.rate_at(step)
-        step_losses = losses(network, batch, recipe.bound_rad)
-        total = torch.stack([weights[name] * step_losses[name] for name in weights]).sum()
-        if not bool(torch.isfinite(total)):
-            raise TrainingError(f"{out}: the loss is {float(total)} at step {step + 1}; lower the rate and start again")
-        optimizer.zero_grad(set_to_none=True)
-        total.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
-        optimizer.step()
-        averaged.update_parameters(network)
-        sums = {name: sums[name] + float(step_losses[name].detach()) for name in sums}
-        advance(1)
-        steps_done = step + 1
-        if steps_done % recipe.validate_every == 0 or steps_done == recipe.steps:
-            count = steps_done % recipe.validate_every or recipe.validate_every
-            seconds = perf_counter() - interval_started
-            record: dict[str, Any] = {"step": steps_done, "rate": recipe.rate_at(step), "seconds": seconds}
-            record |= {f"loss_{name}": value / count for name, value in sums.items()}
-            record |= scores(averaged_network.eval(), validation, geometries) if validation else {}
-            history.append(record)
-            report(history)
-            _save(out / CHECKPOINT_FILE, recipe, steps_done, network, averaged, optimizer, history)
-            sums, interval_started = dict.fromkeys(weights, 0.0), perf_counter()
-            if minutes is not None and perf_counter() - started > 60 * minutes:
-                return TrainedNetwork(averaged_network.eval(), history, steps_done)
-    return TrainedNetwork(averaged_network.eval(), history, recipe.steps)
+    opened = DatasetFolder(dataset)
+    extra_data = None if extra is None else DatasetFolder(extra)
+    if extra_data is not None and extra_data.rig != opened.rig:
+        raise TrainingError(f"{extra}: was made by another rig than {dataset}; build both with the same one")
+    start_weights = None if start is None else load_net(start, folded=False)
+    described = recipe.to_dict() | ({} if extra_data is None else {"extra_fingerprint": extra_data.fingerprint})
+    described |= {} if start_weights is None else {"start_sha256": start_weights.sha256}
+    claim_folder(out, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
+    weights = out / WEIGHTS
+    if weights.exists():
+        finished = load_net(weights).config
+        scores = {key: float(value or 0) for key, value in finished.validation.items()}
+        return Trained(weights, finished.steps, finished.threshold, scores)
+    geometries = {direction: Geometry.of(opened.rig, Settings(direction=direction)) for direction in recipe.directions}
+    folders = [opened] if extra_data is None else [opened, extra_data]
+    samples, validation = _samples(recipe, folders, geometries, show)
+
+    def report(record: Record) -> None:
+        print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
+
+    with reproducible(cpu=True):
+        scored = validation[::VALIDATED_SHARE]
+        network = None if start_weights is None else start_weights.network
+        training = PhaseNetTraining(recipe, samples, scored, geometries, out, report, network)
+        training.run(started, minutes, show)
+        if not training.over:
+            return Trained(None, training.steps_done, 0.0, {})
+        network = training.network
+        raw_answers = [network_answers(network, s.scene.single(), geometries[s.direction]) for s in validation]
+        threshold = chosen_threshold(raw_answers, validation, opened.size[0] * opened.size[1])
+        lead = chosen_lead(raw_answers, validation, geometries)
+        answers = [with_lead(answer, lead) for answer in raw_answers]
+        rows = [score(a, s, geometries[s.direction], threshold) for a, s in zip(answers, validation, strict=True)]
+    means = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    name = recipe.name if extra_data is None else f"{recipe.name}-fresh"
+    config = NetConfig(
+        name=name, title="Fringe order, mask and bounded phase correction", options=network.options,
+        threshold=threshold, lead=lead, period_px={direction: g.route.period_px for direction, g in geometries.items()},
+        dataset_fingerprint=opened.fingerprint, benchmark=training_benchmark(opened.fingerprint), steps=recipe.steps,
+        recipe=described, validation=dict(means),
+    )  # fmt: skip
+    save_net(weights, network, config)
+    (out / CHECKPOINT).unlink(missing_ok=True)
+    return Trained(weights, recipe.steps, threshold, means)
 
 
-def _save(
-    path: Path, recipe: Recipe, step: int, network: PhaseNet, averaged: AveragedModel, optimizer: torch.optim.Optimizer,
-    history: list[dict[str, Any]],
-) -> None:  # fmt: skip
-    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
-    tensors |= {f"averaged.{name}": value for name, value in averaged.state_dict().items()}
-    tensors |= optimizer_tensors(optimizer, "optimizer")
-    save_checkpoint(path, tensors, {"step": step, "digest": recipe.digest, "history": history})
-
-
-def _restore(
-    path: Path, recipe: Recipe, network: PhaseNet, averaged: AveragedModel, optimizer: torch.optim.Optimizer,
-    history: list[dict[str, Any]],
-) -> int:  # fmt: skip
-    """Steps done so far."""
-    if not path.exists():
-        return 0
-    tensors, state = read_checkpoint(path)
-    if state.get("digest") != recipe.digest:
-        raise TrainingError(f"{path}: is of another recipe; give --out a new folder, or the recipe that it was made by")
-    for prefix, module in (("network.", network), ("averaged.", averaged)):
-        module.load_state_dict(
-            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        )
-    restore_optimizer(optimizer, tensors, "optimizer")
-    history.extend(json.loads(json.dumps(state["history"])))
-    return int(state["step"])
+def _samples(
+    recipe: Recipe, folders: list[DatasetFolder], geometries: dict[Direction, Geometry], show: bool
+) -> tuple[list[Sample], list[Sample]]:
+    """Training samples and unions of all ``folders``, and validation samples of the first."""
+    training = [(folder, folder.samples("train")) for folder in folders]
+    names = folders[0].samples("validation")
+    images = (1 + recipe.unions) * sum(len(of_folder) for _, of_folder in training) + len(names)
+    samples: list[Sample] = []
+    validation: list[Sample] = []
+    with Display("phase of the samples", images * len(geometries), show) as display:
+        for geometry in geometries.values():
+            for folder, of_folder in training:
+                samples += samples_of(folder, of_folder, geometry, display.advance)
+                samples += unions_of(folder, of_folder, geometry, recipe.unions, recipe.seed, display.advance)
+            validation += samples_of(folders[0], names, geometry, display.advance)
+    return samples, validation

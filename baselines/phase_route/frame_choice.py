@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
-
-Frames = Sequence[NDArray[np.uint8] | None]
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
 """Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
@@ -84,7 +83,7 @@ def levels_of(steps: int) -> tuple[int, ...]:
     return tuple(levels)
 
 
-class FewestFrames:
+class FewestFrames(Method):
     """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene; further options are
     those of `Settings`, ``frames`` aside.
 
@@ -92,8 +91,7 @@ class FewestFrames:
     """
 
     name = "phase"
-    uses_ground_truth_range = False
-    units = "mm"
+    reports = True
 
     def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
         if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
@@ -103,24 +101,12 @@ class FewestFrames:
         self.rig, self.error_mm = rig, float(error_mm)
         self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
         self.options = self.methods[1].options
-
-    @property
-    def gray(self) -> tuple[int, ...]:
-        return tuple(self.rig.sequence.gray(self.options.direction))
-
-    @property
-    def frames_used(self) -> tuple[int, ...]:
-        """All frames that a scene may need; most scenes need few of them."""
+        self.gray = tuple(rig.sequence.gray(self.options.direction))
         fringes = {index for method in self.methods.values() for index in method.frames_used}
-        return tuple(sorted(fringes | set(self.gray)))
-
-    @property
-    def title(self) -> str:
-        return f"Phase route, fewest {self.options.direction} fringes for {self.error_mm:g} mm, nothing learned"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {"error_mm": self.error_mm} | {k: v for k, v in self.methods[1].settings.items() if k != "frames"}
+        self.frames_used = tuple(sorted(fringes | set(self.gray)))  # all that a scene may need; most need few of them
+        self.title = f"Phase route, fewest {self.options.direction} fringes for {error_mm:g} mm, nothing learned"
+        settings = self.methods[1].settings
+        self.settings = {"error_mm": self.error_mm} | {key: settings[key] for key in settings if key != "frames"}
 
     def choose(self, frames: Frames) -> FrameChoice:
         """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""

@@ -40,7 +40,7 @@ class Job:
 @dataclass(frozen=True)
 class Variant:
     """A way to use a trained network: the end of its row file's name, and the depth range that turns its output into mm
-    (see `fpp_ml_bench.baselines.networks.network_method.NetworkMethod`)."""
+    (see `fpp_ml_bench.baselines.networks.NetworkMethod`)."""
 
     suffix: str
     depth_range: Literal["oracle", "predicted", "mean"] | None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.networks import NetworkMethod
 from fpp_ml_bench.baselines.reproduce.plan import Folders
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing

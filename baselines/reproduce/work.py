@@ -17,9 +17,8 @@ from typing import Any, Protocol
 
 import torch
 
-from fpp_ml_bench.baselines.networks.model import Model, load
-from fpp_ml_bench.baselines.networks.network_method import NetworkMethod, Setting
-from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+from fpp_ml_bench.baselines.method import Setting
+from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads
 from fpp_ml_bench.baselines.reproduce.plan import (
     PREDICTED,
     Folders,

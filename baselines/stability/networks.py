@@ -10,11 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks import build
-from fpp_ml_bench.baselines.networks.base import in_full_precision
-from fpp_ml_bench.baselines.networks.blocks import RECENTRED_FROM, InstanceNorm
+from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings, TorchCalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
@@ -335,7 +334,7 @@ def phase_output(name: str, image: str) -> Outcome:
         grey = 255.0 * (np.indices(shape).sum(axis=0) % 2)
     else:
         grey = np.full(shape, levels[image])
-    phase_method = method(name, rig)
+    phase_method = load_method(name, rig)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     frames[phase_method.frames_used[0]] = grey.astype(np.uint8)
     measurement = phase_method.measure(frames)  # type: ignore[attr-defined]

@@ -1,301 +1,264 @@
-"""The training loop of all recipes, on one processor or many, on the devices that `accelerate` finds.
+"""The training loop of all networks, on one processor or many, on the devices that `accelerate` finds.
 
     accelerate launch ...   several GPUs or machines; a batch of the recipe is then that of one process
 
-A training folder holds, after every epoch, all that is needed to resume: ``checkpoint.safetensors`` (everything),
-``weights.safetensors`` (the epoch of the lowest validation loss), ``log.jsonl``, ``recipe.json``; at the end also
-``curve.png`` and ``done.json``. On one processor type and number of threads, the same recipe and data give the same
-bits on the CPU, stopped and resumed or not.
-
-The recipe is the paper's (Section 5.3): the rate falls on a plateau of the validation loss, training ends when it has
-reached its minimum, and the weights kept are those of the lowest validation loss. A validation loss is the mean over
-samples of each sample's own loss, and the scores beside it are the evaluator's (`training.validation`).
+A training goes in intervals (an epoch, or a number of steps). After each of them its folder holds all that is needed to
+resume: ``checkpoint.safetensors`` (everything), ``log.jsonl`` and ``recipe.json``; at the end also ``curve.png``. On
+one processor type and number of threads, the same recipe and data give the same bits on the CPU, stopped and resumed or
+not.
 """
 
 import json
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
-from accelerate import Accelerator, PartialState
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
 from accelerate.utils import broadcast_object_list, gather_object, set_seed
-from torch import Tensor
-from torch.optim import RMSprop
-from torch.utils.data import DataLoader
+from torch import Tensor, nn
+from torch.optim import Optimizer
 
-from fpp_ml_bench.baselines.training import environment, history
-from fpp_ml_bench.baselines.training.checkpoint import (
+from fpp_ml_bench.baselines.training.losses import Objective
+from fpp_ml_bench.baselines.training.records import (
+    CURVE_FILE,
+    Display,
+    Panel,
+    Record,
+    draw_curves,
     optimizer_tensors,
     read_checkpoint,
     restore_optimizer,
     save_checkpoint,
+    write_log,
 )
-from fpp_ml_bench.baselines.training.display import Display
-from fpp_ml_bench.baselines.training.objectives import Objective
-from fpp_ml_bench.baselines.training.pairs import EpochSampler, training_loader
-from fpp_ml_bench.baselines.training.recipe import Recipe
-from fpp_ml_bench.baselines.training.schedules import Schedule
-from fpp_ml_bench.baselines.training.setup import model_config, objective_of, open_data
-from fpp_ml_bench.baselines.training.validation import validate
-from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
+from fpp_ml_bench.machine import keep_freed_memory
 
-CHECKPOINT, WEIGHTS, RECIPE, DONE = "checkpoint.safetensors", "weights.safetensors", "recipe.json", "done.json"
+CHECKPOINT, RECIPE = "checkpoint.safetensors", "recipe.json"
 CHECK_EVERY = 16
 """Steps between two checks of the losses: reading a loss makes a GPU wait."""
 DIVERGED = 1e6
 """Multiple of the first loss from which on a training counts as diverged."""
+_LARGEST_INT = (1 << 31) - 1
 
 
-@dataclass(frozen=True)
-class TrainingRun:
-    """Files and epochs of a training; ``finished`` is False when its minutes ran out: call `train` again to resume."""
+class Training(ABC):
+    """A training's state and loop; a subclass says what is trained on what, at which rate, and how it is validated.
 
-    weights: Path
-    epochs: int
-    best_epoch: int
-    seconds: float
-    finished: bool
-    log: Path
-    curve: Path
-
-
-def train(
-    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
-) -> TrainingRun:
-    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
-
-    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one epoch is always
-    trained. ``show``: progress on stderr.
-
-    Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a dataset of another image
-    size, a loss that is not finite or has diverged (the batch's samples are named); what else recipe, dataset or
-    network refuse comes as their own error.
+    ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, whatever compiles or
+    distributes them, as they are saved and restored. ``identity``: recipe and data, which a checkpoint must share.
     """
-    out = Path(out)
-    started = perf_counter()
-    training, validation = open_data(recipe, Path(dataset))
-    _claim(out, recipe, training)
-    finished = _finished(out)
-    if finished is not None:
-        return finished
-    with environment.reproducible(recipe):
-        return _Training(recipe, training, validation, out).run(started, minutes, show)
 
+    name: str
+    title: str
+    objective: Objective
+    optimizers: dict[str, Optimizer]
+    bare: dict[str, nn.Module]
+    largest_gradient: float | None = None
 
-class _Training:
-    """The state of one training and its loop."""
-
-    def __init__(self, recipe: Recipe, training: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
-        self.recipe, self.out, self.training, self.validation = recipe, out, training, validation
-        precision = "no" if recipe.precision == "fp32" else recipe.precision
-        self.accelerator = Accelerator(mixed_precision=precision, gradient_accumulation_steps=1)
-        on_gpu = self.accelerator.device.type == "cuda"
-        set_seed(recipe.seed)
-        self.objective: Objective = objective_of(recipe)
-        # The networks themselves, whatever compiles or distributes them: they are validated, saved and restored.
-        self.bare = dict(self.objective.modules)
-        if on_gpu:
-            for module in self.objective.modules.values():
-                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        if on_gpu and recipe.compile:
-            self.objective.modules = {name: torch.compile(m) for name, m in self.objective.modules.items()}  # type: ignore[misc]
-        rule = recipe.optimizer
-        self.optimizers = {
-            name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
-            for name, module in self.objective.modules.items()
-        }
-        self.schedule = Schedule(recipe.schedule, rule.learning_rate)
-        self.sampler = EpochSampler(len(training), recipe.pairs_per_epoch, recipe.seed)
-        loader = training_loader(training, self.sampler, recipe.batch, pin=on_gpu)
-        self.loader: DataLoader = self.accelerator.prepare(loader)
-        for name in self.objective.modules:
-            self.objective.modules[name], self.optimizers[name] = self.accelerator.prepare(
-                self.objective.modules[name], self.optimizers[name]
-            )
-        self.history: list[history.Record] = []
+    def __init__(
+        self, out: Path, identity: Mapping[str, Any], seed: int, precision: str = "fp32", cpu: bool = False
+    ) -> None:
+        self.out, self.identity = out, dict(identity)
+        mixed_precision = "no" if precision == "fp32" else precision
+        self.accelerator = Accelerator(mixed_precision=mixed_precision, cpu=cpu, gradient_accumulation_steps=1)
+        set_seed(seed)
+        self.history: list[Record] = []
         self.first_loss: float | None = None
-        self.before = 0.0  # seconds of earlier calls
-        if (out / CHECKPOINT).exists():
-            self._resume()
-        if len(set(gather_object([self.epoch]))) > 1:
-            raise TrainingError(f"{out}: processes found different checkpoints; give a folder that all machines share")
+        self.before, self.resumed_at = 0.0, 0
+        """Seconds of earlier calls, and intervals that they trained."""
 
     @property
-    def epoch(self) -> int:
-        """Epochs done."""
-        return len(self.history)
-
-    @property
-    def best(self) -> history.Record:
-        return min(self.history, key=lambda record: record["validation_loss"])
-
-    @property
+    @abstractmethod
     def over(self) -> bool:
-        return self.epoch >= self.recipe.max_epochs or (self.epoch > 0 and self.schedule.finished)
+        """Whether the training has come to its end."""
 
-    def run(self, started: float, minutes: float | None, show: bool) -> TrainingRun:
-        with Display(self.recipe, len(self.loader), show and self.accelerator.is_main_process) as display:
-            for record in self.history:
-                display.epoch_done(record)
-            last_epoch_s = 0.0
-            while not self.over and self._agreed(last_epoch_s == 0 or _fits(started, last_epoch_s, minutes)):
-                epoch_started = perf_counter()
-                losses = self._train_epoch(display)
-                self._finish_epoch(losses, epoch_started)
-                display.epoch_done(self.history[-1])
-                last_epoch_s = perf_counter() - epoch_started
+    @property
+    @abstractmethod
+    def total_steps(self) -> int:
+        """Steps at most, for the progress bar."""
+
+    @property
+    @abstractmethod
+    def steps_done(self) -> int:
+        """Steps of all intervals so far."""
+
+    @abstractmethod
+    def batches(self) -> Iterable[Any]:
+        """The batches of the coming interval."""
+
+    @abstractmethod
+    def rate(self, number: int) -> float:
+        """Learning rate of step ``number`` (from 0) of the coming interval."""
+
+    @abstractmethod
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        """The record of an interval that began at ``began`` and had these mean ``losses``; has ``seconds``."""
+
+    @abstractmethod
+    def recorded(self, record: Record) -> None:
+        """Do what follows from the newest record, before everything is saved."""
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds besides modules, optimisers, history and first loss; `restore` takes it back."""
+        return {}
+
+    def restore(self, state: Mapping[str, Any]) -> None:  # noqa: B027  nothing to do is right
+        """Continue from `state`."""
+
+    def label(self, batch: Any) -> Any:
+        """By what `diverged` names a batch."""
+        return None
+
+    @abstractmethod
+    def diverged(self, name: str, value: float, number: int, label: Any) -> str:
+        """Words on a loss that is not finite, or far above the first one, at step ``number`` of the interval."""
+
+    @abstractmethod
+    def progress(self) -> str:
+        """Words on the newest record for the progress bar."""
+
+    @abstractmethod
+    def panels(self) -> list[Panel]:
+        """What the picture of the training shows."""
+
+    def run(self, started: float, minutes: float | None, show: bool) -> float:
+        """Train to the end, or until an interval would outlast ``minutes`` since ``started``; one is always trained.
+
+        Returns the seconds so far, those of earlier calls included.
+        """
+        with Display(self.name, self.total_steps, show and self.accelerator.is_main_process) as display:
+            self._show(display)
+            last_interval_s = 0.0
+            while not self.over and self._agreed(last_interval_s == 0 or _fits(started, last_interval_s, minutes)):
+                began = perf_counter()
+                losses = self._train_interval(display)
+                self._finish_interval(losses, began)
+                self._show(display)
+                last_interval_s = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
-        if self.accelerator.is_main_process:
-            history.write_log(self.out, self.history)
-            history.draw_curve(self.out, self.history, self.recipe.title)
-            if self.over:
-                summary = {"epochs": self.epoch, "best_epoch": self.best["epoch"], "seconds": seconds}
-                write_atomically(self.out / DONE, json.dumps(summary).encode())
-        self.accelerator.wait_for_everyone()
-        best = self.best["epoch"] if self.history else 0
-        return _run(self.out, self.epoch, best, seconds, self.over)
+        if self.accelerator.is_main_process and self.history:
+            write_log(self.out, self.history)
+            draw_curves(self.out / CURVE_FILE, self.title, self.panels())
+        return seconds
 
-    def _agreed(self, next_epoch: bool) -> bool:
-        """Whether the first process trains a next epoch: clocks differ, and all processes must train the same ones."""
-        return bool(broadcast_object_list([next_epoch])[0])
-
-    def _train_epoch(self, display: Display) -> dict[str, float]:
-        """One pass; the mean over batches of everything the objective logs."""
-        recipe = self.recipe
-        # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
-        set_seed((recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index) % 2**32)
-        self.sampler.epoch = self.epoch
-        for module in self.objective.modules.values():
-            module.train()
-        for optimizer in self.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = self.schedule.rate
-        unchecked: list[tuple[int, Tensor, dict[str, Tensor]]] = []
-        sums: dict[str, float] = {}
-        batches = 0
-        for batch in self.loader:
-            unchecked.append((batches, batch.row, self._step(batch)))
-            batches += 1
-            if len(unchecked) == CHECK_EVERY:
-                self._check_losses(unchecked, sums)
-            display.step()
-        self._check_losses(unchecked, sums)
-        return {name: value / batches for name, value in sums.items()}
-
-    def _step(self, batch: FringeDepth) -> dict[str, Tensor]:
+    def step(self, batch: Any) -> dict[str, Tensor]:
+        """Update every module by one batch; what the objective logs."""
         logged: dict[str, Tensor] = {}
         with self.accelerator.autocast():
-            steps = self.objective.steps(batch)
-            for name, loss, values in steps:
+            for name, loss, values in self.objective.steps(batch):
                 optimizer = self.optimizers[name]
                 optimizer.zero_grad(set_to_none=True)
                 self.accelerator.backward(loss)
+                if self.largest_gradient is not None:
+                    parameters = self.objective.modules[name].parameters()
+                    self.accelerator.clip_grad_norm_(parameters, self.largest_gradient)
                 optimizer.step()
                 logged |= values
         return logged
 
-    def _check_losses(self, unchecked: list[tuple[int, Tensor, dict[str, Tensor]]], sums: dict[str, float]) -> None:
-        """Add the losses of the last steps to ``sums``; raise for a loss that is not finite or has diverged."""
-        for number, rows, logged in unchecked:
-            for name, value in logged.items():
-                loss_value = float(value)
-                if name == "loss" and self.first_loss is None and math.isfinite(loss_value):
-                    self.first_loss = max(loss_value, 1e-6)
-                limit = DIVERGED * (self.first_loss or math.inf)
-                if not math.isfinite(loss_value) or (name == "loss" and loss_value > limit):
-                    fault = "is not finite" if not math.isfinite(loss_value) else f"is {DIVERGED:g} times the first one"
-                    samples = sorted({self.training.samples[row] for row in rows.tolist()})
-                    raise TrainingError(
-                        f"{self.out}: training diverged: {name} {fault} ({loss_value:.4g}) in epoch {self.epoch + 1}, "
-                        f"batch {number + 1}, samples {', '.join(samples)}. The last good state is kept "
-                        f"({self.epoch} epochs); lower the learning rate, or look at those samples (fpp-bench show)"
-                    )
-                sums[name] = sums.get(name, 0.0) + loss_value
-        unchecked.clear()
-
-    def _finish_epoch(self, losses: dict[str, float], epoch_started: float) -> None:
-        """Validate, set the rate of the next epoch, keep the best weights, save everything."""
-        network = self.bare["network"]
-        scores = validate(network, self.objective, self.validation, self.recipe, self.accelerator, self.out)
-        self._check_validation(scores["validation_loss"])
-        rate = self.schedule.rate
-        loss = losses.pop("loss")
-        record = {
-            "epoch": self.epoch + 1, "learning_rate": rate, "training_loss": loss, **scores, **losses,
-            "seconds": round(perf_counter() - epoch_started, 3),
-        }  # fmt: skip
-        improved = not self.history or record["validation_loss"] < self.best["validation_loss"]
-        self.history.append(record)
-        self.schedule.step(record["validation_loss"])
-        if self.accelerator.is_main_process:
-            if improved:
-                self._keep_weights(record)
-            self._save()
-            history.write_log(self.out, self.history)
-        self.accelerator.wait_for_everyone()
-
-    def _check_validation(self, loss: float | None) -> None:
-        limit = DIVERGED * (self.first_loss or math.inf)
-        if loss is None or not math.isfinite(loss) or loss > limit:
+    def resume(self) -> None:
+        """Continue from the checkpoint, where there is one. Call it when all modules and optimisers are made."""
+        path = self.out / CHECKPOINT
+        if path.exists():
+            tensors, state = read_checkpoint(path)
+            if any(state.get(key) != value for key, value in self.identity.items()):
+                raise TrainingError(f"{path}: belongs to another recipe or dataset; give a new folder")
+            for name, module in self.bare.items():
+                prefix = f"module.{name}."
+                module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+            for name, optimizer in self.optimizers.items():
+                restore_optimizer(optimizer, tensors, f"optimizer.{name}")
+            self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
+            self.resumed_at = len(self.history)
+            self.restore(state)
+        if len(set(gather_object([len(self.history)]))) > 1:
             raise TrainingError(
-                f"{self.out}: training diverged: the validation loss after epoch {self.epoch + 1} is {loss}. The last "
-                f"good state is kept ({self.epoch} epochs); lower the learning rate"
+                f"{self.out}: processes found different checkpoints; give a folder that all machines share"
             )
 
-    def _keep_weights(self, record: history.Record) -> None:
-        network = self.bare["network"]
-        scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
-        config = model_config(self.recipe, network, self.training.source.fingerprint, record["epoch"], scores)
-        save_weights(self.out / WEIGHTS, network, config)
+    def _show(self, display: Display) -> None:
+        if self.history:
+            display.update(self.steps_done, self.progress())
+
+    def _agreed(self, next_interval: bool) -> bool:
+        """Whether the first process trains on: clocks differ, and all processes must train the same intervals."""
+        return bool(broadcast_object_list([next_interval])[0])
+
+    def _train_interval(self, display: Display) -> dict[str, float]:
+        """One pass over `batches`; the mean over them of everything the objective logs."""
+        batches = self.batches()
+        for module in self.objective.modules.values():
+            module.train()
+        unchecked: list[tuple[int, Any, dict[str, Tensor]]] = []
+        sums: dict[str, float] = {}
+        count = 0
+        for batch in batches:
+            for optimizer in self.optimizers.values():
+                for group in optimizer.param_groups:
+                    group["lr"] = self.rate(count)
+            unchecked.append((count, self.label(batch), self.step(batch)))
+            count += 1
+            if len(unchecked) == CHECK_EVERY:
+                self._check_losses(unchecked, sums)
+            display.advance()
+        self._check_losses(unchecked, sums)
+        return {name: value / count for name, value in sums.items()}
+
+    def _check_losses(self, unchecked: list[tuple[int, Any, dict[str, Tensor]]], sums: dict[str, float]) -> None:
+        """Add the losses of the last steps to ``sums``; raise for a loss that is not finite or has diverged."""
+        for number, label, logged in unchecked:
+            for name, value in logged.items():
+                loss = float(value)
+                if name == "loss" and self.first_loss is None and math.isfinite(loss):
+                    self.first_loss = max(loss, 1e-6)
+                if not math.isfinite(loss) or (name == "loss" and loss > self.limit):
+                    raise TrainingError(f"{self.out}: {self.diverged(name, loss, number, label)}")
+                sums[name] = sums.get(name, 0.0) + loss
+        unchecked.clear()
+
+    @property
+    def limit(self) -> float:
+        """Loss above which the training has diverged."""
+        return DIVERGED * (self.first_loss or math.inf)
+
+    def _finish_interval(self, losses: dict[str, float], began: float) -> None:
+        """Validate and save everything."""
+        record = self.validated(losses, began)
+        self.history.append(record)
+        self.recorded(record)
+        if self.accelerator.is_main_process:
+            self._save()
+            write_log(self.out, self.history)
+        self.accelerator.wait_for_everyone()
 
     def _save(self) -> None:
         tensors: dict[str, Tensor] = {}
-        for name, bare in self.bare.items():
-            tensors |= {f"module.{name}.{key}": value for key, value in bare.state_dict().items()}
-            tensors |= optimizer_tensors(self.optimizers[name], f"optimizer.{name}")
+        for name, module in self.bare.items():
+            tensors |= {f"module.{name}.{key}": value for key, value in module.state_dict().items()}
+        for name, optimizer in self.optimizers.items():
+            tensors |= optimizer_tensors(optimizer, f"optimizer.{name}")
         seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
-        state: dict[str, Any] = {
-            "recipe": self.recipe.digest, "fingerprint": self.training.source.fingerprint, "history": self.history,
-            "schedule": self.schedule.state(), "first_loss": self.first_loss, "seconds": seconds,
-        }  # fmt: skip
-        save_checkpoint(self.out / CHECKPOINT, tensors, state)
-
-    resumed_at = 0
-
-    def _resume(self) -> None:
-        tensors, state = read_checkpoint(self.out / CHECKPOINT)
-        if (state["recipe"], state["fingerprint"]) != (self.recipe.digest, self.training.source.fingerprint):
-            raise TrainingError(f"{self.out / CHECKPOINT}: belongs to another recipe or dataset; give a new folder")
-        for name, bare in self.bare.items():
-            prefix = f"module.{name}."
-            bare.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
-            restore_optimizer(self.optimizers[name], tensors, f"optimizer.{name}")
-        self.schedule.restore(state["schedule"])
-        self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
-        self.resumed_at = len(self.history)
+        state = {"history": self.history, "first_loss": self.first_loss, "seconds": seconds}
+        save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
 
 
-def _fits(started: float, last_epoch_s: float, minutes: float | None) -> bool:
-    """Whether another epoch like the last one ends in time."""
-    return minutes is None or perf_counter() - started + last_epoch_s < 60 * minutes
+def _fits(started: float, last_interval_s: float, minutes: float | None) -> bool:
+    """Whether another interval like the last one ends in time."""
+    return minutes is None or perf_counter() - started + last_interval_s < 60 * minutes
 
 
-def _claim(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
-    """Make ``out`` this recipe's folder, or see that it is. One process of a machine first, then the others."""
-    with PartialState().local_main_process_first():
-        _claim_or_check(out, recipe, data)
-
-
-def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None:
+def claim_folder(out: Path, content: dict[str, Any]) -> None:
+    """Make ``out`` the folder of the training that ``content`` (``recipe``, and what identifies its data) describes,
+    or see that it is. Raises `TrainingError` for a folder of another training or of other files."""
     path = out / RECIPE
-    own_recipe = recipe.to_dict()
-    content = {"recipe": own_recipe, "fingerprint": data.source.fingerprint}
     try:
         out.mkdir(parents=True, exist_ok=True)
         existing = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
@@ -308,23 +271,33 @@ def _claim_or_check(out: Path, recipe: Recipe, data: FringeDepthDataset) -> None
         write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
     elif existing != content:
         existing_recipe = existing.get("recipe", {}) if isinstance(existing, dict) else {}
-        differs = [key for key, value in own_recipe.items() if existing_recipe.get(key) != value] or ["dataset"]
+        differs = [key for key, value in content["recipe"].items() if existing_recipe.get(key) != value] or ["dataset"]
         raise TrainingError(
             f"{path}: was made for another training, which differs in {', '.join(differs)}; give another folder, or "
             f"remove {out} to train again from the start"
         )
 
 
-def _finished(out: Path) -> TrainingRun | None:
-    path = out / DONE
-    if not path.exists() or not (out / WEIGHTS).exists():
-        return None
+@contextmanager
+def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
+    """Within: deterministic kernels on the CPU, the fastest ones on a GPU, and freed memory kept for the next step.
+    ``cpu``: the training within is one on the processor, whatever GPUs there are."""
+    # A process may train in fp32 after bf16, or on a GPU after the processor, but accelerate's shared state allows only
+    # one precision and device.
+    AcceleratorState._reset_state(cpu)
+    keep_freed_memory(_LARGEST_INT)
+    on_gpu = torch.cuda.is_available()
+    before = torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.benchmark
+    torch.use_deterministic_algorithms(not on_gpu)
+    torch.backends.cudnn.benchmark = on_gpu
+    tf32 = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    if precision == "fp32":
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise TrainingError(f"{path}: is damaged; delete it, and the training resumes from its checkpoint") from None
-
-
-def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
-    return TrainingRun(out / WEIGHTS, epochs, best, seconds, finished, out / history.LOG_FILE, out / history.CURVE_FILE)
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0])
+        torch.backends.cudnn.benchmark = before[1]
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = tf32
+        if cpu:
+            AcceleratorState._reset_state(True)

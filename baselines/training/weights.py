@@ -1,8 +1,9 @@
 """Trained weights on disk: one safetensors file with the tensors and the configuration of their network.
 
-The file's metadata is ``format`` (``fpp-ml-bench``), ``version`` and ``config``, a `ModelConfig` as JSON. Tensors whose
-name starts with ``range_head.`` belong to the range heads (`networks.metric_twin`), the others are the
-network's ``state_dict``. Pickles (``.pt``, ``.pth``) are never opened: opening a pickle can run code.
+The file's metadata is ``format`` (that of a `Family`: no reader takes a network of another kind for its own),
+``version`` and ``config``, a `ModelConfig` or `NetConfig` as JSON. Tensors of a depth network's file whose name starts
+with ``range_head.`` belong to the range heads (`RangeHeads`), all others are the network's ``state_dict``. Pickles
+(``.pt``, ``.pth``) are never opened: opening a pickle can run code.
 
 The same tensors and configuration give the same bytes.
 """
@@ -10,6 +11,7 @@ The same tensors and configuration give the same bytes.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,29 +19,42 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from fpp_ml_bench.baselines.training.provenance_of_data import TrainingBenchmark
+from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.evaluation.schema import Count, Scalar, Text, problems_of
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.loaders.storage import Manifest, benchmark_of, intended_benchmark
 from fpp_ml_bench.optics import CONFIGS
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor, nn
 
 SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the weights that come with the package, ``{name}.safetensors``."""
 SUFFIX = ".safetensors"
-FORMAT = "fpp-ml-bench"
 VERSION = "1"
 HEAD_PREFIX = "range_head."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
+Fingerprint = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@checked_dataclass(frozen=True, config=_STRICT)
+class TrainingBenchmark:
+    """``name`` and ``version`` of the benchmark (`loaders.storage.benchmark`) that a network was trained on."""
+
+    name: Text
+    version: Count
+
+    @property
+    def title(self) -> str:
+        return f"{self.name} version {self.version}"
+
+
+@checked_dataclass(frozen=True, config=_STRICT)
 class ModelConfig:
     """What a trained network is, and what it was trained on.
 
@@ -59,7 +74,7 @@ class ModelConfig:
     options: dict[Text, Any]
     normalisation: Normalisation
     image_size: tuple[Pixels, Pixels]
-    dataset_fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    dataset_fingerprint: Fingerprint
     benchmark: TrainingBenchmark | None = None
     data_config: Text = "single_shot"
     background_removed: bool = False
@@ -72,7 +87,46 @@ class ModelConfig:
             raise ValueError(f"unknown data_config {self.data_config!r}; there are {', '.join(CONFIGS)}")
 
 
-_CONFIG: TypeAdapter[ModelConfig] = TypeAdapter(ModelConfig)
+@checked_dataclass(frozen=True, config=_STRICT)
+class NetConfig:
+    """What a phase network is, how its answers are used, and what it was trained on.
+
+    ``options``: arguments of `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added
+    to the logit of the base order, both chosen on the validation split; ``period_px``: image px per fringe period of
+    the training images, by direction; ``steps`` trained; the others as in `ModelConfig`."""
+
+    name: Text
+    title: Text
+    options: dict[Text, Any]
+    threshold: Finite
+    period_px: dict[Text, Finite]
+    dataset_fingerprint: Fingerprint
+    benchmark: TrainingBenchmark | None = None
+    lead: Finite = 0.0
+    steps: Count = 0
+    recipe: dict[Text, Any] = field(default_factory=dict)
+    validation: dict[Text, Scalar] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Family:
+    """A kind of networks: ``format`` and configuration of their files, and words on other files."""
+
+    format: str
+    config: TypeAdapter[Any]
+    kind: str
+    file: str
+    cure: str
+
+
+DEPTH_NETWORKS = Family(
+    "fpp-ml-bench", TypeAdapter(ModelConfig), "a weights file", f"{SUFFIX} file",
+    "a safetensors file of something else holds no configuration to rebuild the network from",
+)  # fmt: skip
+PHASE_NETWORKS = Family(
+    "fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net weights", "phase-net weights",
+    "give a file that fpp-bench train phase-net wrote",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -94,58 +148,33 @@ def save_weights(
     Raises `WeightsError` for tensors that are not finite, that do not fit the network that ``config`` builds, and for
     a path that can't be written.
     """
-    from safetensors.torch import save
-
     path = Path(path)
     if path.suffix != SUFFIX:
         raise WeightsError(f"{_shown(path)}: expected a name that ends in {SUFFIX}; weights are saved as nothing else")
-    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in network.state_dict().items()}
+    tensors = network.state_dict()
     clash = next((name for name in tensors if name.startswith(HEAD_PREFIX)), None)
     if clash is not None:
         raise WeightsError(f"{_shown(path)}: the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
     _check_tensors(path, config, tensors)
-    head_tensors = {
-        HEAD_PREFIX + name: tensor.detach().cpu().contiguous().clone() for name, tensor in (heads or {}).items()
-    }
+    head_tensors = {HEAD_PREFIX + name: tensor for name, tensor in (heads or {}).items()}
     _check_finite(path, head_tensors)
-    metadata = {"format": FORMAT, "version": VERSION, "config": _CONFIG.dump_json(config).decode("utf-8")}
-    from fpp_ml_bench.files import write_atomically
-
-    try:
-        write_atomically(path, _ordered_header(save({**tensors, **head_tensors}, metadata)))
-    except OSError as error:
-        raise WeightsError(f"{_shown(path)} can't be written: {error.strerror}; give a folder that exists") from None
-
-
-def read_weights(path: str | Path) -> "tuple[ModelConfig, dict[str, Tensor]]":
-    """Configuration and network tensors of a file, ready for ``load_state_dict``. Raises `WeightsError`."""
-    weights = open_weights(path)
-    return weights.config, weights.tensors
+    write_file(path, DEPTH_NETWORKS, config, {**tensors, **head_tensors})
 
 
 def open_weights(path: str | Path) -> WeightsFile:
-    """Everything in a weights file, checked.
+    """Everything in the weights file of a depth network, checked.
 
     Raises `WeightsError`, naming file, expectation and finding, for a file that is absent, damaged, a pickle or
     foreign, of another version, with unknown or missing keys in its configuration, with tensors that are not finite or
     that do not fit the network that its configuration builds.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     path = Path(path)
-    data = _read(path)
-    metadata = _metadata(path, data)
-    try:
-        tensors = load(data)
-    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
-    config = _config(path, metadata)
+    config, tensors, digest = read_file(path, DEPTH_NETWORKS)
     head_tensors = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
     _check_tensors(path, config, tensors)
     _check_finite(path, head_tensors)
     heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in head_tensors.items()}
-    return WeightsFile(path, config, tensors, heads, sha256(data).hexdigest())
+    return WeightsFile(path, config, tensors, heads, digest)
 
 
 def shipped_names(folder: Path | None = None) -> list[str]:
@@ -163,8 +192,6 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
         return (folder or SHIPPED) / f"{text}{SUFFIX}"
     if Path(text).exists():
         return Path(text)
-    from difflib import get_close_matches
-
     closest = get_close_matches(text, names, n=1)
     hint = f"did you mean {closest[0]!r}?" if closest else f"there are {', '.join(names) or 'none'};"
     raise WeightsError(
@@ -172,18 +199,86 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
     )
 
 
-def _read(path: Path) -> bytes:
+def training_benchmark(fingerprint: str) -> TrainingBenchmark | None:
+    """The named benchmark with this fingerprint, for the weights file; None for any other dataset."""
+    benchmark = benchmark_of(fingerprint)
+    return None if benchmark is None else TrainingBenchmark(benchmark.name, benchmark.version)
+
+
+def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest) -> str | None:
+    """A sentence where weights are used on another version of the benchmark that they were trained on, or where nothing
+    is known about their training data; else None.
+
+    Only a named benchmark, or a dataset built with its settings, has scores that others compare with theirs. On
+    imported data or a dataset with settings of its own, and on another benchmark, nothing is said: the user chose it.
+    """
+    fingerprint = manifest.fingerprint
+    used_on = benchmark_of(fingerprint) or intended_benchmark(manifest)
+    if used_on is None or config.dataset_fingerprint == fingerprint:
+        return None
+    trained_on = training_benchmark(config.dataset_fingerprint) or config.benchmark
+    if trained_on is not None and trained_on.name != used_on.name:
+        return None
+    training_data = (
+        f"dataset {config.dataset_fingerprint[:8]}, which is no benchmark of this version"
+        if trained_on is None
+        else trained_on.title
+    )
+    dataset = (
+        used_on.title
+        if used_on.fingerprint == fingerprint
+        else f"dataset {fingerprint[:8]}, which has the settings of {used_on.title} but other bytes"
+    )
+    return f"trained on {training_data}; predicting on {dataset}"
+
+
+def write_file(path: Path, family: Family, config: ModelConfig | NetConfig, tensors: "Mapping[str, Tensor]") -> str:
+    """Write ``tensors`` and ``config``, complete or not at all; the file's SHA-256. `WeightsError` where it can't."""
+    from safetensors.torch import save
+
+    plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    text = family.config.dump_json(config).decode("utf-8")
+    data = _ordered_header(save(plain, {"format": family.format, "version": VERSION, "config": text}))
+    try:
+        write_atomically(path, data)
+    except OSError as error:
+        raise WeightsError(f"{_shown(path)} can't be written: {error.strerror}; give a folder that exists") from None
+    return sha256(data).hexdigest()
+
+
+def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]":
+    """The checked configuration, the tensors as they are, and the SHA-256 of a file of ``family``.
+
+    Raises `WeightsError`, naming file, expectation, finding and cure, for a file that is absent, damaged, a pickle or
+    of another kind or version, or has unknown or missing keys in its configuration.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "nothing"
-        raise WeightsError(f"{_shown(path)}: expected a weights file (*{SUFFIX}), found {actual} there")
+        raise WeightsError(f"{_shown(path)}: expected {family.kind} (*{SUFFIX}), found {actual} there")
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise WeightsError(f"{_shown(path)} can't be read: {error.strerror}") from None
+    metadata = _metadata(path, data, family)
+    try:
+        tensors = load(data)
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
+    try:
+        config = family.config.validate_json(metadata.get("config", ""))
+    except ValidationError as error:
+        lines = "\n  ".join(problems_of(error))
+        raise WeightsError(
+            f"{_shown(path)}: its configuration is not valid; train or save it again:\n  {lines}"
+        ) from None
+    return config, tensors, sha256(data).hexdigest()
 
 
-def _metadata(path: Path, data: bytes) -> dict[str, Any]:
-    """The header's ``__metadata__``; refuses what is no safetensors file of ours before anything is unpacked."""
+def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
+    """The header's ``__metadata__``; refuses what is no file of ``family`` before anything is unpacked."""
     if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
         raise WeightsError(
             f"{_shown(path)}: expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a "
@@ -194,18 +289,17 @@ def _metadata(path: Path, data: bytes) -> dict[str, Any]:
         length = int.from_bytes(data[:8], "little")
         if len(data) < 8 or length > len(data) - 8:
             raise ValueError(f"{len(data)} bytes, cut off or no {SUFFIX} at all")
-        header = json.loads(data[8 : 8 + length].decode("utf-8"))
-        metadata = header.get("__metadata__", {})
+        metadata = json.loads(data[8 : 8 + length].decode("utf-8")).get("__metadata__", {})
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is no mapping")
     except (ValueError, AttributeError, RecursionError) as error:
         raise WeightsError(
-            f"{_shown(path)}: damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
+            f"{_shown(path)}: damaged or no {family.file} ({printable(str(error), 200)}); copy or train it again"
         ) from None
-    if metadata.get("format") != FORMAT:
+    if metadata.get("format") != family.format:
         raise WeightsError(
-            f"{_shown(path)}: expected weights of {FORMAT}, got format {printable(str(metadata.get('format')), 60)!r}: "
-            "a safetensors file of something else holds no configuration to rebuild the network from"
+            f"{_shown(path)}: expected weights of {family.format}, got format "
+            f"{printable(str(metadata.get('format')), 60)!r}: {family.cure}"
         )
     if metadata.get("version") != VERSION:
         raise WeightsError(
@@ -215,49 +309,37 @@ def _metadata(path: Path, data: bytes) -> dict[str, Any]:
     return metadata
 
 
-def _config(path: Path, metadata: dict[str, Any]) -> ModelConfig:
-    try:
-        return _CONFIG.validate_json(metadata.get("config", ""))
-    except ValidationError as error:
-        lines = "\n  ".join(problems_of(error))
-        raise WeightsError(
-            f"{_shown(path)}: its configuration is not valid; train or save it again:\n  {lines}"
-        ) from None
-
-
 def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tensor]") -> None:
     """Refuse tensors that are not exactly those of the network that ``config`` builds, or that are not finite."""
     import torch
 
-    from fpp_ml_bench.baselines.networks import build
-
     try:
         with torch.device("meta"):
-            network = build(config.network, **config.options)
+            network = networks.build(config.network, **config.options)
         network.check_size(*config.image_size)
         expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
         raise WeightsError(
             f"{_shown(path)}: its configuration makes no network: {printable(str(error), 300)}"
         ) from None
-    built = f"{config.network} with {_options(config)}"
+    options = ", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults"
+    built = f"{config.network} with {printable(options, 200)}"
     for name in tensors:
         if name not in expected:
             raise WeightsError(f"{_shown(path)}: tensor {printable(name, 100)} is none of {built}")
-    for name in expected:
+    for name, tensor in expected.items():
         if name not in tensors:
             raise WeightsError(f"{_shown(path)}: tensor {name} is missing, which {built} has; train or copy it again")
-        expected_form, actual_form = (
-            f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (expected[name], tensors[name])
-        )
-        if expected_form != actual_form:
-            raise WeightsError(
-                f"{_shown(path)}: tensor {name}: expected {expected_form} for {built}, got {actual_form}"
-            )
+        if (actual := _form(tensors[name])) != _form(tensor):
+            raise WeightsError(f"{_shown(path)}: tensor {name}: expected {_form(tensor)} for {built}, got {actual}")
     _check_finite(path, tensors)
 
 
-def _check_finite(path: Path, tensors: "Mapping[str, torch.Tensor]") -> None:
+def _form(tensor: "Tensor") -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+
+
+def _check_finite(path: Path, tensors: "Mapping[str, Tensor]") -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise WeightsError(
@@ -274,10 +356,6 @@ def _ordered_header(data: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
     text += b" " * (-len(text) % 8)  # tensors start aligned
     return len(text).to_bytes(8, "little") + text + data[8 + length :]
-
-
-def _options(config: ModelConfig) -> str:
-    return printable(", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults", 200)
 
 
 def _shown(path: Path) -> str:

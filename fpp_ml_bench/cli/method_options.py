@@ -5,10 +5,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fpp_ml_bench.baselines.training import PRESETS, TABLES
+from fpp_ml_bench import baselines, decoding
+from fpp_ml_bench.baselines import networks, training
+from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
+from fpp_ml_bench.loaders import render
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.method import Method
     from fpp_ml_bench.loaders.storage import DatasetFolder
 
 METHOD_HELP = (
@@ -84,30 +86,25 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
-def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
+def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
     """The method that ``args`` name, for the rig of ``opened``.
 
     Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
     FppBenchError for an unknown method, and for an option that belongs to another one.
     """
     method = _method(args, opened)
-    config = getattr(method, "weights_config", None)
+    config = method.weights_config
     if config is not None:
-        from fpp_ml_bench.baselines.training import training_data_warning
-
-        warning = training_data_warning(config, opened.manifest)
+        warning = training.training_data_warning(config, opened.manifest)
         if warning is not None:
             print(f"warning: {config.name} was {warning}", file=sys.stderr)
     return method
 
 
-def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
-    from fpp_ml_bench.baselines.method import METHODS, method
-    from fpp_ml_bench.errors import PredictionError
-
+def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
-    kind = args.method if args.method in METHODS else "network"
+    kind = args.method if args.method in baselines.METHODS else "network"
     weights = _weights(args.method, opened.size[1]) if kind == "network" else None
     for owner, options in _OPTIONS.items():
         foreign = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
@@ -117,17 +114,15 @@ def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
             )
     if weights is not None:
         return _network(weights, args, opened)
-    return method(kind, opened.rig, **_MAKERS[kind](args, opened))
+    return baselines.load_method(kind, opened.rig, **_MAKERS[kind](args, opened))
 
 
 def weights_of_recipe(recipe: str, size: int) -> Path:
     """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
     wide. Raises FppBenchError where there are none."""
     from fpp_ml_bench.baselines.reproduce import RUNS, Folders, current_weights
-    from fpp_ml_bench.baselines.training import load_recipe
-    from fpp_ml_bench.errors import RecipeError
 
-    resolved = [load_recipe(recipe, preset) for preset in PRESETS]
+    resolved = [training.load_recipe(recipe, preset) for preset in training.PRESETS]
     searched = []
     for candidate in resolved:
         below = RUNS / candidate.preset
@@ -143,35 +138,21 @@ def weights_of_recipe(recipe: str, size: int) -> Path:
 
 def _weights(name: str, size: int) -> Path:
     """The weights file that METHOD means, where it is no method of its own."""
-    from fpp_ml_bench.baselines.method import METHODS
-    from fpp_ml_bench.baselines.training import SUFFIX, shipped_names, weights_path
-    from fpp_ml_bench.errors import PredictionError, WeightsError
-
-    row_of_a_table = name.split("/")[0] in TABLES and not name.endswith(SUFFIX)
+    row_of_a_table = name.split("/")[0] in training.TABLES and not name.endswith(training.SUFFIX)
     if name.endswith(_RECIPE_SUFFIXES) or row_of_a_table:
         return weights_of_recipe(name, size)
-    try:
-        return weights_path(name)
-    except WeightsError:
-        methods = ", ".join((*METHODS, *shipped_names()))
-        raise PredictionError(
-            f"unknown method {name!r}; there are {methods}, and every .safetensors file of trained weights"
-        ) from None
+    return baselines.known_weights(name)
 
 
-def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
-    from fpp_ml_bench.baselines.networks.model import load
-    from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-    from fpp_ml_bench.errors import WeightsError
-
-    model = load(path, args.device)
+def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
+    model = networks.load(path, args.device)
     if model.config.image_size != opened.size:
         raise WeightsError(
             f"{path}: was trained at {_size(model.config.image_size)} px (H x W), {opened.path} has images of "
             f"{_size(opened.size)} px: the fringe period in px depends on the size, so a network works at one size "
             "only; use weights trained at that size, or a dataset built at the weights' size"
         )
-    return NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
+    return networks.NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
 
 
 def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
@@ -184,18 +165,14 @@ def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, A
 
 def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
     """Steps for ``--depth-noise``, by the noise that the dataset was built with."""
-    from fpp_ml_bench.decoding import fewest_steps
-    from fpp_ml_bench.errors import PredictionError
-    from fpp_ml_bench.loaders.render import modulation_at
-
     depth_noise_mm = args.depth_noise
     noise_grey = opened.manifest.settings.get("noise_sigma_grey")
     if args.steps is not None or not (depth_noise_mm > 0 and depth_noise_mm < float("inf")):
         raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
     if noise_grey is None:
         raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
-    modulation = modulation_at(opened.rig, opened.rig.working_range_mm[1])
-    steps = fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
+    modulation = render.modulation_at(opened.rig, opened.rig.working_range_mm[1])
+    steps = decoding.fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
     if steps is None:
         raise PredictionError(
             f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {opened.sequence.steps} steps that "
@@ -205,8 +182,6 @@ def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
 
 
 def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
-    from fpp_ml_bench.errors import PredictionError
-
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
     options: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}

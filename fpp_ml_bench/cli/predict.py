@@ -2,14 +2,12 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from fpp_ml_bench import baselines
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.method import Method
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import limit_threads
 
 SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
 EXAMPLES = (
@@ -34,39 +32,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.machine import limit_threads
-
     limit_threads(args.threads)
     with as_asked(args):
         return _run(args)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.baselines.run import predict_split
     from fpp_ml_bench.cli.console import progress_bar
-    from fpp_ml_bench.loaders.storage import DatasetFolder
 
-    opened = DatasetFolder(args.dataset)
+    opened = storage.DatasetFolder(args.dataset)
     method = chosen_method(args, opened)
     samples = len(opened.samples(args.split))
     with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
-        finished = predict_split(opened, method, args.split, args.out, advance)
+        finished = baselines.predict_split(opened, method, args.split, args.out, advance)
     print(
         f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
         f"{finished.seconds_per_sample:.3f} s a sample (median)"
     )
     how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
     print(f"next: fpp-eval {args.out} {how} --json result.json")
-    from fpp_ml_bench.baselines.run import explain_predict
-
-    explain(args, lambda: explain_predict(opened, method, args.split))
+    explain(args, lambda: baselines.explain_predict(opened, method, args.split))
     return 0
 
 
-def _scoring(method: "Method", opened: "DatasetFolder") -> str:
+def _scoring(method: "baselines.Method", opened: "storage.DatasetFolder") -> str:
     """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
     from, but against that depth the process that made it would score 0."""
-    mode, target = getattr(method, "mode", "standard"), getattr(method, "target", "depth_exact")
-    if target == "depth_exact" and not opened.has_exact:
-        target = "depth"
-    return (f" --mode {mode}" if mode != "standard" else "") + (f" --target {target}" if target != "depth" else "")
+    target = method.target if opened.has_exact else "depth"
+    mode = "" if method.mode == "standard" else f" --mode {method.mode}"
+    return mode + ("" if target == "depth" else f" --target {target}")

@@ -1,15 +1,20 @@
 """``fpp-bench time``: what a method costs in milliseconds, memory, parameters and captures."""
 
 import argparse
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options
+from fpp_ml_bench import baselines
+from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import limit_threads
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from fpp_ml_bench.evaluation.result import Timing
 
 SUMMARY = "Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."
 EXAMPLES = (
@@ -43,39 +48,30 @@ def _count(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Time the method, write the timing files, print the figures. Raises FppBenchError, before timing, for a file that
     can't be written into."""
-    import json
-
-    from fpp_ml_bench.machine import limit_threads
+    from fpp_ml_bench.cli.console import progress_bar, show
 
     limit_threads(args.threads)
-    from fpp_ml_bench.baselines.timing import check_target, time_method, write_timing
-    from fpp_ml_bench.cli.console import progress_bar, show
-    from fpp_ml_bench.cli.method_options import chosen_method
-    from fpp_ml_bench.errors import SubmissionError
-    from fpp_ml_bench.files import write_atomically
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-
-    opened = DatasetFolder(args.dataset)
+    opened = storage.DatasetFolder(args.dataset)
     method = chosen_method(args, opened)
     for path in args.into:
-        check_target(path, method)
+        baselines.check_target(path, method)
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise SubmissionError(f"--json {args.json}: the folder {args.json.parent} does not exist; make it first")
     with progress_bar(f"timing {args.method}", args.repeats, "images") as advance:
-        timing = time_method(opened, method, args.split, args.batch, args.repeats, advance)
+        timing = baselines.time_method(opened, method, args.split, args.batch, args.repeats, advance)
     if args.json is not None:
         content = {"name": method.title, "method": method.name, "settings": dict(method.settings)}
         text = json.dumps({**content, "timing": timing.model_dump(mode="json")}, indent=1, allow_nan=False)
         write_atomically(args.json, (text + "\n").encode("utf-8"))
     for path in args.into:
-        write_timing(path, timing)
+        baselines.write_timing(path, timing)
     show(_table(method.title, timing))
     for path in (*([args.json] if args.json else []), *args.into):
         print(f"Written: {path}")
     return 0
 
 
-def _table(title: str, timing: "Timing") -> "Table":
+def _table(title: str, timing: "result.Timing") -> "Table":
     from rich.table import Table
     from rich.text import Text
 

@@ -3,7 +3,9 @@
 import argparse
 from pathlib import Path
 
-from fpp_ml_bench.baselines.training import PRESETS
+from fpp_ml_bench.baselines import networks, phase_network, training
+from fpp_ml_bench.cli import CHECK_FAILED
+from fpp_ml_bench.errors import RecipeError
 
 SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
 EXAMPLES = (
@@ -15,6 +17,7 @@ EXAMPLES = (
 )
 MODEL = "model.safetensors"
 PHASE_NET = "phase-net"
+_OF_PHASE_NET = ("extra", "start", "steps", "unions", "rate")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume"
     )
     parser.add_argument(
-        "--preset", choices=PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
+        "--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
     )
     parser.add_argument(
         "--minutes",
@@ -35,10 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="stop before an epoch that would not finish in time, everything saved",
     )
     parser.add_argument(
-        "--extra",
-        type=Path,
-        metavar="DATASET",
-        help="phase-net: another dataset whose training split is added",
+        "--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added"
     )
     parser.add_argument(
         "--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)"
@@ -57,22 +57,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
-    from accelerate import PartialState
-
-    from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
-    from fpp_ml_bench.baselines.training import load_recipe, train
-    from fpp_ml_bench.cli import CHECK_FAILED
-    from fpp_ml_bench.errors import RecipeError
-
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     if args.recipe == PHASE_NET:
         return _phase_net(args)
-    for option in ("extra", "start", "steps", "unions", "rate"):
+    for option in _OF_PHASE_NET:
         if getattr(args, option) is not None:
             raise RecipeError(f"--{option} is an option of phase-net; leave it out")
-    recipe = load_recipe(args.recipe, args.preset)
-    trained = train(recipe, args.dataset, args.out, minutes=args.minutes)
+    from accelerate import PartialState
+
+    recipe = training.load_recipe(args.recipe, args.preset)
+    trained = training.train(recipe, args.dataset, args.out, minutes=args.minutes)
     if not PartialState().is_main_process:
         return 0 if trained.finished else CHECK_FAILED
     if not trained.finished:
@@ -81,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     weights = trained.weights
     if recipe.normalisation == "individual" and not recipe.background_removed:
         weights = args.out / MODEL
-        save_with_heads(trained.weights, args.dataset, weights)
+        networks.save_with_heads(trained.weights, args.dataset, weights)
     print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
     print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
@@ -89,13 +84,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _phase_net(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.baselines.phase_network import Recipe, train_phase_net
-    from fpp_ml_bench.cli import CHECK_FAILED
-    from fpp_ml_bench.cli.console import progress_bar
+    import cv2
 
+    cv2.setNumThreads(1)
     options = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = Recipe(**options)
-    trained = train_phase_net(recipe, args.dataset, args.out, args.minutes, progress_bar, print, args.extra, args.start)
+    recipe = phase_network.Recipe(**options)
+    trained = phase_network.train_phase_net(
+        recipe, args.dataset, args.out, extra=args.extra, start=args.start, minutes=args.minutes, show=True,
+        print_line=print,
+    )  # fmt: skip
     if trained.weights is None:
         steps = f"{trained.steps} of {recipe.steps} steps"
         print(f"{args.out}: stopped after {steps}, all saved; run the same command to resume")

@@ -80,7 +80,7 @@ def _measured(setting: Setting, rules: Rules) -> dict[str, object]:
         "seconds": middle,
         "seconds_p5": low,
         "seconds_p95": high,
-        "parameters": int(getattr(method, "parameters", 0)),
+        "parameters": method.parameters,
         "given": _given(method),
     }
     if scores:
@@ -97,8 +97,8 @@ def _measured(setting: Setting, rules: Rules) -> dict[str, object]:
 
 def _score(method: Method, depth: np.ndarray, views: Views, name: str) -> tuple[float | None, float | None, float]:
     """Object MAE, the MAE over measured object pixels, and the share of object pixels without a depth."""
-    mode: Mode = getattr(method, "mode", "standard")
-    pair = scored_pair(depth, views.target_mm(name), getattr(method, "units", "mm"), mode, name)
+    mode: Mode = method.mode
+    pair = scored_pair(depth, views.target_mm(name), method.units, mode, name)
     sample_scores = score_sample(*pair)
     pixels = sample_scores.object.pixels
     return sample_scores.object.mae_mm, sample_scores.valid.mae_mm, sample_scores.missing / pixels if pixels else 0.0
@@ -111,5 +111,5 @@ def _mean(values: list[float | None]) -> float | None:
 
 def _given(method: Method) -> str | None:
     given = ["depth range"] * method.uses_ground_truth_range
-    given += ["object mask"] * bool(getattr(method, "uses_ground_truth_mask", False))
+    given += ["object mask"] * method.uses_ground_truth_mask
     return " and ".join(given) or None

@@ -13,12 +13,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import METHODS, Method, method
-from fpp_ml_bench.baselines.networks import build
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, parameter_count
-from fpp_ml_bench.baselines.networks.inference import fringe_batch, represent
-from fpp_ml_bench.baselines.networks.model import Model, load
-from fpp_ml_bench.baselines.networks.network_method import DepthRange, NetworkMethod
+from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.networks import (
+    DepthRange,
+    FringeNetwork,
+    Model,
+    NetworkMethod,
+    build,
+    fringe_batch,
+    load,
+    parameter_count,
+    represent,
+)
 from fpp_ml_bench.baselines.training import SHIPPED, SUFFIX, ModelConfig, WeightsFile, open_weights
 from fpp_ml_bench.errors import NetworkError, PredictionError, WeightsError
 from fpp_ml_bench.leaderboard.tradeoff.measure import Setting
@@ -83,7 +89,7 @@ def network_settings(
                 key = f"network-{config.name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
                 yield Setting(key, "networks", title, make, views, note=_note(precision))
     if "phase-net" in METHODS:
-        yield Setting("phase-net", "networks", "phase-net", partial(method, "phase-net", views.rig), views)
+        yield Setting("phase-net", "networks", "phase-net", partial(load_method, "phase-net", views.rig), views)
     for unet_width in widths if widths is not None else QUICK_WIDTHS if quick or height * width > LARGE_PX else WIDTHS:
         for precision in precisions:
             if precision == "bf16" and unet_width > EMULATED_WIDTH and bf16_note():
@@ -137,10 +143,9 @@ def calibration(views: StoredViews, like: Method, count: int = 8) -> NDArray[np.
     return fringe_batch(chosen, opened.size, "the calibration").numpy()
 
 
-class UntrainedMethod:
+class UntrainedMethod(Method):
     """A network with its initial weights, to measure time only: its output is never scored."""
 
-    uses_ground_truth_range = False
     units = "normalised"
 
     def __init__(self, network: FringeNetwork, frame: int = 0) -> None:

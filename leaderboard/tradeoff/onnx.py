@@ -9,7 +9,7 @@ own advice). Needs the optional packages of ``pip install "fpp-ml-bench[onnx]"``
 import importlib.util
 import logging
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.networks.base import FringeNetwork
+from fpp_ml_bench.baselines.networks import FringeNetwork
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.leaderboard.tradeoff.views import Frames
@@ -27,7 +27,7 @@ from fpp_ml_bench.loaders.training import unit_range
 _VNNI_FLAGS = ("avx512_vnni", "avx_vnni", "asimddp")
 
 
-class OnnxMethod:
+class OnnxMethod(Method):
     """The network of the method ``like`` in onnxruntime, with the input and the description of ``like``. ``quantised``:
     in int8, calibrated on ``examples`` float32 (n, 1, H, W).
 
@@ -43,16 +43,11 @@ class OnnxMethod:
         self._like, self.parameters = like, sum(parameter.numel() for parameter in network.parameters())
         self.frames_used = like.frames_used
         self.uses_ground_truth_range = like.uses_ground_truth_range
-        self.uses_ground_truth_mask = getattr(like, "uses_ground_truth_mask", False)
-        self.units = getattr(like, "units", "mm")
-        self.mode = getattr(like, "mode", "standard")
+        self.uses_ground_truth_mask = like.uses_ground_truth_mask
+        self.units, self.mode, self.settings = like.units, like.mode, like.settings
         self.name = like.name
         self.title = f"{like.title}, onnxruntime {'int8' if quantised else 'fp32'}"
         self._session = _session(network, examples, threads, quantised)
-
-    @property
-    def settings(self) -> Mapping[str, str | int | float | bool | None]:
-        return self._like.settings
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in `units`."""
@@ -73,7 +68,7 @@ class OnnxMethod:
 def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int, quantised: bool) -> Any:
     import onnxruntime
 
-    from fpp_ml_bench.baselines.networks.onnx_export import export_onnx
+    from fpp_ml_bench.baselines.networks import export_onnx
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import MIN_MODULATION, DirectionPlan, Limits, plan_direction
 from fpp_ml_bench.errors import DecodeError
@@ -19,8 +20,8 @@ from fpp_ml_bench.leaderboard.tradeoff.views import Frames
 from fpp_ml_bench.optics import Direction, Rig, decode_cells
 
 
-@dataclass(frozen=True)
-class DecodeInType:
+@dataclass
+class DecodeInType(Method):
     """Decoding of one direction with ``steps`` steps in ``dtype`` (``float32`` or ``float64``). A pixel that is too
     dark, has an ambiguous code, or lies outside the working range gets 0.
 
@@ -33,24 +34,13 @@ class DecodeInType:
     dtype: str
 
     name = "classical"
-    units = "mm"
-    uses_ground_truth_range = False
 
     def __post_init__(self) -> None:
         if self.rig.projector.is_distorted:
             raise DecodeError("float32 against float64 is compared for a projector without distortion; this rig's has")
-
-    @property
-    def title(self) -> str:
-        return f"NumPy in {self.dtype}, {self.steps}-step, {self.direction} fringes"
-
-    @property
-    def frames_used(self) -> tuple[int, ...]:
-        return ClassicalMethod(self.rig, self.direction, self.steps).frames_used
-
-    @property
-    def settings(self) -> dict[str, str | int]:
-        return {"direction": self.direction, "steps": self.steps, "dtype": self.dtype}
+        self.title = f"NumPy in {self.dtype}, {self.steps}-step, {self.direction} fringes"
+        self.frames_used = ClassicalMethod(self.rig, self.direction, self.steps).frames_used
+        self.settings = {"direction": self.direction, "steps": self.steps, "dtype": self.dtype}
 
     @cached_property
     def _plan(self) -> DirectionPlan:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from functools import partial
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Method, method
+from fpp_ml_bench.baselines.method import Method, load_method
 from fpp_ml_bench.constants import TEST_OBJECTS
 from fpp_ml_bench.decoding import Directions
 from fpp_ml_bench.errors import FppBenchError
@@ -59,7 +59,7 @@ def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]
 
 
 def _phase(rig: Rig, options: dict[str, object]) -> "partial[Method]":
-    return partial(method, "phase", rig, **options)
+    return partial(load_method, "phase", rig, **options)
 
 
 def precision_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:

@@ -8,7 +8,7 @@ import yaml
 from conftest import TINY_SIZE
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import METHODS, method
+from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
@@ -119,10 +119,12 @@ def test_steps_out_of_bounds(opened, steps):
 
 
 def test_methods_by_name(opened):
-    assert METHODS == ("classical", "phase", "phase-net")
-    assert method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
+    assert tuple(METHODS) == ("classical", "phase", "phase-net")
+    assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
+    network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
+    assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper-individual")
     with pytest.raises(FppBenchError, match="there are classical"):
-        method("magic", opened.rig)
+        load_method("magic", opened.rig)
 
 
 # ---- predictions
@@ -148,8 +150,8 @@ def test_prediction_folder(opened, tmp_path):
 
 
 def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
-    class Spy:
-        name, title, frames_used, uses_ground_truth_range, settings = "spy", "Spy", (0, 20), False, {}
+    class Spy(Method):
+        name, title, frames_used, settings = "spy", "Spy", (0, 20), {}
 
         def predict(self, frames):
             assert [i for i, f in enumerate(frames) if f is not None] == [0, 20] and len(frames) == 52
@@ -171,8 +173,8 @@ def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
     ],
 )
 def test_faulty_methods_are_caught(opened, tmp_path, depth, says):
-    class Faulty:
-        name, title, frames_used, uses_ground_truth_range, settings = "x", "X", (0,), False, {}
+    class Faulty(Method):
+        name, title, frames_used, settings = "x", "X", (0,), {}
 
         def predict(self, frames):
             return depth

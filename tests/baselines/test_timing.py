@@ -9,6 +9,7 @@ import yaml
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines import timing
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.evaluation.result import read_result, write_result
@@ -32,7 +33,7 @@ class Clock:
 
 
 @dataclass
-class Scripted:
+class Scripted(Method):
     """A method whose runs take the seconds it is told, in turn; after those, one second each."""
 
     clock: Clock
@@ -40,7 +41,6 @@ class Scripted:
     stacks: list = field(default_factory=list)
     name = title = "scripted"
     frames_used = (0,)
-    uses_ground_truth_range = False
     settings: dict = field(default_factory=dict)
     parameters = 1234
 
@@ -74,6 +74,8 @@ def test_a_method_that_takes_batches_gets_them_at_once(small, monkeypatch):
     sizes = []
 
     class Batched(Scripted):
+        batched = True
+
         def predict_batch(self, stacks):
             sizes.append(len(stacks))
             clock.now += 50.0 if len(sizes) == 1 else 0.5  # the first batch warms up

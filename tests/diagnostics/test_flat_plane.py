@@ -10,7 +10,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
 from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.stability import U32
 
 
@@ -24,7 +24,7 @@ def answering(dataset, answer, units="mm"):
 @pytest.fixture(scope="module")
 def decoded(opened, tmp_path_factory):
     folder = tmp_path_factory.mktemp("planes")
-    exact = subject_of_method(method("classical", opened.rig, direction="horizontal"), opened)
+    exact = subject_of_method(load_method("classical", opened.rig, direction="horizontal"), opened)
     return FlatPlane().run(exact, opened, ProbeSettings(quick=True), folder, silent), folder
 
 

@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.diagnostics.reliance import (
     sample_score,
 )
 from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import object_interval
 
@@ -93,6 +93,7 @@ class Reader:
     answer: Any
     frames_used: tuple[int, ...] = (0,)
     units: str = "mm"
+    uses_ground_truth_mask: bool = False
 
     def predict(self, frames):
         return np.asarray(self.answer(frames), dtype=np.float32)
@@ -128,7 +129,7 @@ def scene_set(opened):
 
 @pytest.fixture(scope="module")
 def exact(opened):
-    return method("classical", opened.rig)
+    return load_method("classical", opened.rig)
 
 
 @pytest.mark.parametrize("units", ["mm", "normalised"])

@@ -7,8 +7,7 @@ import yaml
 from scored_dataset import make_dataset, write_predictions
 from tiny_network import config_of, rounding_error, tiny_network
 
-from fpp_ml_bench.baselines.networks.inference import fringe_batch
-from fpp_ml_bench.baselines.networks.model import load
+from fpp_ml_bench.baselines.networks.model import fringe_batch, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.baselines.run import captured_frames, predict_split

@@ -140,11 +140,7 @@ def test_transunet_names_the_size_it_was_built_for():
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(
     "fringe",
-    [
-        torch.zeros(1, 2, SIZE, SIZE),
-        torch.zeros(1, SIZE, SIZE),
-        torch.zeros(1, 1, SIZE, SIZE, dtype=torch.uint8),
-    ],
+    [torch.zeros(1, 2, SIZE, SIZE), torch.zeros(1, SIZE, SIZE), torch.zeros(1, 1, SIZE, SIZE, dtype=torch.uint8)],
     ids=["channels", "rank", "integer"],
 )
 def test_input_that_is_no_fringe_image(name, fringe):

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import NETWORKS, build
-from fpp_ml_bench.baselines.networks.blocks import Attention, DoubleConvolution, DropPath, InstanceNorm, Join
+from fpp_ml_bench.baselines.networks.base import Attention, DoubleConvolution, DropPath, InstanceNorm, Join
 
 
 @pytest.fixture(autouse=True)

@@ -10,8 +10,7 @@ from torch import nn
 
 from fpp_ml_bench.baselines.networks import range_heads
 from fpp_ml_bench.baselines.networks.base import FringeNetwork
-from fpp_ml_bench.baselines.networks.metric_twin import heads_from_tensors
-from fpp_ml_bench.baselines.networks.model import Model
+from fpp_ml_bench.baselines.networks.model import Model, heads_from_tensors
 from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.errors import PredictionError, WeightsError
 

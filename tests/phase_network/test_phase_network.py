@@ -7,12 +7,11 @@ import pytest
 import torch
 from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
+from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod, load_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_network.weights import load_net
 from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Settings
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
 from fpp_ml_bench.optics import Rig, paper_rig
@@ -100,7 +99,7 @@ def test_objects_at_unknown_distance_also_on_another_rig(rig: Rig) -> None:
 
 
 def test_method_is_registered_and_reports_itself() -> None:
-    phase_net = method("phase-net", RIG, direction="vertical")
+    phase_net = load_method("phase-net", RIG, direction="vertical")
     assert phase_net.frames_used == (18,) and phase_net.uses_ground_truth_range is False
     assert "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
     assert 100_000 < phase_net.parameters < 1_000_000  # type: ignore[attr-defined]

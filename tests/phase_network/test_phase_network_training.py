@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -10,14 +11,13 @@ import torch
 from flat_planes import plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
+from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.recipe import Recipe
 from fpp_ml_bench.baselines.phase_network.samples import Sample, companions, sample_of, united
-from fpp_ml_bench.baselines.phase_network.training import CHECKPOINT_FILE, train
-from fpp_ml_bench.baselines.phase_network.weights import NetConfig, load_net, save_net
+from fpp_ml_bench.baselines.phase_network.training import PhaseNetTraining, Recipe
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import Settings
-from fpp_ml_bench.baselines.training import SHIPPED
+from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, NetConfig, reproducible
 from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
 from fpp_ml_bench.optics import paper_rig
 
@@ -129,19 +129,24 @@ def test_turning_for_the_network_and_back() -> None:
 
 def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     samples, geometries = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    at_once = train(SMALL, samples, samples[:1], geometries, tmp_path / "a")
-    first = train(SMALL, samples, samples[:1], geometries, tmp_path / "b", minutes=0.0)
-    assert (first.steps, at_once.steps) == (2, 4)
-    second = train(SMALL, samples, samples[:1], geometries, tmp_path / "b")
+
+    def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> PhaseNetTraining:
+        (tmp_path / name).mkdir(exist_ok=True)
+        with reproducible(cpu=True):
+            training = PhaseNetTraining(recipe, samples, samples[:1], geometries, tmp_path / name)
+            training.run(perf_counter(), minutes, show=False)
+        return training
+
+    at_once, first = trained("a"), trained("b", minutes=0.0)
+    assert (first.steps_done, first.over, at_once.steps_done) == (2, False, 4)
+    second = trained("b")
     assert [record["step"] for record in second.history] == [2, 4]
     for name, value in at_once.network.state_dict().items():
         assert torch.equal(value, second.network.state_dict()[name]), name
     assert at_once.history[-1]["loss_phase"] == second.history[-1]["loss_phase"]
     with pytest.raises(TrainingError, match="another recipe"):
-        train(replace(SMALL, seed=1), samples, samples[:1], geometries, tmp_path / "b")
-    assert (tmp_path / "b" / CHECKPOINT_FILE).exists()
+        trained("b", replace(SMALL, seed=1))
+    assert (tmp_path / "b" / CHECKPOINT).exists()
 
 
 def test_recipes_that_train_nothing_are_refused() -> None:
@@ -182,7 +187,7 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
     unet = next(SHIPPED.glob("*.safetensors"))
     for file, message in (
         (tmp_path / "none.safetensors", "found nothing"), (cut, "damaged"), (junk, "cut off|damaged"),
-        (unet, "expected fpp-ml-bench phase-net"), (wider, "not those of its network"),
+        (unet, "expected weights of fpp-ml-bench phase-net"), (wider, "not those of its network"),
     ):  # fmt: skip
         with pytest.raises(WeightsError, match=message):
             load_net(file)

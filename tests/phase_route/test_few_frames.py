@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic import make
 
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import Method, load_method
 from fpp_ml_bench.baselines.phase_route.frame_choice import FewestFrames, levels_of
 from fpp_ml_bench.baselines.phase_route.local_fit import Window
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
@@ -185,27 +185,27 @@ def test_an_empty_scene_needs_one_frame() -> None:
 
 
 def test_methods_say_what_they_need_and_refuse_what_they_cannot() -> None:
-    assert method("phase", RIG, frames=3, direction="vertical").frames_used == (18, 24, 30)
-    few = method("phase", RIG, error_mm=3.0)
+    assert load_method("phase", RIG, frames=3, direction="vertical").frames_used == (18, 24, 30)
+    few = load_method("phase", RIG, error_mm=3.0)
     assert few.frames_used == (*range(18), *range(36, 43)) and "3 mm" in few.title
     assert few.settings["error_mm"] == 3.0 and "frames" not in few.settings
     for wrong in (0, -1.0, float("nan"), float("inf"), True, "3"):
         with pytest.raises(PredictionError, match="error_mm"):
-            method("phase", RIG, error_mm=wrong)
+            load_method("phase", RIG, error_mm=wrong)
     with pytest.raises(PredictionError, match="give one"):
-        method("phase", RIG, error_mm=3.0, frames=2)
+        load_method("phase", RIG, error_mm=3.0, frames=2)
     with pytest.raises(PredictionError, match="frames 19"):
-        method("phase", RIG, frames=19)
+        load_method("phase", RIG, frames=19)
     with pytest.raises(DecodeError, match="frame 6 is missing"):
         made(3).measure([image if i != 6 else None for i, image in enumerate(plane(1.8))])
     with pytest.raises(DecodeError, match="expected 3 fringes"):
         made(3).route.measure(plane(1.8)[0])
 
 
-class Reporting:
+class Reporting(Method):
     """A method that says how many frames each sample took."""
 
-    name, title, frames_used, uses_ground_truth_range = "counting", "Counting", (0,), False
+    name, title, frames_used, reports = "counting", "Counting", (0,), True
     settings: ClassVar = {"error_mm": 3.0}
 
     def predict(self, frames):  # type: ignore[no-untyped-def]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 from fpp_ml_bench.baselines.phase_route.observation import Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
@@ -154,7 +154,7 @@ def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
 
 
 def test_method_is_registered_and_reports_itself() -> None:
-    phase_method = method("phase", RIG, direction="vertical", prior="standoff")
+    phase_method = load_method("phase", RIG, direction="vertical", prior="standoff")
     assert phase_method.frames_used == (18,)
     assert phase_method.uses_ground_truth_range is False
     assert phase_method.settings["prior"] == "standoff" and "standoff" in phase_method.title

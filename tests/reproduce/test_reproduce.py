@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.reproduce.scoring import (
     write_all_frames,
 )
 from fpp_ml_bench.baselines.timing import time_method
-from fpp_ml_bench.baselines.training import engine, load_recipe, model_config, save_weights
+from fpp_ml_bench.baselines.training import claim_folder, depth_training, load_recipe, model_config, save_weights
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
@@ -74,15 +74,18 @@ class Trainer:
 
     def __call__(self, recipe, dataset, out, *, minutes=None, show=True):
         opened = DatasetFolder(dataset)
-        engine._claim(out, recipe, engine.open_data(recipe, dataset)[0])
-        finished = engine._finished(out)
+        data = depth_training.open_data(recipe, dataset)[0]
+        claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
+        finished = depth_training.finished_run(out)
         if finished is not None:
             return finished
         outcome = self.says.get(recipe.name)
         if isinstance(outcome, BaseException):
             raise outcome
         if outcome == "out of time":
-            return engine.TrainingRun(out / engine.WEIGHTS, 1, 1, 1.0, False, out / "log.jsonl", out / "curve.png")
+            return depth_training.TrainingRun(
+                out / depth_training.WEIGHTS, 1, 1, 1.0, False, out / "log.jsonl", out / "curve.png"
+            )
         self.trained.append(recipe.name)
         torch.manual_seed(self.seed)
         network = build(recipe.network, width=recipe.width)
@@ -90,9 +93,9 @@ class Trainer:
         with torch.no_grad():
             network.head.weight.mul_(0.01)
             network.head.bias.fill_({"raw": 1500.0, "global": 1.5, "individual": 0.4}[recipe.normalisation])
-        save_weights(out / engine.WEIGHTS, network, model_config(recipe, network, opened.fingerprint, 3, {}))
-        (out / engine.DONE).write_text(json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4}))
-        return engine._finished(out)
+        save_weights(out / depth_training.WEIGHTS, network, model_config(recipe, network, opened.fingerprint, 3, {}))
+        (out / depth_training.DONE).write_text(json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4}))
+        return depth_training.finished_run(out)
 
 
 @pytest.fixture
@@ -214,12 +217,12 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     out.mkdir(parents=True)
     recipe = plan.load_recipe("normalization/individual", "cpu")
     other = {**recipe.to_dict(), "batch": 8, "seed": 1}
-    (out / engine.RECIPE).write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
+    (out / "recipe.json").write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
     assert run(TABLE) == 2
     error = capsys.readouterr().err
     assert "batch (8 there, 4 in the recipe), seed (1 there, 42 in the recipe)" in error and f"mv {out}" in error
     assert trainer.trained == []
-    (out / engine.RECIPE).write_text("[]")
+    (out / "recipe.json").write_text("[]")
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
 
 

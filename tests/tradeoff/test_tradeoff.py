@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.score import evaluate
@@ -38,7 +39,7 @@ def small(tmp_path_factory):
 
 
 @dataclass
-class Answer:
+class Answer(Method):
     """A method that knows the answers, off by ``offset_mm``; ``rows`` rows of each image it leaves out."""
 
     dataset: object

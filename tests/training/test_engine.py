@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from conftest import TINY_SIZE
 
-from fpp_ml_bench.baselines.networks.model import load
-from fpp_ml_bench.baselines.training.display import Display
-from fpp_ml_bench.baselines.training.engine import CHECKPOINT, DONE, WEIGHTS, train
-from fpp_ml_bench.baselines.training.history import CURVE_FILE
-from fpp_ml_bench.baselines.training.pairs import epoch_order, spread
+from fpp_ml_bench.baselines.networks import load
+from fpp_ml_bench.baselines.training.data import epoch_order, spread
+from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, train
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
+from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display
 from fpp_ml_bench.baselines.training.schedules import Schedule
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
@@ -76,7 +76,7 @@ def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monk
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Display, "step", kill)
+        patch.setattr(Display, "advance", kill)
         train(small(), tiny, tmp_path / "run", show=False)
     resumed = train(small(), tiny, tmp_path / "run", show=False)
     assert resumed.weights.read_bytes() == uninterrupted.weights.read_bytes()
@@ -187,7 +187,7 @@ def test_two_processes_agree(tiny, tmp_path):
 
 def test_nothing_that_is_not_finite_is_kept(tiny, tmp_path, monkeypatch):
     """A network whose training looks sound and whose answer in validation is not."""
-    from fpp_ml_bench.baselines.networks.unet import UNet
+    from fpp_ml_bench.baselines.networks import UNet
 
     forward = UNet.forward
     monkeypatch.setattr(UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan))

@@ -9,8 +9,13 @@ from torch import nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training.losses import loss_function, sample_losses
-from fpp_ml_bench.baselines.training.objectives import Adversarial, AdversarialSettings, Regression
+from fpp_ml_bench.baselines.training.losses import (
+    Adversarial,
+    AdversarialSettings,
+    Regression,
+    loss_function,
+    sample_losses,
+)
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.loaders.training import FringeDepth
 

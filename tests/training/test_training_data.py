@@ -6,16 +6,20 @@ from dataclasses import replace
 import pytest
 from tiny_network import config_of, tiny_network
 
-from fpp_ml_bench.baselines.phase_network import NetConfig, PhaseNet, load_net, save_net
-from fpp_ml_bench.baselines.training import provenance_of_data as training_data
-from fpp_ml_bench.baselines.training.provenance_of_data import (
+from fpp_ml_bench.baselines.phase_network import PhaseNet, load_net, save_net
+from fpp_ml_bench.baselines.training import weights as training_data
+from fpp_ml_bench.baselines.training.depth_training import model_config
+from fpp_ml_bench.baselines.training.recipe import load_recipe
+from fpp_ml_bench.baselines.training.weights import (
+    SHIPPED,
+    NetConfig,
     TrainingBenchmark,
+    open_weights,
+    save_weights,
+    shipped_names,
     training_benchmark,
     training_data_warning,
 )
-from fpp_ml_bench.baselines.training.recipe import load_recipe
-from fpp_ml_bench.baselines.training.setup import model_config
-from fpp_ml_bench.baselines.training.weights import SHIPPED, read_weights, save_weights, shipped_names
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark
 
@@ -26,10 +30,7 @@ NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6
 @pytest.fixture
 def benchmarks(monkeypatch, opened):
     """The tiny dataset as version 1 of a benchmark ``tiny``, and a second benchmark."""
-    named = (
-        Benchmark("tiny", 1, "mini", 176, opened.fingerprint),
-        Benchmark("large", 0, "full", 960, "c" * 64),
-    )
+    named = (Benchmark("tiny", 1, "mini", 176, opened.fingerprint), Benchmark("large", 0, "full", 960, "c" * 64))
     monkeypatch.setattr(benchmark, "BENCHMARKS", named)
     return named
 
@@ -48,7 +49,7 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
         assert config.benchmark == expected
         path = tmp_path / "net.safetensors"
         save_weights(path, network, config)
-        assert read_weights(path)[0].benchmark == expected
+        assert open_weights(path).config.benchmark == expected
         save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=training_benchmark(fingerprint)))
         assert load_net(path).config.benchmark == expected
 
@@ -56,7 +57,7 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
 def test_a_file_without_the_entry_is_read(tmp_path):
     """The shipped weights are older than the entry."""
     for name in shipped_names():
-        assert read_weights(SHIPPED / f"{name}.safetensors")[0].benchmark is None
+        assert open_weights(SHIPPED / f"{name}.safetensors").config.benchmark is None
     assert load_net().config.benchmark is None
     data = load_net().path.read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])

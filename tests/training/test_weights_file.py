@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from tiny_network import config_of, tiny_network
 
 from fpp_ml_bench.baselines.training import weights as weights_file
-from fpp_ml_bench.baselines.training.weights import open_weights, read_weights, save_weights, weights_path
+from fpp_ml_bench.baselines.training.weights import open_weights, save_weights, weights_path
 from fpp_ml_bench.errors import WeightsError
 
 HEADS = {"range_mean": torch.tensor([1700.0, 1900.0], dtype=torch.float64)}
@@ -46,12 +46,12 @@ def config_with(path, **changes):
 
 
 def test_what_goes_in_comes_out(saved, network):
-    config, tensors = read_weights(saved)
+    file = open_weights(saved)
+    config, tensors, heads = file.config, file.tensors, file.heads
     assert config == config_of(network) and config.image_size == (32, 48) and config.recipe["loss"]["alpha"] == 0.7
     assert tensors.keys() == network.state_dict().keys()
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensors[name], tensor) and tensors[name].dtype == tensor.dtype
-    heads = open_weights(saved).heads
     assert heads.keys() == HEADS.keys() and torch.equal(heads["range_mean"], HEADS["range_mean"])
     network.load_state_dict(tensors)
     # Anyone's safetensors reads it, and finds the configuration as plain JSON.
@@ -93,7 +93,7 @@ def test_training_layouts_are_saved_plainly(saved, tmp_path):
 def test_configurations_that_do_not_fit(saved, changes, words):
     rewrite(saved, {"config": config_with(saved, **changes)})
     with pytest.raises(WeightsError, match=f"(?s)net.safetensors: .*{words}"):
-        read_weights(saved)
+        open_weights(saved)
 
 
 @pytest.mark.parametrize(
@@ -107,13 +107,13 @@ def test_configurations_that_do_not_fit(saved, changes, words):
 )
 def test_foreign_metadata(saved, metadata, words):
     with pytest.raises(WeightsError, match=words):
-        read_weights(rewrite(saved, metadata))
+        open_weights(rewrite(saved, metadata))
 
 
 def test_tensors_that_do_not_fit(saved, network, tmp_path):
     name = next(iter(network.state_dict()))
     with pytest.raises(WeightsError, match="tensor extra is none of unet with"):
-        read_weights(rewrite(saved, tensors={"extra": torch.zeros(1)}))
+        open_weights(rewrite(saved, tensors={"extra": torch.zeros(1)}))
     tensors = load_file(saved)
     del tensors["extra"]
     for broken, words in (
@@ -128,7 +128,7 @@ def test_tensors_that_do_not_fit(saved, network, tmp_path):
         path = tmp_path / "broken.safetensors"
         save_file(broken, path, {"format": "fpp-ml-bench", "version": "1", "config": config_with(saved)})
         with pytest.raises(WeightsError, match=words):
-            read_weights(path)
+            open_weights(path)
 
 
 def test_damage_at_every_place(saved):
@@ -136,7 +136,7 @@ def test_damage_at_every_place(saved):
     for cut in (0, 1, 7, 8, 9, 100, len(data) // 2, len(data) - 1):
         saved.write_bytes(data[:cut])
         with pytest.raises(WeightsError, match=r"net\.safetensors: damaged"):
-            read_weights(saved)
+            open_weights(saved)
     for foreign in (
         b"\xff" * 64,
         b"version https://git-lfs.github.com/spec/v1\n",
@@ -145,7 +145,7 @@ def test_damage_at_every_place(saved):
     ):
         saved.write_bytes(foreign)
         with pytest.raises(WeightsError, match=r"net\.safetensors: (damaged|expected weights of)"):
-            read_weights(saved)
+            open_weights(saved)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -157,7 +157,7 @@ def test_a_pickle_is_never_opened(tmp_path, network, zipped):
     path = tmp_path / "net.pth"
     torch.save({"model": network.state_dict(), "trap": Trap()}, path, _use_new_zipfile_serialization=zipped)
     with pytest.raises(WeightsError, match=r"got a PyTorch pickle.*never opened"):
-        read_weights(path)
+        open_weights(path)
 
 
 def test_nothing_is_written_that_could_not_be_read(tmp_path, network):
@@ -178,14 +178,14 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path, network):
 
 
 def test_an_old_file_survives_a_failed_write(saved, network, monkeypatch):
-    from fpp_ml_bench.loaders.storage import manifest
+    from fpp_ml_bench import files
 
     before = saved.read_bytes()
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(manifest.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(WeightsError, match="No space left"):
         save_weights(saved, network, config_of(network, epoch=3))
     assert saved.read_bytes() == before and [p.name for p in saved.parent.iterdir()] == [saved.name]
@@ -201,4 +201,4 @@ def test_names_and_paths(saved, monkeypatch, tmp_path):
         weights_path("quite-another")
     for path, words in ((tmp_path, "found a folder"), (tmp_path / "no.safetensors", "found nothing")):
         with pytest.raises(WeightsError, match=words):
-            read_weights(path)
+            open_weights(path)

@@ -5,11 +5,14 @@ that never stopped.
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -79,3 +82,21 @@ def _as_read(batch: Any) -> FringeDepth:
 def training_loader(source: FringeDepthDataset, sampler: EpochSampler, batch: int, pin: bool) -> DataLoader:
     """Batches in the sampler's order, read in this process: a batch takes less time than a step."""
     return DataLoader(BatchRead(source), batch_size=batch, sampler=sampler, collate_fn=_as_read, pin_memory=pin)
+
+
+def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
+    """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
+    datasets = []
+    for split in ("train", "validation"):
+        data = FringeDepthDataset(dataset, split, recipe.data_config, recipe.normalisation, recipe.background_removed)
+        if data.source.size != (recipe.size, recipe.size):
+            height, width = data.source.size
+            raise TrainingError(
+                f"{dataset}: holds images of {width} x {height} px, recipe {recipe.name} with preset {recipe.preset} "
+                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build DIR --preset full "
+                f"--size {recipe.size}"
+            )
+        if not len(data):
+            raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
+        datasets.append(data)
+    return datasets[0], datasets[1]

@@ -1,0 +1,294 @@
+"""Training a network from a fringe image to depth by a recipe (paper Section 5.3), from dataset to weights file.
+
+The rate falls on a plateau of the validation loss, training ends when it has reached its minimum, and the weights kept
+are those of the lowest validation loss. A validation loss is the mean over samples of each sample's own loss, and the
+scores beside it are the evaluator's: individual normalisation is scored with the sample's range, by the paper's rule,
+as its rows on the leaderboard are.
+
+Beside the files of the engine, a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from accelerate import PartialState
+from accelerate.utils import gather_object, set_seed
+from torch import Tensor, nn
+from torch.optim import RMSprop
+from torch.utils.data import DataLoader
+
+from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.training.data import EpochSampler, open_data, spread, training_loader
+from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.losses import Adversarial, DepthObjective, Regression
+from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
+from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
+from fpp_ml_bench.baselines.training.schedules import Schedule
+from fpp_ml_bench.baselines.training.tables import GAN
+from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
+from fpp_ml_bench.depth import Normalisation
+from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.score import DepthScores, scored_pair
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
+
+WEIGHTS, DONE = "weights.safetensors", "done.json"
+SCORING: dict[Normalisation, tuple[Units, Mode]] = {
+    "raw": ("mm", "standard"), "global": ("m", "standard"), "individual": ("normalised", "paper-individual"),
+}  # fmt: skip
+"""How a network's output is scored: its unit, and the evaluator's mode."""
+LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
+"""The scores of `DepthScores` that a training log holds."""
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """Files and epochs of a training; ``finished`` is False when its minutes ran out: call `train` again to resume."""
+
+    weights: Path
+    epochs: int
+    best_epoch: int
+    seconds: float
+    finished: bool
+    log: Path
+    curve: Path
+
+
+def train(
+    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
+) -> TrainingRun:
+    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
+
+    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one epoch is always
+    trained. ``show``: progress on stderr.
+
+    Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a dataset of another image
+    size, a loss that is not finite or has diverged (the batch's samples are named); what else recipe, dataset or
+    network refuse comes as their own error.
+    """
+    out, started = Path(out), perf_counter()
+    data, validation = open_data(recipe, Path(dataset))
+    with PartialState().local_main_process_first():
+        claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
+    finished = finished_run(out)
+    if finished is not None:
+        return finished
+    with reproducible(recipe.precision):
+        training = DepthTraining(recipe, data, validation, out)
+        seconds = training.run(started, minutes, show)
+        epochs, best = training.epoch, training.best["epoch"] if training.history else 0
+        if training.over and training.accelerator.is_main_process:
+            summary = {"epochs": epochs, "best_epoch": best, "seconds": seconds}
+            write_atomically(out / DONE, json.dumps(summary).encode())
+        training.accelerator.wait_for_everyone()
+        return _run(out, epochs, best, seconds, training.over)
+
+
+def finished_run(out: Path) -> TrainingRun | None:
+    """The finished training in the folder ``out``; None where there is none. `TrainingError` for a damaged one."""
+    path = out / DONE
+    if not path.exists() or not (out / WEIGHTS).exists():
+        return None
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
+    except (OSError, ValueError, KeyError, TypeError):
+        raise TrainingError(f"{path}: is damaged; delete it, and the training resumes from its checkpoint") from None
+
+
+def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
+    return TrainingRun(out / WEIGHTS, epochs, best, seconds, finished, out / LOG_FILE, out / CURVE_FILE)
+
+
+class DepthTraining(Training):
+    """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is validated."""
+
+    objective: DepthObjective
+
+    def __init__(self, recipe: Recipe, data: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
+        identity = {"recipe": recipe.digest, "fingerprint": data.source.fingerprint}
+        super().__init__(out, identity, recipe.seed, recipe.precision)
+        self.recipe, self.data, self.validation = recipe, data, validation
+        self.name, self.title = recipe.name, recipe.title
+        self.objective = objective_of(recipe)
+        self.bare = dict(self.objective.modules)
+        on_gpu = self.accelerator.device.type == "cuda"
+        if on_gpu:
+            for module in self.bare.values():
+                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        modules: dict[str, Any] = dict(self.bare)
+        if on_gpu and recipe.compile:
+            modules = {name: torch.compile(module) for name, module in modules.items()}
+        rule = recipe.optimizer
+        self.optimizers = {
+            name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
+            for name, module in modules.items()
+        }
+        self.schedule = Schedule(recipe.schedule, rule.learning_rate)
+        self.sampler = EpochSampler(len(data), recipe.pairs_per_epoch, recipe.seed)
+        loader = training_loader(data, self.sampler, recipe.batch, pin=on_gpu)
+        self.loader: DataLoader = self.accelerator.prepare(loader)
+        for name in modules:
+            self.objective.modules[name], self.optimizers[name] = self.accelerator.prepare(
+                modules[name], self.optimizers[name]
+            )
+        self.resume()
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+        return len(self.history)
+
+    @property
+    def epochs(self) -> int:
+        """Epochs at most; a plateau may end it sooner."""
+        rule, most = self.recipe.schedule, self.recipe.max_epochs
+        return min(rule.constant + rule.decay, most) if isinstance(rule, Linear) else most
+
+    @property
+    def best(self) -> Record:
+        return min(self.history, key=lambda record: record["validation_loss"])
+
+    @property
+    def over(self) -> bool:
+        return self.epoch >= self.recipe.max_epochs or (self.epoch > 0 and self.schedule.finished)
+
+    @property
+    def steps_done(self) -> int:
+        return self.epoch * len(self.loader)
+
+    @property
+    def total_steps(self) -> int:
+        return self.epochs * max(1, len(self.loader))
+
+    def batches(self) -> Iterable[FringeDepth]:
+        # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
+        set_seed((self.recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index) % 2**32)
+        self.sampler.epoch = self.epoch
+        return self.loader
+
+    def rate(self, number: int) -> float:
+        return self.schedule.rate
+
+    def label(self, batch: FringeDepth) -> Tensor:
+        return batch.row
+
+    def diverged(self, name: str, value: float, number: int, label: Tensor) -> str:
+        fault = f"is {DIVERGED:g} times the first one" if math.isfinite(value) else "is not finite"
+        samples = sorted({self.data.samples[row] for row in label.tolist()})
+        return (
+            f"training diverged: {name} {fault} ({value:.4g}) in epoch {self.epoch + 1}, batch {number + 1}, samples "
+            f"{', '.join(samples)}. The last good state is kept ({self.epoch} epochs); lower the learning rate, or "
+            "look at those samples (fpp-bench show)"
+        )
+
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        scores = self._validate()
+        loss = scores["validation_loss"]
+        if loss is None or not math.isfinite(loss) or loss > self.limit:
+            raise TrainingError(
+                f"{self.out}: training diverged: the validation loss after epoch {self.epoch + 1} is {loss}. The last "
+                f"good state is kept ({self.epoch} epochs); lower the learning rate"
+            )
+        training_loss = losses.pop("loss")
+        return {
+            "epoch": self.epoch + 1, "learning_rate": self.schedule.rate, "training_loss": training_loss, **scores,
+            **losses, "seconds": round(perf_counter() - began, 3),
+        }  # fmt: skip
+
+    def _validate(self) -> dict[str, float | None]:
+        """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled).
+
+        Each process takes its share of the validation pairs, and all get the means over all pairs; a score is None
+        where no pair has such a pixel.
+        """
+        network, accelerator = self.bare["network"], self.accelerator
+        pairs = spread(len(self.validation), self.recipe.validation_pairs)
+        indices = pairs[accelerator.process_index :: accelerator.num_processes]
+        units, mode = SCORING[self.recipe.normalisation]
+        network.eval()
+        metric = DepthScores()
+        if accelerator.device.type == "cuda":  # NCCL adds up tensors on a GPU only
+            metric.to(accelerator.device)
+        losses: list[float] = []
+        for read in self.validation.batches(self.recipe.batch, indices):
+            batch = FringeDepth(*(tensor.to(accelerator.device) for tensor in read))
+            with torch.inference_mode(), accelerator.autocast():
+                prediction = network(batch.fringe).float()
+                losses += self.objective.validation_losses(prediction, batch).double().cpu().tolist()
+            for values, row in zip(prediction[:, 0].cpu().numpy(), read.row.tolist(), strict=True):
+                sample = self.validation.samples[row]
+                if not np.isfinite(values).all():
+                    raise TrainingError(f"{self.out}: the network's answer to {sample} is not finite; it has diverged")
+                pair = scored_pair(values, self.validation.source.depth_mm(sample), units, mode, sample)
+                metric.update(*(torch.tensor(depth)[None] for depth in pair))
+        losses = gather_object(losses)
+        means = {key: float(mean) for key, mean in metric.compute().items() if key in LOGGED}
+        scores = {key: None if math.isnan(means[key]) else means[key] for key in LOGGED}
+        return {"validation_loss": sum(losses) / len(losses) if losses else None, **scores}
+
+    def recorded(self, record: Record) -> None:
+        """Set the rate of the next epoch, keep the best weights."""
+        self.schedule.step(record["validation_loss"])
+        if self.best is record and self.accelerator.is_main_process:
+            scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
+            network, fingerprint = self.bare["network"], self.data.source.fingerprint
+            save_weights(
+                self.out / WEIGHTS, network, model_config(self.recipe, network, fingerprint, record["epoch"], scores)
+            )
+
+    def state(self) -> dict[str, Any]:
+        return {"schedule": self.schedule.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.schedule.restore(state["schedule"])
+
+    def progress(self) -> str:
+        record = self.history[-1]
+        score = record["object_mae_mm"]
+        return (
+            f"epoch {record['epoch']}/{self.epochs}  loss {record['training_loss']:.4g} / "
+            f"{record['validation_loss']:.4g}  object {'-' if score is None else f'{score:.1f} mm'}  rate "
+            f"{record['learning_rate']:.1e}"
+        )
+
+    def panels(self) -> list[Panel]:
+        kept = self.best["epoch"]
+        losses = Panel.of(
+            "loss", self.history, "epoch", {"training_loss": "training", "validation_loss": "validation"}, log=True
+        )
+        mark = {f"kept: epoch {kept}": ([kept], [self.best["validation_loss"]])}
+        return [
+            Panel(losses.title, losses.x_label, {**losses.lines, **mark}, log=True),
+            Panel.of("validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"}),
+            Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True),
+        ]
+
+
+def objective_of(recipe: Recipe) -> DepthObjective:
+    """The objective of a recipe, with freshly initialised networks. Seed torch first."""
+    network = networks.build(recipe.network, width=recipe.width, **recipe.options)
+    if recipe.loss.name == GAN:
+        return Adversarial(network, networks.discriminator(width=recipe.width))
+    return Regression(network, recipe.loss.name, recipe.loss.alpha)
+
+
+def model_config(
+    recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: dict[str, Any]
+) -> ModelConfig:
+    """Configuration for the weights file."""
+    return ModelConfig(
+        name=recipe.name, title=recipe.title, network=recipe.network,
+        options=dict(network.options),  # type: ignore[arg-type, call-overload]
+        normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=fingerprint,
+        benchmark=training_benchmark(fingerprint), data_config=recipe.data_config,
+        background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
+    )  # fmt: skip

@@ -1,0 +1,165 @@
+"""What a training writes down: its whole state in one file, its log, its curve, and the progress bar.
+
+The checkpoint is a safetensors file, never a pickle, with networks, optimisers, schedule and history. It is written
+after every interval, atomically; the history travels in it, so that the log is always that of the state.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+from torch.optim import Optimizer
+
+from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.files import write_atomically
+
+LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
+_FORMAT = "fpp-ml-bench training 1"
+State = dict[str, Tensor]
+
+
+def optimizer_tensors(optimizer: Optimizer, prefix: str) -> State:
+    """The optimiser's state as tensors, ``prefix.parameter number.key``."""
+    tensors: State = {}
+    for number, state in optimizer.state_dict()["state"].items():
+        for key, value in state.items():
+            if isinstance(value, Tensor):
+                tensors[f"{prefix}.{number}.{key}"] = value
+    return tensors
+
+
+def restore_optimizer(optimizer: Optimizer, tensors: State, prefix: str) -> None:
+    """Put back what `optimizer_tensors` took; the rate and other settings stay as they are."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith(f"{prefix}."):
+            number, key = name[len(prefix) + 1 :].split(".", 1)
+            state.setdefault(int(number), {})[key] = value
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def save_checkpoint(path: Path, tensors: State, state: dict[str, Any]) -> None:
+    """Write ``tensors`` and the JSON mapping ``state``, sealed with a digest of both."""
+    contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    text = json.dumps(state, allow_nan=False)
+    seal = _seal(contiguous, text)
+    write_atomically(path, save(contiguous, {"format": _FORMAT, "state": text, "sha256": seal}))
+
+
+def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+    """What `save_checkpoint` wrote. TrainingError for a file that is cut off, changed or something else."""
+    cure = f"; delete {path} to train again from the start"
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no mapping
+    except (SafetensorError, OSError, ValueError) as error:
+        raise TrainingError(
+            f"{path}: expected a checkpoint of this package, it can't be read ({error}){cure}"
+        ) from None
+    if metadata.get("format") != _FORMAT:
+        raise TrainingError(f"{path}: expected {_FORMAT!r}, got {metadata.get('format')!r}{cure}")
+    if metadata.get("sha256") != _seal(tensors, metadata.get("state", "")):
+        raise TrainingError(f"{path}: its content does not match its own checksum, it was damaged{cure}")
+    return tensors, json.loads(metadata["state"])
+
+
+def _seal(tensors: State, text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].numpy().reshape(-1).view("uint8").data)
+    return digest.hexdigest()
+
+
+Record = dict[str, Any]
+
+
+def write_log(folder: Path, history: list[Record]) -> None:
+    """``log.jsonl``: a line for each record: step or epoch (from 1), rate, losses, scores in mm, seconds."""
+    lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in history)
+    write_atomically(folder / LOG_FILE, lines.encode("utf-8"))
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A diagram of the curve: ``lines`` of a label (none: ``_``), its x and its y; a single point becomes a mark."""
+
+    title: str
+    x_label: str
+    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    log: bool = False
+
+    @classmethod
+    def of(cls, title: str, history: list[Record], x: str, labels: Mapping[str, str], log: bool = False) -> "Panel":
+        """The values of the keys ``labels`` over those of ``x``, where there are some."""
+        lines = {}
+        for key, label in labels.items():
+            points = [(record[x], record[key]) for record in history if record.get(key) is not None]
+            lines[label] = ([at for at, _ in points], [value for _, value in points])
+        return cls(title, x, lines, log)
+
+
+def draw_curves(path: Path, title: str, panels: Sequence[Panel]) -> None:
+    """Write the ``panels`` side by side as the picture ``path``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    figure = Figure(figsize=(10, 3.2), layout="constrained", dpi=110)
+    for axes, panel in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for label, (x, y) in panel.lines.items():
+            axes.plot(x, y, "o" if len(x) == 1 else "-", label=label)
+        axes.set(title=panel.title, xlabel=panel.x_label, **({"yscale": "log"} if panel.log else {"ylim": (0, None)}))
+        axes.grid(alpha=0.3)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if not all(label.startswith("_") for label in panel.lines):
+            axes.legend(frameon=False)
+    figure.suptitle(title, fontsize=10)
+    picture = BytesIO()
+    FigureCanvasAgg(figure).print_png(picture)
+    write_atomically(path, picture.getvalue())
+
+
+class Display:
+    """A rich progress bar on standard error over at most ``steps`` steps; silent when ``show`` is False."""
+
+    def __init__(self, name: str, steps: int, show: bool) -> None:
+        self.name, self.steps = name, steps
+        self.progress: Any = None
+        if not show:
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.progress = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[state]}"),
+            TimeElapsedColumn(), TextColumn("left at most"), TimeRemainingColumn(), console=Console(stderr=True),
+        )  # fmt: skip
+
+    def __enter__(self) -> "Display":
+        if self.progress is not None:
+            self.progress.start()
+            self.task = self.progress.add_task(self.name, total=self.steps, state="")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.progress is not None:
+            self.progress.stop()
+
+    def advance(self, steps: int = 1) -> None:
+        """So many more steps are done."""
+        if self.progress is not None:
+            self.progress.advance(self.task, steps)
+
+    def update(self, steps_done: int, state: str) -> None:
+        """All steps so far, now or by an earlier call, and words on where they led."""
+        if self.progress is not None:
+            self.progress.update(self.task, completed=steps_done, state=state)
