@@ -1,7 +1,14 @@
-"""The surface that each pixel sees: a dataset's sample, a surface moved along the camera's rays, or a plane."""
+"""Surfaces seen by a rig's camera, and rendered frames of scenes with them that are not in a dataset.
 
-from collections.abc import Callable
-from dataclasses import dataclass
+Light and sensor are the dataset's own: an unchanged scene gives the frames of its dataset, noise included, except for a
+few pixels in 50,000 that differ by a grey level (tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel
+depends only on the dataset's seed, the object, view, frame and pixel, so it is the same in a changed scene.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +16,38 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.loaders.render import MESH_FOLDER, PixelRays, TracedObject, UserMesh, load_user_mesh, turned
+from fpp_ml_bench.loaders.render import (
+    MESH_FOLDER,
+    BuildSettings,
+    Exposure,
+    Lighting,
+    LitPixels,
+    Noise,
+    PixelRays,
+    TracedObject,
+    UserMesh,
+    background_plane,
+    light_surface,
+    load_user_mesh,
+    turned,
+)
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction, Rig
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
+
+
+def constant(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The `Field` that is 1 everywhere."""
+    return np.ones_like(x)
+
+
+def times(amplitude: float, field: Field) -> Field:
+    """``amplitude`` times ``field``."""
+    return lambda x, y: amplitude * field(x, y)
+
 
 _STEP = 1e-6
 """Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
@@ -40,9 +72,10 @@ class Surface:
         """Camera coordinates in metres (n, 3)."""
         return np.column_stack([self.x, self.y, np.ones_like(self.x)]) * self.depth_m[:, None]
 
-    def at(self, chosen: NDArray) -> "Surface":
-        """The part at ``chosen``, a mask (n,) or indices (k,)."""
-        return Surface(self.pixels[chosen], self.x[chosen], self.y[chosen], self.depth_m[chosen], self.normals[chosen])
+    def joined(self, other: "Surface") -> "Surface":
+        """The pixels of both."""
+        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(self))
+        return Surface(*(np.concatenate(pair) for pair in pairs))
 
     def depth_mm(self, shape: tuple[int, int]) -> NDArray[np.float64]:
         """Depth map (H, W) in mm, 0 outside the surface."""
@@ -68,12 +101,10 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
         vertices_m = turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
         placed_m = vertices_m + np.array([0, 0, record["distance_mm"] / MM_PER_M])
         hits = TracedObject(solid, placed_m).primary(PixelRays.of(dataset.rig.camera))
-        hit_index = np.full(x.size, -1)
-        hit_index[hits.pixels] = np.arange(hits.pixels.size)
-        traced = hit_index[pixels] >= 0
-        traced[traced] = np.abs(hits.depth_m[hit_index[pixels[traced]]] - depth_m[traced]) < _SAME_SURFACE_M
-        normals[traced] = hits.normals[hit_index[pixels[traced]]]
-        depth_m[traced] = hits.depth_m[hit_index[pixels[traced]]]  # the stored depth is rounded to float32
+        _, seen, hit = np.intersect1d(pixels, hits.pixels, assume_unique=True, return_indices=True)
+        same = np.abs(hits.depth_m[hit] - depth_m[seen]) < _SAME_SURFACE_M
+        normals[seen[same]] = hits.normals[hit[same]]
+        depth_m[seen[same]] = hits.depth_m[hit[same]]  # the stored depth is rounded to float32
     return Surface(pixels, x.ravel()[pixels], y.ravel()[pixels], depth_m, normals)
 
 
@@ -147,3 +178,106 @@ def _moved_m(
     residual = phase - layer.infinity_rad - TAU * layer.infinity_order
     depth: NDArray[np.float64] = layer.depth_of_residual_mm(residual) / MM_PER_M
     return depth
+
+
+Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
+PITCH_FACTOR = 4 / 3
+"""Factor of the changed pitch: 18 px become 24."""
+Frames = list[NDArray[np.uint8] | None]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Lit pixels in front of the empty scene, and the pattern that is projected on them.
+
+    ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
+    it. ``stream``: key of the noise. ``projected``: the unchanged sequence, its mean light inside or outside the
+    object, the frames of the other direction, or fringes of another pitch.
+    """
+
+    pixels: NDArray[np.uint32]
+    lit: LitPixels
+    mask: NDArray[np.bool_]
+    stream: tuple[object, ...]
+    projected: Projected = "sequence"
+
+
+class SceneRenderer:
+    """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
+
+    def __init__(self, rig: Rig, noise_sigma_grey: float = BuildSettings.noise_sigma_grey) -> None:
+        self.rig, self.lighting = rig, Lighting()
+        self.shape = (rig.camera.height, rig.camera.width)
+        self.noise = Noise.of_sigma(noise_sigma_grey)
+        self._all_pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
+        self._background_stream: tuple[object, ...] = ()
+        self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
+
+    @classmethod
+    def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
+        """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
+        return cls(dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", BuildSettings.noise_sigma_grey))
+
+    @cached_property
+    def exposure(self) -> Exposure:
+        return Exposure.of(self.rig, self.noise)
+
+    @cached_property
+    def _uniform(self) -> Exposure:
+        light = np.broadcast_to(self.exposure.light.mean(axis=1, keepdims=True), self.exposure.light.shape)
+        return replace(self.exposure, light=np.ascontiguousarray(light))
+
+    @cached_property
+    def _other_pitch(self) -> Exposure:
+        horizontal_px, vertical_px = (
+            PITCH_FACTOR * self.rig.pitch_horizontal_px,
+            PITCH_FACTOR * self.rig.pitch_vertical_px,
+        )
+        return Exposure.of(
+            replace(self.rig, pitch_horizontal_px=horizontal_px, pitch_vertical_px=vertical_px), self.noise
+        )
+
+    @cached_property
+    def _empty(self) -> LitPixels:
+        return background_plane(self.rig, self.lighting)
+
+    def light(self, surface: Surface) -> LitPixels:
+        """The light on ``surface``; no cast shadows, as in the paper."""
+        return light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
+
+    def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
+        """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
+        0 outside ``scene.mask``."""
+        inside, outside = {
+            "no fringe inside": (self._uniform, self.exposure),
+            "no fringe outside": (self.exposure, self._uniform),
+            "other pitch": (self._other_pitch, self._other_pitch),
+        }.get(scene.projected, (self.exposure, self.exposure))
+        swapped = scene.projected == "other direction"
+        projected_indices = [self._partner(index) if swapped else index for index in indices]
+        object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
+        frames: Frames = [None] * len(self.rig.sequence)
+        for index, projected_index, values in zip(indices, projected_indices, object_values, strict=True):
+            image = self._background(scene.stream, projected_index, outside).copy()
+            image.ravel()[scene.pixels] = values
+            frames[index] = image * scene.mask if masked else image
+        return frames
+
+    def _background(self, stream: tuple[object, ...], index: int, exposure: Exposure) -> NDArray[np.uint8]:
+        if self._background_stream != stream:
+            self._background_stream, self._backgrounds = stream, {}
+        key = id(exposure), index  # the three exposures live as long as the renderer
+        if key not in self._backgrounds:
+            image = exposure.expose([index], self._empty, self._all_pixels, stream)[0]
+            self._backgrounds[key] = image.reshape(self.shape)
+        return self._backgrounds[key]
+
+    def _partner(self, index: int) -> int:
+        """The frame of the other direction with the same step or bit; black and white frames map to themselves."""
+        sequence = self.rig.sequence
+        frame = sequence.frames[index]
+        if frame.direction is None:
+            return index
+        frames_of = sequence.sinusoids if frame.kind == "sinusoid" else sequence.gray
+        others = frames_of("vertical" if frame.direction == "horizontal" else "horizontal")
+        return others[min(frame.step, len(others) - 1)]
