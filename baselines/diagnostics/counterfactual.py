@@ -14,20 +14,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, Counterfactuals, SceneSet
 from fpp_ml_bench.baselines.diagnostics.phase_reliance import SampleReliance, ScenePredictor, measure
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
-    INK,
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    drawing,
-    picture,
-    save_figure,
-    tidy,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.evaluation.result import PART_TITLES, Reliance
@@ -71,16 +58,12 @@ class Counterfactual(Probe):
         # The middle sample of the list, which is the same for every method.
         middle = samples[len(samples) // 2].sample
         scenes = next(scenes for scenes in scene_set.scenes(reliance.direction) if scenes.original.sample == middle)
-        return Finding(
-            self.name,
-            self.title,
+        return self.finding(
             summary(reliance),
             {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample},
             tables(reliance, samples),
-            [
-                _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes, folder),
-                _draw_parts(reliance, samples, folder),
-            ],
+            _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes, folder),
+            _draw_parts(reliance, samples, folder),
         )
 
 
@@ -156,21 +139,21 @@ def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Pat
         images = (np.asarray(image, dtype=np.float64)[box] for image in column)
         tiles.append([np.pad(image, _GAP, constant_values=np.nan) for image in images])
     height, width = tiles[0][0].shape
-    figure, axes = drawing(5, 1, _WIDE, 5 * 0.9 * _WIDE / len(tiles) * height / width + 0.9)
-    for row, (axis, (title, colours, low, high)) in enumerate(zip(axes[:, 0], rows, strict=True)):
+    sheet = Sheet(5, 1, _WIDE, 5 * 0.9 * _WIDE / len(tiles) * height / width + 0.9)
+    for row, (axis, (title, colours, low, high)) in enumerate(zip(sheet.axes[:, 0], rows, strict=True)):
         # One image per row: fifty small axes take ten times as long to lay out.
-        drawn = picture(axis, np.hstack([column[row] for column in tiles]), "", colours, low, high)
+        drawn = sheet.picture(axis, np.hstack([column[row] for column in tiles]), "", colours, low, high)
         axis.set_facecolor("#e8e8e8" if row else "white")
         axis.set_ylabel(title, fontsize=8)
-        figure.colorbar(drawn, ax=axis, fraction=0.012, pad=0.008).ax.tick_params(labelsize=6)
-    top = axes[0, 0]
+        sheet.scale(drawn, axis, 6, fraction=0.012, pad=0.008)
+    top = sheet.axes[0, 0]
     top.xaxis.tick_top()
     top.set_xticks([width * (number + 0.5) for number in range(len(columns))], [name for name, *_ in columns])
     top.tick_params(axis="x", length=0, labelsize=7)
     title = f"{original.sample}: one thing changed at a time; {scenes.direction} phase; grey: no prediction"
-    figure.suptitle(title, fontsize=10)
+    sheet.figure.suptitle(title, fontsize=10)
     alt = f"Scenes of {original.sample} with changed phase, outline or fringes; truth, prediction and its change"
-    return save_figure(figure, folder, Figure("One thing changed at a time", "counterfactual_scenes.png", alt))
+    return sheet.save(folder, "counterfactual_scenes.png", "One thing changed at a time", alt)
 
 
 def _figure_columns(
@@ -199,22 +182,22 @@ def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
 
 def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance], folder: Path) -> Figure:
     """Bars of the parts, with a point for each sample."""
-    figure, axes = drawing(1, 2, 9.2, 3.2)
+    sheet = Sheet(1, 2, 9.2, 3.2)
     sides = (
-        (_FOLLOWS, "Follows, share of the expected change", COLOURS["phase"], 1.05),
-        (_CHANGES, "Changes, relative to a moved phase", COLOURS["depth"], None),
+        (_FOLLOWS, "Follows, share of the expected change", sheet.COLOURS["phase"], 1.05),
+        (_CHANGES, "Changes, relative to a moved phase", sheet.COLOURS["depth"], None),
     )
-    for axis, (names, title, colour, top) in zip(axes[0], sides, strict=True):
+    for axis, (names, title, colour, top) in zip(sheet.axes[0], sides, strict=True):
         measured = {key: name for key, name in names.items() if getattr(reliance.parts, key) is not None}
         values = [getattr(reliance.parts, key) for key in measured]
         axis.bar(range(len(measured)), values, 0.6, color=colour, alpha=0.75)
         for number, key in enumerate(measured):
             points = [value for sample in samples if (value := sample.parts.get(key)) is not None]
-            axis.plot([number] * len(points), points, ".", color=INK, markersize=4, alpha=0.6)
+            axis.plot([number] * len(points), points, ".", color=sheet.INK, markersize=4, alpha=0.6)
         axis.set_xticks(range(len(measured)), list(measured.values()))
-        tidy(axis, title)
+        sheet.tidy(axis, title)
         axis.tick_params(axis="x", labelsize=7)
         axis.set_ylim(0, top)
-    figure.suptitle(f"Phase reliance {reliance.score:.2f}; a point is a sample", fontsize=10)
+    sheet.figure.suptitle(f"Phase reliance {reliance.score:.2f}; a point is a sample", fontsize=10)
     alt = "Bars of how far the answer follows and what changes it"
-    return save_figure(figure, folder, Figure("What the score is made of", "counterfactual_parts.png", alt))
+    return sheet.save(folder, "counterfactual_parts.png", "What the score is made of", alt)

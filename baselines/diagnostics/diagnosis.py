@@ -1,27 +1,18 @@
 """Runs the probes on a subject, stores each finding, and writes the report: a page that loads nothing, and JSON."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from hashlib import sha256
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    PROBES,
-    Cell,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    checked_names,
-    finding_key,
-    load_finding,
-    make_probe,
-    save_finding,
-    write_json,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, Probe, ProbeSettings, Progress, Table
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.report import data_uri, page, render
@@ -111,6 +102,63 @@ def diagnose(
     return Diagnosis(tuple(results), out / REPORT_FILE, out / JSON_FILE)
 
 
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """``names`` without repeats, in the order of the report; all probes if empty. Raises `DiagnosisError` for an
+    unknown name."""
+    for name in names:
+        if name not in PROBES:
+            suggestions = get_close_matches(name, PROBES, n=1)
+            hint = f"did you mean {suggestions[0]!r}? " if suggestions else ""
+            raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
+    return tuple(name for name in PROBES if not names or name in names)
+
+
+def make_probe(name: str) -> Probe:
+    """The probe ``name`` of `PROBES`."""
+    module, cls = PROBES[name]
+    probe: Probe = getattr(import_module(f"fpp_ml_bench.baselines.diagnostics.{module}"), cls)()
+    return probe
+
+
+def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
+    """Hash (64 hex digits) of everything that a finding depends on."""
+    content = {
+        "probe": probe.name, "version": probe.version, "subject": subject.sha256, "layers": list(subject.layer_names),
+        "dataset": dataset.fingerprint, "settings": asdict(settings),
+    }  # fmt: skip
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
+    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already.
+
+    Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
+    """
+    content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
+    write_json(folder / f"{finding.probe}.json", content)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write ``content`` atomically. Raises ``ValueError`` for NaN and infinity."""
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    write_atomically(path, (text + "\n").encode("utf-8"))
+
+
+def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
+    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
+    try:
+        content = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        if content["key"] != key:
+            return None
+        fields = dict(content["finding"])
+        fields["tables"] = tuple(Table(**table) for table in fields["tables"])
+        fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
+        finding, seconds = Finding(**fields), float(content["seconds"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return None  # absent, half written, or of another version: it is made again
+    return (finding, seconds) if all((folder / figure.file).is_file() for figure in finding.figures) else None
+
+
 def _prepare(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -182,7 +230,7 @@ def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Findin
     return page(f"{subject['name']}: diagnosis", body, _STYLE, description=f"What {subject['name']} read")
 
 
-def cell_text(cell: Cell) -> str:
+def cell_text(cell: str | float | None) -> str:
     """A cell as text: floats with four significant digits, a dash for None."""
     if cell is None:
         return "-"

@@ -21,20 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    INK,
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    drawing,
-    picture,
-    save_figure,
-    spread,
-    tidy,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Frames, Subject
 from fpp_ml_bench.constants import MM_PER_M
@@ -136,16 +123,14 @@ class FlatPlane(Probe):
             progress(len(planes), total, f"{predicted.outline}, {predicted.distance_m:g} m")
         control = control_of(subject, dataset, renderer, list(outlines), scale)
         rows = [predicted.statistics(scale) for predicted in planes]
-        return Finding(
-            self.name,
-            self.title,
+        return self.finding(
             summary(rows, control, normalised),
             {
                 "planes": rows, "objects": control, "range_mm": [low, high] if normalised else None,
                 "collapse_below": scale.limit,
             },
             tables(rows, control, normalised),
-            [draw(planes, normalised, folder)],
+            draw(planes, normalised, folder),
         )  # fmt: skip
 
 
@@ -164,7 +149,7 @@ def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, ND
     first: dict[str, str] = {}
     for sample in dataset.samples("test"):
         first.setdefault(dataset.measured(sample)["object"], sample)
-    names = spread(list(first.values()), settings.samples or (QUICK_OUTLINES if settings.quick else OUTLINES))
+    names = settings.choose(list(first.values()), OUTLINES, QUICK_OUTLINES)
     masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
     return {name: mask for name, mask in masks.items() if mask.any()}
 
@@ -271,29 +256,29 @@ def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> F
     facing = [shown for shown in planes if shown.distance_m == PAPER_DISTANCE_M and shown.tilt_deg == (0.0, 0.0)]
     examples = [next(shown for shown in facing if shown.outline == kind) for kind in (FRAME, RECTANGLE)]
     examples += [shown for shown in facing if shown.kind == SILHOUETTE][:1]
-    figure, axes = drawing(2, len(examples) + 1, 11, 5.2, width_ratios=[1] * len(examples) + [1.5])
+    sheet = Sheet(2, len(examples) + 1, 11, 5.2, width_ratios=[1] * len(examples) + [1.5])
     low, high = (-0.2, 1.2) if normalised else (0.0, 2400.0)
     unit, digits = ("share of range", 2) if normalised else ("mm", 0)
-    for (above, below), shown in zip(axes.T, examples, strict=False):
+    for (above, below), shown in zip(sheet.axes.T, examples, strict=False):
         values = shown.prediction[shown.mask]
-        picture(above, shown.frame, f"{shown.outline}\n{shown.distance_m:g} m", low=0, high=255)
+        sheet.picture(above, shown.frame, f"{shown.outline}\n{shown.distance_m:g} m", "gray", 0, 255)
         least, most, mean = (f"{value:.{digits}f}" for value in (values.min(), values.max(), values.mean()))
         title = f"prediction over the plane:\n{least} to {most}, mean {mean}"
-        image = picture(below, shown.prediction, title, "viridis", low, high)
-    figure.colorbar(image, ax=axes[1, : len(examples)], fraction=0.05, pad=0.02, label=unit).ax.tick_params(labelsize=7)
-    _against_distance(axes[0, -1], planes, normalised)
-    axis, bins = axes[1, -1], np.linspace(low, high, 57)
+        image = sheet.picture(below, shown.prediction, title, "viridis", low, high)
+    sheet.scale(image, sheet.axes[1, : len(examples)], fraction=0.05, pad=0.02, label=unit)
+    _against_distance(sheet, planes, normalised)
+    axis, bins = sheet.axes[1, -1], np.linspace(low, high, 57)
     for shown in examples:
         values = np.clip(shown.prediction[shown.mask], low, high)
         axis.hist(values, bins, histtype="step", weights=np.full(values.size, 1 / values.size), label=shown.outline)
-    tidy(axis, "Predictions at 1.8 m (end bins: beyond)", unit, "share of pixels")
+    sheet.tidy(axis, "Predictions at 1.8 m (end bins: beyond)", unit, "share of pixels")
     axis.legend(fontsize=7, frameon=False)
     alt = "Fringes on planes in three outlines, the predictions, their means against the distance, and their spread"
-    return save_figure(figure, folder, Figure("Flat planes", "flat_plane.png", alt))
+    return sheet.save(folder, "flat_plane.png", "Flat planes", alt)
 
 
-def _against_distance(axis: Any, planes: Sequence[PlanePrediction], normalised: bool) -> None:
-    scale = 1.0 if normalised else 1000.0
+def _against_distance(sheet: Sheet, planes: Sequence[PlanePrediction], normalised: bool) -> None:
+    axis, scale = sheet.axes[0, -1], 1.0 if normalised else 1000.0
     for kind, mark in ((FRAME, "o"), (RECTANGLE, "s"), (SILHOUETTE, "^")):
         points: dict[float, list[float]] = {}
         for shown in planes:
@@ -304,6 +289,6 @@ def _against_distance(axis: Any, planes: Sequence[PlanePrediction], normalised: 
         axis.plot(list(points), means, mark + "-", markersize=5, label=kind)
     if not normalised:
         ends = min(DISTANCES_M), max(DISTANCES_M)
-        axis.plot(ends, ends, color=INK, linewidth=0.8, label="true")
-    tidy(axis, "Mean prediction of a facing plane", "distance, m", "share of range" if normalised else "m")
+        axis.plot(ends, ends, color=sheet.INK, linewidth=0.8, label="true")
+    sheet.tidy(axis, "Mean prediction of a facing plane", "distance, m", "share of range" if normalised else "m")
     axis.legend(fontsize=7, frameon=False)

@@ -18,23 +18,8 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics.layers import edge_map
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
-    INK,
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    bars_of,
-    drawing,
-    picture,
-    save_figure,
-    spread,
-    tidy,
-)
+from fpp_ml_bench.baselines.diagnostics.fits import edge_map
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
@@ -62,17 +47,12 @@ class GradCam(Probe):
     name = "grad-cam"
     title = "Grad-CAM"
     question = "Which pixels change the mean prediction: those at edges, or those with fringes?"
-
-    def applies_to(self, subject: Subject) -> str | None:
-        if subject.network is None:
-            return f"{subject.name} is a method without a network: it has no gradient to follow."
-        return None
+    without_network = "it has no gradient to follow"
 
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
-        most_samples = settings.samples or (QUICK_SAMPLES if settings.quick else SAMPLES)
-        samples = spread(dataset.samples("test"), most_samples)
+        samples = settings.choose(dataset.samples("test"), SAMPLES, QUICK_SAMPLES)
         if not samples:
             raise DiagnosisError(f"{dataset.path}: split test holds no sample, which Grad-CAM needs")
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
@@ -82,13 +62,12 @@ class GradCam(Probe):
             "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
             "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
         }  # fmt: skip
-        return Finding(
-            self.name,
-            self.title,
+        return self.finding(
             summary(correlations),
             {"protocol": protocol, **correlations.to_dict()},
             tables(correlations),
-            [_draw_bars(correlations, folder), _draw_heatmaps(subject, dataset, samples, layers, folder)],
+            _draw_bars(correlations, folder),
+            _draw_heatmaps(subject, dataset, samples, layers, folder),
         )
 
 
@@ -334,8 +313,8 @@ def tables(correlations: Correlations) -> list[Table]:
 
 
 def _draw_bars(correlations: Correlations, folder: Path) -> Figure:
-    figure, axes = drawing(1, 1, 9, 3.4)
-    axis, layers, positions = axes[0, 0], correlations.layers, np.arange(len(correlations.layers))
+    sheet = Sheet(1, 1, 9, 3.4)
+    axis, layers, positions = sheet.axes[0, 0], correlations.layers, np.arange(len(correlations.layers))
     series = (
         (EDGES, True, "edges", "edges"), (FRINGES, True, "phase", "fringes"),
         (EDGES, False, "random", "edges, random weights"), (FRINGES, False, "raw", "fringes, random weights"),
@@ -343,13 +322,13 @@ def _draw_bars(correlations: Correlations, folder: Path) -> Figure:
     for number, (target, trained, colour, label) in enumerate(series):
         means = [correlations.mean(layer, target, trained) for layer in layers]
         bars = [(mean.r, mean.interval) for mean in means]
-        bars_of(axis, positions + (number - 1.5) * _BAR, bars, width=_BAR, color=COLOURS[colour], label=label)
-    axis.axhline(0, color=INK, linewidth=0.8)
+        sheet.bars(axis, positions + (number - 1.5) * _BAR, bars, width=_BAR, color=sheet.COLOURS[colour], label=label)
+    axis.axhline(0, color=sheet.INK, linewidth=0.8)
     axis.set_xticks(positions, layers, rotation=30 if len(layers) > 8 else 0)
-    tidy(axis, f"Grad-CAM against edges and fringes, {len(correlations.objects)} test samples", y="Pearson r")
+    sheet.tidy(axis, f"Grad-CAM against edges and fringes, {len(correlations.objects)} test samples", y="Pearson r")
     axis.legend(fontsize=8, frameon=False, ncols=2)
     alt = "Correlation of Grad-CAM with edges and with fringes by layer"
-    return save_figure(figure, folder, Figure("Correlation by layer", "grad_cam_correlations.png", alt))
+    return sheet.save(folder, "grad_cam_correlations.png", "Correlation by layer", alt)
 
 
 def _draw_heatmaps(
@@ -357,21 +336,21 @@ def _draw_heatmaps(
 ) -> Figure:
     picks = sorted({round(share * (len(samples) - 1)) for share in np.linspace(0, 1, _EXAMPLES)})
     examples = [samples[pick] for pick in picks]
-    figure, axes = drawing(len(examples), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(examples))
+    sheet = Sheet(len(examples), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(examples))
     (index,), titles = subject.frames_used, ["input", "edges", "fringes", *layers]
     sample_maps = maps(subject, subject.networks()[0], dataset, examples, layers)
-    for row, (sample, heat) in zip(axes, sample_maps, strict=True):
+    for row, (sample, heat) in zip(sheet.axes, sample_maps, strict=True):
         frame = subject.as_input(dataset.frame(sample, index), dataset.depth_mm(sample))
         edges, fringes = references(subject, dataset, sample).values()
-        picture(row[0], frame, titles[0], low=0, high=255)
-        picture(row[1], edges, titles[1], low=0)
-        picture(row[2], fringes, titles[2], low=0)
+        sheet.picture(row[0], frame, titles[0], "gray", 0, 255)
+        sheet.picture(row[1], edges, titles[1], "gray", 0, edges.max())
+        sheet.picture(row[2], fringes, titles[2], "gray", 0, fringes.max())
         row[0].set_ylabel(sample, fontsize=7)
         for axis, layer, title in zip(row[3:], layers, titles[3:], strict=True):
-            picture(axis, heat[layer], title, "inferno", 0, float(heat[layer].max()) or 1.0)
+            sheet.picture(axis, heat[layer], title, "inferno", 0, float(heat[layer].max()) or 1.0)
         titles = [""] * len(titles)  # only above the first row
-    figure_title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
-    return save_figure(figure, folder, Figure(figure_title, "grad_cam_heatmaps.png", alt))
+    title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
+    return sheet.save(folder, "grad_cam_heatmaps.png", title, alt)
 
 
 def _r(value: float | None) -> str:

@@ -1,6 +1,6 @@
 """Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls.
 
-Probes of two kinds (`fpp_ml_bench.baselines.diagnostics.layers`) are fitted to the layers of a network, of the same
+Probes of two kinds (`fpp_ml_bench.baselines.diagnostics.fits`) are fitted to the layers of a network, of the same
 network with random weights, and to controls: the raw input and the pixel's position.
 """
 
@@ -12,40 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics.layers import (
-    BATCH,
-    EPOCHS,
-    INPUT,
-    WIDTH,
-    Moments,
-    NormalEquations,
-    ProbeSet,
-    Source,
-    apply,
-    at_pixels,
-    at_size,
-    edge_map,
-    grid_step,
-    normalised_depth,
-    run_network,
-    tapped,
-    truth,
-)
-from fpp_ml_bench.baselines.diagnostics.linear_report import (
-    CONTROLS,
-    TRAINED,
-    UNTRAINED,
-    Scores,
-    draw_four_convolutions,
-    draw_one_by_one,
-    mean_ratio,
-    ratio_of_means,
-    score,
-    summary,
-    tables,
-    to_dict,
-)
-from fpp_ml_bench.baselines.diagnostics.probe import Finding, Probe, ProbeSettings, Progress, spread
+from fpp_ml_bench.baselines.diagnostics import fits, linear_report
+from fpp_ml_bench.baselines.diagnostics.linear_report import CONTROLS, TRAINED, UNTRAINED, Scores, score
+from fpp_ml_bench.baselines.diagnostics.probe import Finding, Probe, ProbeSettings, Progress
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
@@ -81,20 +50,15 @@ class LinearProbing(Probe):
     name = "linear"
     title = "Linear probing"
     question = "What can be read from each layer: edges, depth, the fringe's phase, its order?"
-
-    def applies_to(self, subject: Subject) -> str | None:
-        if subject.network is None:
-            return f"{subject.name} is a method without a network: it has no layers to probe."
-        return None
+    without_network = "it has no layers to probe"
 
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
-        most_samples = settings.samples or (QUICK_SAMPLES if settings.quick else SAMPLES)
-        train = _samples_with_object(dataset, "train", most_samples)
-        validation = _samples_with_object(dataset, "validation", settings.samples)
+        train = settings.choose(_samples_with_object(dataset, "train"), SAMPLES, QUICK_SAMPLES)
+        validation = settings.choose(_samples_with_object(dataset, "validation"))
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
-        epochs = QUICK_EPOCHS if settings.quick else EPOCHS
+        epochs = QUICK_EPOCHS if settings.quick else fits.EPOCHS
         total, done = (len(train) + len(validation)) * (2 + seeds) + epochs * len(train), 0
 
         def tick(samples: int, activity: str) -> None:
@@ -106,31 +70,30 @@ class LinearProbing(Probe):
         linear, spatial = experiment.linear_scores(seeds), experiment.spatial_scores(seeds, epochs)
         protocol = {
             "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
-            "epochs": epochs, "batch": BATCH, "probe_width": WIDTH,
-            "image_px_a_grid_step": grid_step(subject.image_size),
+            "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
+            "image_px_a_grid_step": fits.grid_step(subject.image_size),
         }  # fmt: skip
-        return Finding(
-            self.name,
-            self.title,
-            summary(linear, spatial),
+        return self.finding(
+            linear_report.summary(linear, spatial),
             {
                 "protocol": protocol,
-                "four_convolutions": to_dict(spatial),
-                "ratio": mean_ratio(spatial[TRAINED]),
-                "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]),
-                "linear": to_dict(linear),
+                "four_convolutions": linear_report.to_dict(spatial),
+                "ratio": linear_report.mean_ratio(spatial[TRAINED]),
+                "ratio_of_means": linear_report.ratio_of_means(spatial[CONTROLS][fits.INPUT]),
+                "linear": linear_report.to_dict(linear),
             },
-            tables(linear, spatial),
-            [draw_four_convolutions(spatial, folder), draw_one_by_one(linear, folder)],
+            linear_report.tables(linear, spatial),
+            linear_report.draw_four_convolutions(spatial, folder),
+            linear_report.draw_one_by_one(linear, folder),
         )
 
 
-def _samples_with_object(dataset: DatasetFolder, split: str, limit: int | None) -> list[str]:
-    """At most ``limit`` samples of ``split`` that show an object. Raises `DiagnosisError` where there is none."""
+def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
+    """The samples of ``split`` that show an object. Raises `DiagnosisError` where there is none."""
     names = [name for name in dataset.samples(split) if object_mask(dataset.depth_mm(name)).any()]
     if not names:
         raise DiagnosisError(f"{dataset.path}: split {split} holds no object; probes need training and validation data")
-    return spread(names, limit)
+    return names
 
 
 @dataclass
@@ -168,7 +131,7 @@ class Pixels:
         dataset, split = self.dataset, self.dataset.split_of_sample(sample)
         rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
         direction = "horizontal" if self.direction == "both" else self.direction
-        ground_truth = truth(dataset.depth_mm(sample), dataset.rig, direction)
+        ground_truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
         inside, size = np.flatnonzero(ground_truth.inside), ground_truth.inside.size
         drawn = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
         targets = {
@@ -207,7 +170,7 @@ class Experiment:
         scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
         errors, reference = self.linear_errors(network, controls=True)
         for (layer, target), sample_errors in errors.items():
-            source = CONTROLS if layer in (INPUT, POSITION) else TRAINED
+            source = CONTROLS if layer in (fits.INPUT, POSITION) else TRAINED
             scores[source].setdefault(layer, {})[target] = score([sample_errors], reference[target], self.objects)
         random_errors = [self.linear_errors(untrained(seed))[0] for seed in range(seeds)]
         for layer, target in random_errors[0]:
@@ -221,16 +184,16 @@ class Experiment:
         The second value holds the errors of predicting the mean, by target. With ``controls`` the raw input and the
         position are probed like layers.
         """
-        equations: dict[tuple[str, bool], NormalEquations] = {}
+        equations: dict[tuple[str, bool], fits.NormalEquations] = {}
         for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
             if (layer, key) not in equations:
-                equations[layer, key] = NormalEquations(features.shape[2], targets.shape[2])
+                equations[layer, key] = fits.NormalEquations(features.shape[2], targets.shape[2])
             equations[layer, key].add(features.flatten(0, 1), targets.flatten(0, 1))
         weights = {probe: normal_equations.solve() for probe, normal_equations in equations.items()}
         errors: Errors = {}
         for layer, key, features, targets in self._pixel_batches(network, self.validation, "validating", controls):
             for sample_features, sample_targets in zip(features, targets, strict=True):
-                difference = apply(weights[layer, key], sample_features) - sample_targets.double()
+                difference = fits.apply(weights[layer, key], sample_features) - sample_targets.double()
                 for name, error in self.pixels.errors_of(layer, key, difference):
                     errors.setdefault(name, []).append(error)
         means: dict[bool, Tensor] = {}
@@ -252,15 +215,15 @@ class Experiment:
         drawn: dict[bool, Tensor] = {}
 
         def take(features: Tensor) -> Tensor:
-            return torch.stack([at_pixels(features, pixels, size) for pixels in drawn.values()])
+            return torch.stack([fits.at_pixels(features, pixels, size) for pixels in drawn.values()])
 
-        with tapped(layers, take) as activations:
+        with fits.tapped(layers, take) as activations:
             for names, fringe in self.subject.batches(self.dataset, samples):
                 batch = [self.pixels.of(name) for name in names]
                 drawn.update({key: torch.stack([sample.pixels[key] for sample in batch]) for key in (False, True)})
-                run_network(network, fringe, activations, list(layers), self.subject.name)
+                fits.run_network(network, fringe, activations, list(layers), self.subject.name)
                 if controls:
-                    activations[INPUT] = take(fringe)
+                    activations[fits.INPUT] = take(fringe)
                     activations[POSITION] = torch.stack([_position(pixels, size) for pixels in drawn.values()])
                 for layer, of_sets in activations.items():
                     for key, features in zip(drawn, of_sets, strict=True):
@@ -271,40 +234,40 @@ class Experiment:
         """Scores of the four-convolution probes: of the network, of an untrained copy, and of the raw input."""
         network, untrained = self.subject.networks()
         # Each seed of the untrained network costs another forward pass per batch, so there is one.
-        seed_counts = {TRAINED: seeds, INPUT: seeds, UNTRAINED: 1}
+        seed_counts = {TRAINED: seeds, fits.INPUT: seeds, UNTRAINED: 1}
         errors, reference = self.spatial_errors({TRAINED: network, UNTRAINED: untrained(0)}, seed_counts, epochs)
         scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
         for (source, layer), target in dict.fromkeys(key[:2] for key in errors):
             seed_errors = [errors[(source, layer), target, seed] for seed in range(seed_counts[source])]
-            layer_scores = scores[CONTROLS if source == INPUT else source].setdefault(layer, {})
+            layer_scores = scores[CONTROLS if source == fits.INPUT else source].setdefault(layer, {})
             layer_scores[target] = score(seed_errors, reference[target], self.objects)
         return scores
 
     def spatial_errors(
         self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
-    ) -> tuple[dict[tuple[Source, str, int], list[float]], dict[str, list[float]]]:
+    ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
         """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed.
 
         The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input. The
         second value holds the errors of predicting the mean.
         """
-        moments: dict[Source, Moments] = {}
+        moments: dict[fits.Source, fits.Moments] = {}
         sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
         for features, targets in self._map_batches(networks, self.train, "spread of the activations"):
             for source, maps in features.items():
-                moments.setdefault(source, Moments()).add(maps)
+                moments.setdefault(source, fits.Moments()).add(maps)
             for target, values in targets.items():
                 sums[target] += float(values.double().sum())
                 counts[target] += values.numel()
         means = {target: sums[target] / counts[target] for target in SPATIAL}
-        steps = epochs * -(-len(self.train) // BATCH)
-        probes = ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
+        steps = epochs * -(-len(self.train) // fits.BATCH)
+        probes = fits.ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
         for epoch in range(epochs):
             order = np.random.default_rng([1, epoch]).permutation(len(self.train))
             shuffled = [self.train[index] for index in order]
             for features, targets in self._map_batches(networks, shuffled, "training four-convolution probes"):
                 probes.step(features, targets)
-        errors: dict[tuple[Source, str, int], list[float]] = {}
+        errors: dict[tuple[fits.Source, str, int], list[float]] = {}
         reference: dict[str, list[float]] = {target: [] for target in SPATIAL}
         for features, targets in self._map_batches(networks, self.validation, "validating four-convolution probes"):
             for probe, sample_errors in probes.errors(features, targets).items():
@@ -315,24 +278,24 @@ class Experiment:
 
     def _map_batches(
         self, networks: Mapping[str, nn.Module], samples: Sequence[str], activity: str
-    ) -> Iterator[tuple[dict[Source, Tensor], dict[str, Tensor]]]:
+    ) -> Iterator[tuple[dict[fits.Source, Tensor], dict[str, Tensor]]]:
         """Activations (B, C, h, w) of every layer and targets (B, 1, h, w), on one grid."""
         height, width = self.subject.image_size
-        step = grid_step((height, width))
+        step = fits.grid_step((height, width))
         side = max(1, height // step), max(1, width // step)
-        for names, fringe in self.subject.batches(self.dataset, samples, BATCH):
-            features = {(INPUT, INPUT): at_size(fringe, side)}
+        for names, fringe in self.subject.batches(self.dataset, samples, fits.BATCH):
+            features = {(fits.INPUT, fits.INPUT): fits.at_size(fringe, side)}
             for source, network in networks.items():
                 layers = self.subject.layers_of(network)
-                with tapped(layers, lambda maps: at_size(maps, side)) as activations:
-                    run_network(network, fringe, activations, list(layers), self.subject.name)
+                with fits.tapped(layers, lambda maps: fits.at_size(maps, side)) as activations:
+                    fits.run_network(network, fringe, activations, list(layers), self.subject.name)
                     features |= {(source, layer): activations[layer] for layer in layers}
             depths = [self.dataset.depth_mm(name) for name in names]
             targets = {
-                "edges": np.stack([edge_map(depth_mm) for depth_mm in depths]),
-                "depth": np.stack([normalised_depth(depth_mm) for depth_mm in depths]),
+                "edges": np.stack([fits.edge_map(depth_mm) for depth_mm in depths]),
+                "depth": np.stack([fits.normalised_depth(depth_mm) for depth_mm in depths]),
             }
-            yield features, {key: at_size(torch.from_numpy(maps)[:, None], side) for key, maps in targets.items()}
+            yield features, {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in targets.items()}
             self.tick(len(names), activity)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.baselines.diagnostics.layers import INPUT
-from fpp_ml_bench.baselines.diagnostics.probe import COLOURS, GRID, Figure, Table, bars_of, drawing, save_figure, tidy
+from fpp_ml_bench.baselines.diagnostics.fits import INPUT
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Sheet, Table
 from fpp_ml_bench.evaluation.score import Interval, object_interval
 
 PAPER_RATIO = 2.82
@@ -163,30 +163,29 @@ def _r2(one: Score) -> str:
 def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
     """The paper's figure, and the same probes as shares of variance."""
     layers, raw = list(spatial[TRAINED]), spatial[CONTROLS][INPUT]
-    figure, axes = drawing(1, 2, 10, 3.6)
+    sheet = Sheet(1, 2, 10, 3.6)
     for axis, key, title in (
-        (axes[0, 0], "mse", "Validation MSE: the paper's figure (different units!)"),
-        (axes[0, 1], "r2", "The same probes: share of variance explained"),
+        (sheet.axes[0, 0], "mse", "Validation MSE: the paper's figure (different units!)"),
+        (sheet.axes[0, 1], "r2", "The same probes: share of variance explained"),
     ):
         for shift, target in ((-1, "edges"), (1, "depth")):
             scores, positions = [spatial[TRAINED][layer][target] for layer in layers], np.arange(len(layers))
             positions = positions + shift * _BAR / 2
             bars = [(getattr(one, key), getattr(one, f"{key}_interval")) for one in scores]
-            bars_of(axis, positions, bars, width=_BAR, color=COLOURS[target], label=target)
+            sheet.bars(axis, positions, bars, width=_BAR, color=sheet.COLOURS[target], label=target)
             random = [getattr(spatial[UNTRAINED][layer][target], key) for layer in layers]
             axis.plot(
                 positions, random, linestyle="none", marker="_", markersize=9, markeredgewidth=2, color="black",
                 label="random weights" if shift > 0 else None,
             )  # fmt: skip
-            label = f"raw input, {target}"
-            axis.axhline(getattr(raw[target], key), color=COLOURS[target], linewidth=1, linestyle=":", label=label)
+            style = {"color": sheet.COLOURS[target], "linewidth": 1, "linestyle": ":"}
+            axis.axhline(getattr(raw[target], key), label=f"raw input, {target}", **style)
         _layers(axis, layers)
-        tidy(axis, title, y="MSE" if key == "mse" else "R2")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=8, frameon=False, ncols=5, loc="outside lower center")
+        sheet.tidy(axis, title, y="MSE" if key == "mse" else "R2")
+    handles, labels = sheet.axes[0, 0].get_legend_handles_labels()
+    sheet.figure.legend(handles, labels, fontsize=8, frameon=False, ncols=5, loc="outside lower center")
     alt = "Edge and depth probe error and of variance explained for each layer, with random weights and raw input"
-    about = Figure("Four-convolution probes by layer", "linear_four_convolutions.png", alt)
-    return save_figure(figure, folder, about)
+    return sheet.save(folder, "linear_four_convolutions.png", "Four-convolution probes by layer", alt)
 
 
 def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
@@ -195,34 +194,33 @@ def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
     targets, positions = list(linear[TRAINED][layers[0]]), np.arange(len(layers))
     columns = 3 if len(targets) > 2 else 2
     rows = -(-len(targets) // columns)
-    figure, axes = drawing(rows, columns, 10, 2.7 * rows)
-    for axis, target in zip(axes.flat, targets, strict=False):
+    sheet = Sheet(rows, columns, 10, 2.7 * rows)
+    for axis, target in zip(sheet.axes.flat, targets, strict=False):
         trained, random = ([linear[source][layer][target] for layer in layers] for source in (TRAINED, UNTRAINED))
         low, high = [min(one.seeds) for one in random], [max(one.seeds) for one in random]
-        axis.fill_between(positions, low, high, color=COLOURS["random"], alpha=0.4, linewidth=0)
-        axis.plot(positions, [one.r2 for one in random], color=COLOURS["random"], label="random weights")
-        style = {"color": COLOURS[target], "marker": "o", "markersize": 4, "label": "trained"}
+        axis.fill_between(positions, low, high, color=sheet.COLOURS["random"], alpha=0.4, linewidth=0)
+        axis.plot(positions, [one.r2 for one in random], color=sheet.COLOURS["random"], label="random weights")
+        style = {"color": sheet.COLOURS[target], "marker": "o", "markersize": 4, "label": "trained"}
         axis.plot(positions, [one.r2 for one in trained], **style)
         for x, one in zip(positions, trained, strict=True):
             if one.r2_interval is not None:
-                axis.plot([x, x], one.r2_interval, color=COLOURS[target], linewidth=1)
+                axis.plot([x, x], one.r2_interval, color=sheet.COLOURS[target], linewidth=1)
         for control, label, line in ((INPUT, "raw input", ":"), ("position", "pixel's position", "--")):
             r2 = linear[CONTROLS][control][target].r2
             axis.axhline(r2, color="black", linewidth=1, linestyle=line, label=label)
-        axis.axhline(0, color=GRID, linewidth=1)
+        axis.axhline(0, color=sheet.GRID, linewidth=1)
         axis.set_ylim(min(-0.1, max(-0.5, min(one.r2 for one in trained) - 0.05)), 1.02)
         _layers(axis, layers)
-        tidy(axis, TITLES[target], y="R2")
-    for axis in axes.flat[len(targets) :]:
+        sheet.tidy(axis, TITLES[target], y="R2")
+    for axis in sheet.axes.flat[len(targets) :]:
         axis.axis("off")
     if len(targets) < rows * columns:
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        axes.flat[-1].legend(handles, labels, fontsize=8, frameon=False, loc="center")
+        handles, labels = sheet.axes.flat[0].get_legend_handles_labels()
+        sheet.axes.flat[-1].legend(handles, labels, fontsize=8, frameon=False, loc="center")
     else:
-        axes.flat[0].legend(fontsize=7, frameon=False)
+        sheet.axes.flat[0].legend(fontsize=7, frameon=False)
     alt = f"R2 of linear probes for {', '.join(TITLES[target] for target in targets)} by layer, with controls"
-    about = Figure("Linear (1 x 1) probes by layer and target", "linear_one_by_one.png", alt)
-    return save_figure(figure, folder, about)
+    return sheet.save(folder, "linear_one_by_one.png", "Linear (1 x 1) probes by layer and target", alt)
 
 
 def _layers(axis: Any, layers: Sequence[str]) -> None:

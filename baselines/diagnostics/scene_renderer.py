@@ -16,21 +16,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.loaders.render import (
-    MESH_FOLDER,
-    BuildSettings,
-    Exposure,
-    Lighting,
-    LitPixels,
-    Noise,
-    PixelRays,
-    TracedObject,
-    UserMesh,
-    background_plane,
-    light_surface,
-    load_user_mesh,
-    turned,
-)
+from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction, Rig
@@ -95,12 +81,12 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
     pixels = np.flatnonzero(object_mask(depth_mm))
     normals, depth_m = normals_of_depth(depth_mm, x, y)[pixels], depth_mm.ravel()[pixels] / MM_PER_M
     record = dataset.measured(sample)
-    mesh_file = dataset.path / MESH_FOLDER / f"{record['object']}.ply"
+    mesh_file = dataset.path / render.MESH_FOLDER / f"{record['object']}.ply"
     if mesh_file.is_file() and record.get("distance_mm") is not None:
-        solid = load_user_mesh(UserMesh(mesh_file.stem, str(mesh_file), centre=False))
-        vertices_m = turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
+        solid = render.load_user_mesh(render.UserMesh(mesh_file.stem, str(mesh_file), centre=False))
+        vertices_m = render.turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
         placed_m = vertices_m + np.array([0, 0, record["distance_mm"] / MM_PER_M])
-        hits = TracedObject(solid, placed_m).primary(PixelRays.of(dataset.rig.camera))
+        hits = render.TracedObject(solid, placed_m).primary(render.PixelRays.of(dataset.rig.camera))
         _, seen, hit = np.intersect1d(pixels, hits.pixels, assume_unique=True, return_indices=True)
         same = np.abs(hits.depth_m[hit] - depth_m[seen]) < _SAME_SURFACE_M
         normals[seen[same]] = hits.normals[hit[same]]
@@ -196,7 +182,7 @@ class Scene:
     """
 
     pixels: NDArray[np.uint32]
-    lit: LitPixels
+    lit: render.LitPixels
     mask: NDArray[np.bool_]
     stream: tuple[object, ...]
     projected: Projected = "sequence"
@@ -205,10 +191,10 @@ class Scene:
 class SceneRenderer:
     """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
 
-    def __init__(self, rig: Rig, noise_sigma_grey: float = BuildSettings.noise_sigma_grey) -> None:
-        self.rig, self.lighting = rig, Lighting()
+    def __init__(self, rig: Rig, noise_sigma_grey: float = render.BuildSettings.noise_sigma_grey) -> None:
+        self.rig, self.lighting = rig, render.Lighting()
         self.shape = (rig.camera.height, rig.camera.width)
-        self.noise = Noise.of_sigma(noise_sigma_grey)
+        self.noise = render.Noise.of_sigma(noise_sigma_grey)
         self._all_pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
         self._background_stream: tuple[object, ...] = ()
         self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
@@ -216,34 +202,36 @@ class SceneRenderer:
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
         """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
-        return cls(dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", BuildSettings.noise_sigma_grey))
+        return cls(
+            dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", render.BuildSettings.noise_sigma_grey)
+        )
 
     @cached_property
-    def exposure(self) -> Exposure:
-        return Exposure.of(self.rig, self.noise)
+    def exposure(self) -> render.Exposure:
+        return render.Exposure.of(self.rig, self.noise)
 
     @cached_property
-    def _uniform(self) -> Exposure:
+    def _uniform(self) -> render.Exposure:
         light = np.broadcast_to(self.exposure.light.mean(axis=1, keepdims=True), self.exposure.light.shape)
         return replace(self.exposure, light=np.ascontiguousarray(light))
 
     @cached_property
-    def _other_pitch(self) -> Exposure:
+    def _other_pitch(self) -> render.Exposure:
         horizontal_px, vertical_px = (
             PITCH_FACTOR * self.rig.pitch_horizontal_px,
             PITCH_FACTOR * self.rig.pitch_vertical_px,
         )
-        return Exposure.of(
+        return render.Exposure.of(
             replace(self.rig, pitch_horizontal_px=horizontal_px, pitch_vertical_px=vertical_px), self.noise
         )
 
     @cached_property
-    def _empty(self) -> LitPixels:
-        return background_plane(self.rig, self.lighting)
+    def _empty(self) -> render.LitPixels:
+        return render.background_plane(self.rig, self.lighting)
 
-    def light(self, surface: Surface) -> LitPixels:
+    def light(self, surface: Surface) -> render.LitPixels:
         """The light on ``surface``; no cast shadows, as in the paper."""
-        return light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
+        return render.light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
@@ -263,7 +251,7 @@ class SceneRenderer:
             frames[index] = image * scene.mask if masked else image
         return frames
 
-    def _background(self, stream: tuple[object, ...], index: int, exposure: Exposure) -> NDArray[np.uint8]:
+    def _background(self, stream: tuple[object, ...], index: int, exposure: render.Exposure) -> NDArray[np.uint8]:
         if self._background_stream != stream:
             self._background_stream, self._backgrounds = stream, {}
         key = id(exposure), index  # the three exposures live as long as the renderer

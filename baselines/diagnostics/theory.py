@@ -20,20 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
-    GRID,
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    drawing,
-    picture,
-    save_figure,
-    tidy,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, Surface, constant, moved, times
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
@@ -130,8 +117,8 @@ class Theory(Probe):
                 for curve in curves
             ],
         }  # fmt: skip
-        figures = [_draw_twins(twins, folder), _draw_curves(curves, folder)]
-        return Finding(self.name, self.title, summary(values), values, tables(values, curves), figures)
+        figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
+        return self.finding(summary(values), values, tables(values, curves), *figures)
 
 
 def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
@@ -286,38 +273,38 @@ def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Tabl
 
 
 def _draw_twins(twins: Twins, folder: Path) -> Figure:
-    figure, axes = drawing(2, 4, 10, 5.0)
+    sheet = Sheet(2, 4, 10, 5.0)
     inside = twins.depths_mm[0] > 0
     depths = [depth[inside] for depth in twins.depths_mm]
     low, high = min(depth.min() for depth in depths), max(depth.max() for depth in depths)
     pairs = (twins.frames, twins.direction), (twins.other_frames, "other direction")
-    for row, (name, axis, depth) in enumerate(zip("AB", axes, twins.depths_mm, strict=True)):
-        shown = picture(axis[0], np.where(inside, depth, np.nan), f"scene {name}: depth, mm", "viridis", low, high)
-        picture(axis[1], twins.frames[row], f"its {twins.direction} fringe", low=0, high=255)
-        picture(axis[2], twins.other_frames[row], "its other direction", low=0, high=255)
-        figure.colorbar(shown, ax=axis[0], fraction=0.05, pad=0.03).ax.tick_params(labelsize=7)
-    for axis, ((first, second), direction) in zip(axes[:, 3], pairs, strict=True):
+    for row, (name, axis, depth) in enumerate(zip("AB", sheet.axes, twins.depths_mm, strict=True)):
+        depth_mm = np.where(inside, depth, np.nan)
+        shown = sheet.picture(axis[0], depth_mm, f"scene {name}: depth, mm", "viridis", low, high)
+        sheet.picture(axis[1], twins.frames[row], f"its {twins.direction} fringe", "gray", 0, 255)
+        sheet.picture(axis[2], twins.other_frames[row], "its other direction", "gray", 0, 255)
+        sheet.scale(shown, axis[0], fraction=0.05, pad=0.03)
+    for axis, ((first, second), direction) in zip(sheet.axes[:, 3], pairs, strict=True):
         difference = second.astype(np.int64) - first
         title = f"B - A, {direction}:\n{np.count_nonzero(difference)} pixels differ"
-        shown = picture(axis, difference, title, "coolwarm", -60, 60)
-    bar = figure.colorbar(shown, ax=axes[:, 3], fraction=0.05, pad=0.03, label="grey levels")
-    bar.ax.tick_params(labelsize=7)
+        shown = sheet.picture(axis, difference, title, "coolwarm", -60, 60)
+    sheet.scale(shown, sheet.axes[:, 3], fraction=0.05, pad=0.03, label="grey levels")
     alt = "Two depths a period apart, their identical fringes, and their difference"
-    return save_figure(figure, folder, Figure("Two scenes, one frame", "theory_twins.png", alt))
+    return sheet.save(folder, "theory_twins.png", "Two scenes, one frame", alt)
 
 
 def _draw_curves(curves: Sequence[ErrorCurve], folder: Path) -> Figure:
-    figure, axes = drawing(1, 2, 10, 3.8)
-    errors, exponents = axes[0]
+    sheet = Sheet(1, 2, 10, 3.8)
+    errors, exponents = sheet.axes[0]
     for curve, name in zip(curves, ("edges", "depth", "phase", "order", "raw"), strict=True):
-        finite, style = np.isfinite(curve.error_mm), {"color": COLOURS[name], "linewidth": 1.4}
+        finite, style = np.isfinite(curve.error_mm), {"color": sheet.COLOURS[name], "linewidth": 1.4}
         errors.loglog(curve.distances_m[finite], curve.error_mm[finite], label=curve.name, **style)
         exponents.semilogx(curve.distances_m, curve.local, **style)
-    exponents.axhspan(1.98, 2.02, color=GRID)
+    exponents.axhspan(1.98, 2.02, color=sheet.GRID)
     exponents.text(0.31, 2.2, "grey: 2 within 1%", fontsize=7)
     exponents.set_ylim(1.0, 3.5)
-    tidy(errors, "Depth error of a phase error", "distance, m", "mm")
-    tidy(exponents, "Local exponent of distance", "distance, m")
+    sheet.tidy(errors, "Depth error of a phase error", "distance, m", "mm")
+    sheet.tidy(exponents, "Local exponent of distance", "distance, m")
     for axis in (errors, exponents):
         axis.axvspan(1.5, 2.1, color="#f0e6d2", zorder=0)
         axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
@@ -325,4 +312,4 @@ def _draw_curves(curves: Sequence[ErrorCurve], folder: Path) -> Figure:
     errors.legend(fontsize=7, frameon=False)
     errors.text(1.53, errors.get_ylim()[0] * 1.3, "working\nrange", fontsize=7)
     alt = "Depth error of a phase error from 0.3 to 10 m, and its exponent"
-    return save_figure(figure, folder, Figure("Depth error against distance", "theory_range.png", alt))
+    return sheet.save(folder, "theory_range.png", "Depth error against distance", alt)

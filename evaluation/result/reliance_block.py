@@ -1,7 +1,7 @@
 """Phase reliance as part of a result: how far a method's answers follow the phase of the fringes.
 
-``fpp_ml_bench.baselines.diagnostics.phase_reliance`` defines it and measures it on counterfactual scenes; this module is
-the form of its block in a result file.
+``fpp_ml_bench.baselines.diagnostics.phase_reliance`` defines it and measures it on counterfactual scenes; this module
+is the form of its block in a result file.
 """
 
 from typing import Annotated, Literal

@@ -10,19 +10,10 @@ import torch
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines.diagnostics import diagnosis
+from fpp_ml_bench.baselines.diagnostics.diagnosis import checked_names, load_finding, save_finding
 from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam
 from fpp_ml_bench.baselines.diagnostics.linear import LinearProbing
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    PROBES,
-    Figure,
-    Finding,
-    ProbeSettings,
-    Table,
-    checked_names,
-    load_finding,
-    save_finding,
-    spread,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, ProbeSettings, Table, spread
 from fpp_ml_bench.baselines.diagnostics.subjects import subject
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.baselines.training import save_weights

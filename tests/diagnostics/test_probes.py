@@ -8,9 +8,8 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics import layers, linear
-from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
-from fpp_ml_bench.baselines.diagnostics.layers import (
+from fpp_ml_bench.baselines.diagnostics import fits, linear
+from fpp_ml_bench.baselines.diagnostics.fits import (
     INPUT,
     NormalEquations,
     apply,
@@ -20,6 +19,7 @@ from fpp_ml_bench.baselines.diagnostics.layers import (
     tapped,
     truth,
 )
+from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
 from fpp_ml_bench.baselines.diagnostics.linear_report import score
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.decoding import depth_from_coordinate, wrapped_phase
@@ -173,7 +173,7 @@ def test_score_is_share_of_variance_with_an_interval_that_holds_it():
 
 def test_moments_are_mean_and_spread_of_each_channel():
     batches = [torch.randn(n, 3, 4, 5) * torch.tensor([1.0, 10.0, 0.0]).view(3, 1, 1) + 2 for n in (2, 3)]
-    moments = layers.Moments()
+    moments = fits.Moments()
     for batch in batches:
         moments.add(batch)
     mean, factor = moments.standard()
@@ -193,11 +193,11 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
         return features, {"edges": functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)}
 
     features, target = batch()
-    moments = {name: layers.Moments() for name in features}
+    moments = {name: fits.Moments() for name in features}
     for name, moment in moments.items():
         moment.add(features[name])
     mean = float(target["edges"].mean())
-    probes = layers.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
+    probes = fits.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
     assert set(probes.probes) == {("here/a", "edges", 0), ("here/a", "edges", 1), ("else/b", "edges", 0)}
     reference = (target["edges"].double() - mean).square().mean((1, 2, 3))
     for errors in probes.errors(features, target).values():
