@@ -169,8 +169,8 @@ def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
         (sheet.axes[0, 1], "r2", "The same probes: share of variance explained"),
     ):
         for shift, target in ((-1, "edges"), (1, "depth")):
-            scores, positions = [spatial[TRAINED][layer][target] for layer in layers], np.arange(len(layers))
-            positions = positions + shift * _BAR / 2
+            scores = [spatial[TRAINED][layer][target] for layer in layers]
+            positions = np.arange(len(layers)) + shift * _BAR / 2
             bars = [(getattr(one, key), getattr(one, f"{key}_interval")) for one in scores]
             sheet.bars(axis, positions, bars, width=_BAR, color=sheet.COLOURS[target], label=target)
             random = [getattr(spatial[UNTRAINED][layer][target], key) for layer in layers]

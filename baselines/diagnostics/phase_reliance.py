@@ -75,13 +75,16 @@ class Change:
         answered = (first != 0) & (second != 0) if zero_is_none else np.ones(first.shape, dtype=bool)
         return cls(np.asarray(expected[where], dtype=np.float64), np.where(answered, second - first, 0.0), answered)
 
+    def at(self, chosen: NDArray[np.bool_]) -> "Change":
+        """The part at ``chosen`` (n,)."""
+        return Change(self.expected[chosen], self.actual[chosen], self.answered[chosen])
+
 
 def follows(changes: Sequence[Change]) -> float | None:
     """Purity times min(gain, 1 / gain) of the ``changes``; None where no change is expected."""
-    product, actual, expected = (
-        sum(float(np.dot(getattr(change, a), getattr(change, b))) for change in changes)
-        for a, b in (("actual", "expected"), ("actual", "actual"), ("expected", "expected"))
-    )
+    product = sum(float(change.actual @ change.expected) for change in changes)
+    actual = sum(float(change.actual @ change.actual) for change in changes)
+    expected = sum(float(change.expected @ change.expected) for change in changes)
     if expected <= 0:
         return None
     if product <= 0:
@@ -221,10 +224,9 @@ def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> Sample
         "follows_constant": followed(constant, lambda move: move.phase),
     }
     for name, scene in scenes.reprojected.items():
-        key, still = name.replace(" ", "_"), np.zeros(target.shape)
-        other = Change.of(before, predictor.predict(scene), still, target, predictor.in_mm)
-        answered = Change(*(values[other.answered] for values in (other.expected, other.actual, other.answered)))
-        parts[f"change_{key}"] = relative_change([answered], unit)
+        key = name.replace(" ", "_")
+        other = Change.of(before, predictor.predict(scene), np.zeros(target.shape), target, predictor.in_mm)
+        parts[f"change_{key}"] = relative_change([other.at(other.answered)], unit)
         if name.startswith("no fringe"):
             parts[f"answered_{key}"] = float(other.answered.mean())
     order_free_score = None

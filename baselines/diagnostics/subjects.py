@@ -102,9 +102,7 @@ class Subject:
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """The input of ``network`` for several samples: float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without
-        a network or its frame."""
-        if self.network is None:
-            raise DiagnosisError(f"{self.name} has no network, so there is no input to it")
+        its frame."""
         (index,) = self.frames_used
         images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
         if len(images) != len(stacks):
@@ -128,13 +126,12 @@ class Subject:
     def represent(self, frames: Frames) -> NDArray[np.float32]:
         """The network's output float32 (H, W) in its ``normalisation``.
 
-        Raises `DiagnosisError` as `input_batch`, and for an output of another shape or with values that are not finite.
+        Raises `DiagnosisError` without a network or its frame, and for an output of another shape or not finite.
         """
-        if self.network is None:
-            raise DiagnosisError(f"{self.name} has no network, so it has no network output")
+        network, _ = self.networks()
         batch = self.input_batch([frames])
         with torch.inference_mode():
-            return checked_output(self.network(batch), batch, self.name)[0, 0].numpy()
+            return checked_output(network(batch), batch, self.name)[0, 0].numpy()
 
 
 def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:

@@ -93,6 +93,10 @@ class ErrorCurve:
         quadratic = self.distances_m[np.abs(self.local - 2) <= 2 * WITHIN]
         return (float(quadratic.min()), float(quadratic.max())) if quadratic.size else None
 
+    def to_dict(self) -> dict[str, Any]:
+        about = {"name": self.name, "periods": self.periods, "exponent": self.exponent}
+        return {**about, "fitted_m": list(self.fitted_m), "quadratic_m": self.quadratic_m()}
+
 
 class Theory(Probe):
     """Both theorems on the dataset's rig."""
@@ -111,12 +115,8 @@ class Theory(Probe):
         values = {
             "twins": twins.to_dict(),
             "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": [
-                {"name": curve.name, "periods": curve.periods, "exponent": curve.exponent,
-                 "fitted_m": list(curve.fitted_m), "quadratic_m": curve.quadratic_m()}
-                for curve in curves
-            ],
-        }  # fmt: skip
+            "curves": [curve.to_dict() for curve in curves],
+        }
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 
