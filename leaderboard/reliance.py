@@ -1,20 +1,16 @@
 """Writing a measured phase reliance into the result file or row of the same method."""
 
-from typing import TYPE_CHECKING
-
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Reliance, Result, result_content, write_result
 from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.method import Method
-
 _OF_THE_MACHINE = ("threads", "device")
 
 
-def check_same_method(entry: Entry, method: "Method") -> None:
+def check_same_method(entry: Entry, method: Method) -> None:
     """Refuse (SubmissionError) a row of another method: name, frames, units, or a setting that both have."""
     about = entry.result.submission
     pairs: dict[str, tuple[object, object]] = {

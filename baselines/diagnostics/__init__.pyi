@@ -1,11 +1,11 @@
 from .counterfactual_scenes import VIEWS_PER_OBJECT as VIEWS_PER_OBJECT
 from .counterfactual_scenes import SceneSet as SceneSet
 from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import checked_names as checked_names
 from .diagnosis import diagnose as diagnose
+from .phase_reliance import measure as measure
+from .probe import PROBES as PROBES
 from .probe import Probe as Probe
 from .probe import ProbeSettings as ProbeSettings
 from .probe import Progress as Progress
-from .registry import PROBES as PROBES
-from .registry import checked_names as checked_names
-from .reliance_measure import measure as measure
 from .subjects import subject as subject

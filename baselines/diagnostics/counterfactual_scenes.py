@@ -7,19 +7,27 @@ shift can't be confused with the opposite one.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, OutlineChange, original
-from fpp_ml_bench.baselines.diagnostics.counterfactual_outlines import outline_changes
-from fpp_ml_bench.baselines.diagnostics.synth import Projected, Scene, SceneRenderer
-from fpp_ml_bench.baselines.diagnostics.synth_surface import Field, Surface, moved
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
+    Field,
+    Projected,
+    Scene,
+    SceneRenderer,
+    Surface,
+    constant,
+    moved,
+    surface_of_sample,
+    times,
+)
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.render import LitPixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
@@ -30,6 +38,43 @@ REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "
 VIEWS_PER_OBJECT = 2
 _STORED_PX = 300
 """Scenes of images up to this width are kept in memory; larger ones are made again for each method."""
+GROWTH = 0.1
+"""How far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area."""
+KEPT_SHARE = 0.5
+"""Share of the object that an ellipse leaves; of the other objects' outlines the nearest to this share is used."""
+
+
+@dataclass(frozen=True)
+class Original:
+    """An unchanged sample: its ``object``, ``surface`` and ``scene``, exact ``depth_mm`` float64 (H, W), and ``target``
+    bool (H, W): the pixels with a decoded depth, which are scored."""
+
+    sample: str
+    object: str
+    surface: Surface
+    scene: Scene
+    target: NDArray[np.bool_]
+    depth_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OutlineChange:
+    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
+    after."""
+
+    name: str
+    scene: Scene
+    unchanged: NDArray[np.bool_]
+    depth_mm: NDArray[np.float64]
+
+
+def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Original:
+    """``sample`` as the dataset shows it."""
+    record, surface = dataset.measured(sample), surface_of_sample(dataset, sample)
+    target = object_mask(dataset.depth_mm(sample))
+    stream = (dataset.manifest.settings.get("seed", 0), record["object"], record["view"])
+    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), target, stream)
+    return Original(sample, record["object"], surface, scene, target, surface.depth_mm(renderer.shape))
 
 
 @dataclass(frozen=True)
@@ -65,20 +110,16 @@ class Counterfactuals:
 
 
 def counterfactuals(
-    dataset: DatasetFolder,
-    renderer: SceneRenderer,
-    sample: str,
-    direction: Direction,
-    outline_samples: Sequence[str] = (),
+    dataset: DatasetFolder, renderer: SceneRenderer, sample: str, direction: Direction, outline_samples: Sequence[str]
 ) -> Counterfactuals:
     """Every scene of ``sample``, which may be cut to the outlines of ``outline_samples``.
 
     Raises `DiagnosisError` for a sample without an object.
     """
-    outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
     sample_scene = original(dataset, renderer, sample)
     if not sample_scene.target.any():
         raise DiagnosisError(f"{dataset.path}: {sample} shows no object; choose samples that do")
+    outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
     return Counterfactuals(
         original=sample_scene,
         direction=direction,
@@ -87,6 +128,9 @@ def counterfactuals(
         outline_changes=tuple(outline_changes(sample_scene, renderer, outlines)),
         reprojected={name: replace(sample_scene.scene, projected=name) for name in REPROJECTED},
     )
+
+
+# ---- the phase moved
 
 
 def fields(surface: Surface) -> dict[str, Field]:
@@ -98,15 +142,11 @@ def fields(surface: Surface) -> dict[str, Field]:
         return (x - middle[0]) / half[0], (y - middle[1]) / half[1]
 
     return {
-        "constant": lambda x, y: np.ones_like(x),
+        "constant": constant,
         "ramp across": lambda x, y: scaled(x, y)[0],
         "ramp down": lambda x, y: scaled(x, y)[1],
         "bump": lambda x, y: np.exp(-2.0 * (scaled(x, y)[0] ** 2 + scaled(x, y)[1] ** 2)),
     }
-
-
-def _times(field: Field, amplitude: float, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    return amplitude * field(x, y)
 
 
 def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> Iterator[Move]:
@@ -116,7 +156,7 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
             amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
-            moved_surface = moved(surface, renderer.rig, direction, partial(_times, field, amplitude))
+            moved_surface = moved(surface, renderer.rig, direction, times(amplitude, field))
             lit = renderer.light(moved_surface)
             before = sample.scene.lit
             yield Move(
@@ -143,6 +183,78 @@ def _largest_shift_rad(
     return float(np.clip(limits.min(), 0.0, LARGEST_SHIFT_RAD))
 
 
+# ---- another outline
+
+
+def outline_changes(
+    sample: Original, renderer: SceneRenderer, outlines: Sequence[NDArray[np.bool_]]
+) -> Iterator[OutlineChange]:
+    """The sample under three other outlines, two without ``outlines`` (masks (H, W) of other objects)."""
+    inside = np.zeros(renderer.shape, dtype=bool)
+    inside.ravel()[sample.surface.pixels] = True
+    cuts = {"ellipse": _ellipse(sample)}
+    moved = [_laid_over(outline, sample.target) for outline in outlines]
+    if moved:
+        # An outline that covers the whole object would change nothing.
+        shares = [(cut & sample.target).sum() / sample.target.sum() for cut in moved]
+        cuts["another object's outline"] = moved[int(np.argmin(np.abs(np.array(shares) - KEPT_SHARE)))]
+    for name, cut in cuts.items():
+        inside_cut = cut.ravel()[sample.surface.pixels]
+        kept, pixels = sample.target & cut, sample.scene.pixels[inside_cut]
+        scene = replace(sample.scene, pixels=pixels, lit=_part(sample.scene.lit, inside_cut), mask=kept)
+        yield OutlineChange(name, scene, kept, sample.depth_mm * (inside & cut))
+    yield _grown(sample, renderer, inside)
+
+
+def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_]) -> OutlineChange:
+    """The surface extended beyond its outline with depth and brightness of the nearest target pixel."""
+    distance_px, nearest = distance_transform_edt(~sample.target, return_indices=True)
+    ring = (distance_px > 0) & (distance_px <= GROWTH * np.sqrt(sample.target.sum())) & ~inside
+    surface_index = np.full(renderer.shape, -1)
+    surface_index.ravel()[sample.surface.pixels] = np.arange(sample.surface.pixels.size)
+    source = surface_index[tuple(nearest)][ring]
+    x, y = (rays[ring] for rays in renderer.rig.camera.rays())
+    both = sample.surface.joined(
+        Surface(np.flatnonzero(ring), x, y, sample.surface.depth_m[source], sample.surface.normals[source])
+    )
+    gain = np.concatenate([sample.scene.lit.gain, sample.scene.lit.gain[source]])
+    lit = replace(renderer.light(both), gain=gain)
+    scene = replace(sample.scene, pixels=both.pixels.astype(np.uint32), lit=lit, mask=sample.target | ring)
+    return OutlineChange("grown", scene, sample.target, both.depth_mm(renderer.shape))
+
+
+def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
+    lookup = {
+        name: replace(entry, index=entry.index[selection], weight=entry.weight[selection])
+        for name, entry in lit.lookup.items()
+    }
+    return replace(lit, lookup=lookup, gain=lit.gain[selection], ambient=lit.ambient[selection])
+
+
+def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``outline`` shifted so that its centre lies on the target's."""
+    centres = [np.argwhere(mask).mean(axis=0) for mask in (target, outline)]
+    rows, columns = (np.argwhere(outline) + np.rint(centres[0] - centres[1]).astype(int)).T
+    shifted = np.zeros_like(outline)
+    in_image = (rows >= 0) & (rows < shifted.shape[0]) & (columns >= 0) & (columns < shifted.shape[1])
+    shifted[rows[in_image], columns[in_image]] = True
+    return shifted
+
+
+def _ellipse(sample: Original) -> NDArray[np.bool_]:
+    """An ellipse at the target's centre, with axes in proportion to its standard deviations, that holds `KEPT_SHARE` of
+    its pixels."""
+    points = np.argwhere(sample.target).astype(np.float64)
+    spread = np.maximum(points.std(axis=0), 1.0)
+    rows, columns = np.indices(sample.target.shape)
+    centre = points.mean(axis=0)
+    radius = np.hypot((rows - centre[0]) / spread[0], (columns - centre[1]) / spread[1])
+    return np.asarray(radius <= np.quantile(radius[sample.target], KEPT_SHARE))
+
+
+# ---- the scenes of a dataset
+
+
 def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple[str, list[str]]]:
     """``views`` samples of each object of ``split``, each with a sample of every other object, whose outlines it may be
     cut to. Raises `DiagnosisError` for a split without an object."""
@@ -158,12 +270,8 @@ def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple
         ordered = [*samples[0::2], *samples[1::2]]
         for view_number in range(min(views, len(ordered))):
             view = (view_number + object_number) % len(ordered)
-            outline_samples = [
-                other_samples[view % len(other_samples)]
-                for other_name, other_samples in by_object.items()
-                if other_name != name
-            ]
-            chosen.append((ordered[view], outline_samples))
+            others = [other for other_name, other in by_object.items() if other_name != name]
+            chosen.append((ordered[view], [other[view % len(other)] for other in others]))
     return chosen
 
 

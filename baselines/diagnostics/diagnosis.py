@@ -1,36 +1,37 @@
-"""Runs the probes on a subject, stores each finding, and writes the report."""
+"""Runs the probes on a subject, stores each finding, and writes the report: a page that loads nothing, and JSON."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from hashlib import sha256
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.page import REPORT_FILE, report_page
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    finding_key,
-    load_finding,
-    save_finding,
-)
-from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names, probe
+from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, Probe, ProbeSettings, Progress, Table
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.evaluation.report import data_uri, page, render
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-
-JSON_FILE = "diagnose.json"
+JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"
 FORMAT_VERSION = 1
 _PACKAGES = ("numpy", "torch", "captum")
+_STYLE = """
+.drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
+.question { font-style: italic; color: var(--soft); }
+figure + .scroll, .scroll + .scroll { margin-top: 1.25rem; }
+.dense td:first-child { text-align: left; white-space: normal; min-width: 6.5rem; }
+.dense th:first-child { text-align: left; }
+ul.short { padding-left: 1.1rem; max-width: 46rem; }
+ul.short li { margin: .5rem 0; }
+"""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Diagnosis:
 
 
 def diagnose(
-    subject: "Subject", dataset: "DatasetFolder", probe_names: Sequence[str], settings: ProbeSettings, out: Path,
+    subject: Subject, dataset: DatasetFolder, probe_names: Sequence[str], settings: ProbeSettings, out: Path,
     progress: Callable[[Probe], Progress], command: str = "",
 ) -> Diagnosis:  # fmt: skip
     """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``.
@@ -71,46 +72,91 @@ def diagnose(
     for name in PROBES:
         if name not in selected and not (out / f"{name}.json").is_file():
             continue
-        current_probe = probe(name)
-        key = finding_key(current_probe, subject, dataset, settings)
+        probe = make_probe(name)
+        key = finding_key(probe, subject, dataset, settings)
         stored = load_finding(out, name, key)
         if stored is not None:
-            finding, seconds = stored
-            results.append(ProbeResult(current_probe, finding, seconds, reused=True))
+            results.append(ProbeResult(probe, *stored, reused=True))
         elif name in selected:
-            results.append(_run_probe(current_probe, subject, dataset, settings, out, key, progress))
+            started = perf_counter()
+            reason = probe.applies_to(subject)
+            if reason is None:
+                finding = probe.run(subject, dataset, settings, out, progress(probe))
+            else:
+                finding = Finding(probe.name, probe.title, "", skipped=reason)
+            seconds = round(perf_counter() - started, 2)
+            save_finding(out, key, finding, seconds)
+            results.append(ProbeResult(probe, finding, seconds, reused=False))
     context = _context(subject, dataset, settings, command)
-    content = {
-        "format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context,
-        "findings": {
-            result.finding.probe: {
-                "title": result.finding.title, "summary": result.finding.summary, "skipped": result.finding.skipped,
-                "seconds": result.seconds, "values": result.finding.values,
-            }
-            for result in results
-        },
+    findings = {
+        result.finding.probe: {
+            "title": result.finding.title, "summary": result.finding.summary, "skipped": result.finding.skipped,
+            "seconds": result.seconds, "values": result.finding.values,
+        }
+        for result in results
     }  # fmt: skip
-    values, report = out / JSON_FILE, out / REPORT_FILE
+    content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
+    write_json(out / JSON_FILE, content)
+    html = report_page(context, [(result.probe.question, result.finding) for result in results], out)
+    write_atomically(out / REPORT_FILE, html.encode("utf-8"))
+    return Diagnosis(tuple(results), out / REPORT_FILE, out / JSON_FILE)
+
+
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """``names`` without repeats, in the order of the report; all probes if empty. Raises `DiagnosisError` for an
+    unknown name."""
+    for name in names:
+        if name not in PROBES:
+            suggestions = get_close_matches(name, PROBES, n=1)
+            hint = f"did you mean {suggestions[0]!r}? " if suggestions else ""
+            raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
+    return tuple(name for name in PROBES if not names or name in names)
+
+
+def make_probe(name: str) -> Probe:
+    """The probe ``name`` of `PROBES`."""
+    module, cls = PROBES[name]
+    probe: Probe = getattr(import_module(f"fpp_ml_bench.baselines.diagnostics.{module}"), cls)()
+    return probe
+
+
+def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
+    """Hash (64 hex digits) of everything that a finding depends on."""
+    content = {
+        "probe": probe.name, "version": probe.version, "subject": subject.sha256, "layers": list(subject.layer_names),
+        "dataset": dataset.fingerprint, "settings": asdict(settings),
+    }  # fmt: skip
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
+    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already.
+
+    Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
+    """
+    content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
+    write_json(folder / f"{finding.probe}.json", content)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write ``content`` atomically. Raises ``ValueError`` for NaN and infinity."""
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(values, (text + "\n").encode("utf-8"))
-    page = report_page(context, [(result.probe.question, result.finding) for result in results], out)
-    write_atomically(report, page.encode("utf-8"))
-    return Diagnosis(tuple(results), report, values)
+    write_atomically(path, (text + "\n").encode("utf-8"))
 
 
-def _run_probe(
-    current_probe: Probe, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, out: Path, key: str,
-    progress: Callable[[Probe], Progress],
-) -> ProbeResult:  # fmt: skip
-    reason = current_probe.applies_to(subject)
-    started = perf_counter()
-    if reason is None:
-        finding = current_probe.run(subject, dataset, settings, out, progress(current_probe))
-    else:
-        finding = Finding(current_probe.name, current_probe.title, "", skipped=reason)
-    seconds = round(perf_counter() - started, 2)
-    save_finding(out, key, finding, seconds)
-    return ProbeResult(current_probe, finding, seconds, reused=False)
+def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
+    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
+    try:
+        content = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        if content["key"] != key:
+            return None
+        fields = dict(content["finding"])
+        fields["tables"] = tuple(Table(**table) for table in fields["tables"])
+        fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
+        finding, seconds = Finding(**fields), float(content["seconds"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return None  # absent, half written, or of another version: it is made again
+    return (finding, seconds) if all((folder / figure.file).is_file() for figure in finding.figures) else None
 
 
 def _prepare(out: Path) -> None:
@@ -125,8 +171,7 @@ def _prepare(out: Path) -> None:
         raise DiagnosisError(f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder")
 
 
-def _context(subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, command: str) -> dict[str, Any]:
-    height, width = dataset.size
+def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
     return {
         "subject": {
             "name": subject.name, "title": subject.title, "sha256": subject.sha256, "units": subject.units,
@@ -134,7 +179,7 @@ def _context(subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettin
             "direction": subject.direction, "layers": list(subject.layer_names),
         },
         "dataset": {
-            "name": dataset.path.resolve().name, "fingerprint": dataset.fingerprint, "size": [height, width],
+            "name": dataset.path.resolve().name, "fingerprint": dataset.fingerprint, "size": list(dataset.size),
             "samples": {split: len(names) for split, names in dataset.splits.items()},
         },
         "settings": asdict(settings),
@@ -142,3 +187,51 @@ def _context(subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettin
         "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES}},
         "hardware": describe_hardware().to_dict(),
     }  # fmt: skip
+
+
+def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
+    """The report: a section for each finding with its question and its pictures from ``folder``.
+
+    ``context`` is what ``diagnose.json`` says about subject, dataset, settings and machine.
+    """
+    subject, dataset, hardware = context["subject"], context["dataset"], context["hardware"]
+    (height, width), frames = dataset["size"], subject["frames_used"]
+    frames_text = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
+    settings = ", ".join(f"{name} {value}" for name, value in context["settings"].items() if value is not None)
+    software = ", ".join(f"{name} {value}" for name, value in context["software"].items())
+    body = render(
+        "fpp_ml_bench.baselines.diagnostics",
+        "diagnosis.html",
+        subject=subject,
+        intro=(
+            f"{subject['title']}; {frames_text} per sample, {subject['direction']} fringes",
+            f"{dataset['name']} ({dataset['fingerprint'][:8]}), {sum(dataset['samples'].values())} samples of "
+            f"{width} x {height} px",
+        ),
+        sections=[
+            {
+                "question": question,
+                "finding": finding,
+                "figures": [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
+                "tables": [
+                    (table.title, table.header, [[cell_text(cell) for cell in row] for row in table.rows])
+                    for table in finding.tables
+                ],
+            }
+            for question, finding in findings
+        ],
+        command=context["command"],
+        made=(
+            f"Settings: {settings}. Layers: {', '.join(subject['layers']) or 'none'}.",
+            f"{software}; {hardware['cpu']}, {hardware['cores']} cores.",
+            "All values are in diagnose.json beside this page.",
+        ),
+    )
+    return page(f"{subject['name']}: diagnosis", body, _STYLE, description=f"What {subject['name']} read")
+
+
+def cell_text(cell: str | float | None) -> str:
+    """A cell as text: floats with four significant digits, a dash for None."""
+    if cell is None:
+        return "-"
+    return f"{cell:.4g}" if isinstance(cell, float) else printable(cell, 500)

@@ -12,33 +12,54 @@ prediction is its own output, without range heads. A plane that faces the camera
 normalised predictions are converted to mm by the mean D_min and D_max of the test split, the same for every plane.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_original import original
-from fpp_ml_bench.baselines.diagnostics.flat_plane_report import draw, summary, tables
-from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Frames, Subject
-from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
-from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, plane
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
-RECTANGLE = 0.5
+RECTANGLE_SIDE = 0.5
 """Side of the rectangle, as a share of the image's side."""
 NORMALISED_BACKGROUND = 0.1
 OUTLINES, QUICK_OUTLINES = 5, 2
+FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
+"""Kinds of outlines; a silhouette is named by its sample."""
 STREAM = (0, "plane", "")
+PAPER_MEAN, PAPER_DISTANCE_M = 0.088, 1.8
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Converts predictions to mm: ``range_mm`` for normalised ones; ``near_mm`` is the working range's near end."""
+
+    normalised: bool
+    range_mm: tuple[float, float]
+    near_mm: float
+
+    def mm(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        low, high = self.range_mm
+        return values * (high - low) + low if self.normalised else values
+
+    @property
+    def limit(self) -> float:
+        """Predictions below it are background."""
+        return NORMALISED_BACKGROUND if self.normalised else self.near_mm / 2
+
+    def collapsed(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.asarray(values < self.limit)
 
 
 @dataclass(frozen=True)
@@ -54,7 +75,12 @@ class PlanePrediction:
     frame: NDArray[np.uint8]
     prediction: NDArray[np.float32]
 
-    def statistics(self, scale: "Scale") -> dict[str, Any]:
+    @property
+    def kind(self) -> str:
+        """`FRAME`, `RECTANGLE` or `SILHOUETTE`."""
+        return _kind(self.outline)
+
+    def statistics(self, scale: Scale) -> dict[str, Any]:
         """Mean, standard deviation, least and largest prediction over ``mask``, in its own units and in mm, its error,
         and the share that collapsed to background; in float64."""
         values = self.prediction[self.mask].astype(np.float64)
@@ -64,36 +90,16 @@ class PlanePrediction:
                "answer_max": values.max(), "collapsed_share": scale.collapsed(values).mean(),
                "mean_mm": millimetres.mean(), "std_mm": millimetres.std(), "bias_mm": error.mean(),
                "mae_mm": np.abs(error).mean(), "true_std_mm": self.depth_mm[self.mask].std()}  # fmt: skip
-        return {
-            "outline": self.outline, "distance_m": self.distance_m, "tilt_deg": list(self.tilt_deg),
-            "pixels": int(self.mask.sum()), **{key: float(value) for key, value in own.items()},
-        }  # fmt: skip
+        about = {"outline": self.outline, "distance_m": self.distance_m, "tilt_deg": list(self.tilt_deg)}
+        return {**about, "pixels": int(self.mask.sum()), **{key: float(value) for key, value in own.items()}}
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Converts predictions to mm: ``range_mm`` for normalised ones; ``near_mm`` is the working range's near end."""
-
-    normalised: bool
-    range_mm: tuple[float, float]
-    near_mm: float
-
-    def mm(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        low, high = self.range_mm
-        return values * (high - low) + low if self.normalised else values
-
-    def collapsed(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        limit = NORMALISED_BACKGROUND if self.normalised else self.near_mm / 2
-        return np.asarray(values < limit)
-
-
-class FlatPlane:
+class FlatPlane(Probe):
     """Predictions for planes in three outlines, and for the test objects as the control."""
 
     name = "flat-plane"
     title = "Flat plane"
     question = "Is a plane without features predicted at its distance, or as background?"
-    version = 1
 
     def applies_to(self, subject: Subject) -> str | None:
         if subject.uses_ground_truth_mask:
@@ -101,37 +107,35 @@ class FlatPlane:
         return None
 
     def run(
-        self, subject: Subject, dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         renderer = SceneRenderer.of(dataset)
         records = [dataset.measured(sample) for sample in dataset.samples("test")]
         ranges = [(record["depth_min_mm"], record["depth_max_mm"]) for record in records if record.get("depth_max_mm")]
         low, high = (float(np.mean(ends)) for ends in zip(*ranges, strict=True))
-        scale = Scale(normalised(subject), (low, high), renderer.rig.working_range_mm[0])
+        normalised = subject.units == "normalised" or subject.normalisation == "individual"
+        scale = Scale(normalised, (low, high), renderer.rig.working_range_mm[0])
         outlines = outlines_of(dataset, settings)
         total = len(DISTANCES_M) * len(TILTS_DEG) * (2 + len(outlines)) + len(outlines)
-        planes = []
-        for plane_prediction in predict_planes(subject, renderer, outlines, settings.quick):
-            planes.append(plane_prediction)
-            progress(len(planes), total, f"{plane_prediction.outline}, {plane_prediction.distance_m:g} m")
+        planes: list[PlanePrediction] = []
+        for predicted in predict_planes(subject, renderer, outlines, settings.quick):
+            planes.append(predicted)
+            progress(len(planes), total, f"{predicted.outline}, {predicted.distance_m:g} m")
         control = control_of(subject, dataset, renderer, list(outlines), scale)
-        rows = [plane_prediction.statistics(scale) for plane_prediction in planes]
-        return Finding(
-            self.name,
-            self.title,
-            summary(rows, control, scale.normalised),
+        rows = [predicted.statistics(scale) for predicted in planes]
+        return self.finding(
+            summary(rows, control, normalised),
             {
-                "planes": rows, "objects": control, "range_mm": [low, high] if scale.normalised else None,
-                "collapse_below": NORMALISED_BACKGROUND if scale.normalised else scale.near_mm / 2,
+                "planes": rows, "objects": control, "range_mm": [low, high] if normalised else None,
+                "collapse_below": scale.limit,
             },
-            tables(rows, control, scale.normalised),
-            draw(planes, scale.normalised, folder),
+            tables(rows, control, normalised),
+            draw(planes, normalised, folder),
         )  # fmt: skip
 
 
-def normalised(subject: Subject) -> bool:
-    """Whether the subject's own output is normalised to the sample's range."""
-    return subject.units == "normalised" or subject.normalisation == "individual"
+def _kind(outline: str) -> str:
+    return outline if outline in (FRAME, RECTANGLE) else SILHOUETTE
 
 
 def prediction_of(subject: Subject, frames: Frames) -> NDArray[np.float32]:
@@ -140,12 +144,12 @@ def prediction_of(subject: Subject, frames: Frames) -> NDArray[np.float32]:
     return subject.represent(frames) if subject.normalisation == "individual" else subject.predict(frames)
 
 
-def outlines_of(dataset: "DatasetFolder", settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
+def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
     """Silhouettes (H, W) of a test sample of each object, by sample."""
     first: dict[str, str] = {}
     for sample in dataset.samples("test"):
         first.setdefault(dataset.measured(sample)["object"], sample)
-    names = spread(list(first.values()), settings.samples or (QUICK_OUTLINES if settings.quick else OUTLINES))
+    names = settings.choose(list(first.values()), OUTLINES, QUICK_OUTLINES)
     masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
     return {name: mask for name, mask in masks.items() if mask.any()}
 
@@ -156,45 +160,135 @@ def predict_planes(
     """Every plane, rendered and predicted."""
     height, width = renderer.shape
     rectangle = np.zeros(renderer.shape, dtype=bool)
-    down, across = (round(side * (1 - RECTANGLE) / 2) for side in renderer.shape)
+    down, across = (round(side * (1 - RECTANGLE_SIDE) / 2) for side in renderer.shape)
     rectangle[down : height - down, across : width - across] = True
-    masks = {"fills the frame": np.ones(renderer.shape, dtype=bool), "rectangle": rectangle, **outlines}
-    for outline, mask in masks.items():
+    for outline, mask in {FRAME: np.ones(renderer.shape, dtype=bool), RECTANGLE: rectangle, **outlines}.items():
         for tilt in TILTS_DEG[: 1 if quick else None]:
             for distance_m in DISTANCES_M:
                 surface = plane(renderer.rig, distance_m, tilt, mask)
-                yield predict_plane(subject, renderer, surface, mask, outline, distance_m, tilt)
-
-
-def predict_plane(
-    subject: Subject, renderer: SceneRenderer, surface: Surface, mask: NDArray[np.bool_], outline: str,
-    distance_m: float, tilt_deg: tuple[float, float],
-) -> PlanePrediction:  # fmt: skip
-    """A plane, rendered and predicted."""
-    lit = renderer.light(surface)
-    mask = mask.copy()
-    mask.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-    scene = Scene(surface.pixels.astype(np.uint32), lit, mask, STREAM)
-    frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
-    frame = frames[subject.frames_used[0]]
-    if frame is None:
-        raise ValueError("the frame of the plane is missing")
-    prediction = prediction_of(subject, frames)
-    return PlanePrediction(outline, distance_m, tilt_deg, mask, surface.depth_mm(renderer.shape), frame, prediction)
+                lit, seen = renderer.light(surface), mask.copy()
+                seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+                scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
+                frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
+                frame, prediction = frames[subject.frames_used[0]], prediction_of(subject, frames)
+                depth_mm = surface.depth_mm(renderer.shape)
+                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), prediction)
 
 
 def control_of(
-    subject: Subject, dataset: "DatasetFolder", renderer: SceneRenderer, samples: list[str], scale: Scale
+    subject: Subject, dataset: DatasetFolder, renderer: SceneRenderer, samples: list[str], scale: Scale
 ) -> dict[str, float]:
     """Share of the test objects' pixels that the subject predicts as background, and that are as near in truth."""
     predicted_shares, true_shares = [], []
     for sample in samples:
-        sample_scene = original(dataset, renderer, sample)
-        frames = renderer.frames(sample_scene.scene, subject.frames_used, subject.uses_ground_truth_mask)
-        predicted_shares.append(
-            scale.collapsed(prediction_of(subject, frames)[sample_scene.target].astype(np.float64)).mean()
-        )
-        depth_mm = dataset.depth_mm(sample)[sample_scene.target].astype(np.float64)
+        unchanged = original(dataset, renderer, sample)
+        frames = renderer.frames(unchanged.scene, subject.frames_used, subject.uses_ground_truth_mask)
+        predicted = prediction_of(subject, frames)[unchanged.target].astype(np.float64)
+        predicted_shares.append(scale.collapsed(predicted).mean())
+        depth_mm = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
         span = float(np.ptp(depth_mm)) or MM_PER_M
         true_shares.append(scale.collapsed((depth_mm - depth_mm.min()) / span if scale.normalised else depth_mm).mean())
     return {"collapsed_share": float(np.mean(predicted_shares)), "collapsed_share_true": float(np.mean(true_shares))}
+
+
+# ---- the report
+
+
+def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
+    """The share that collapsed in each outline, the mean prediction at the paper's distance, and for mm the means at
+    all distances."""
+    shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if _kind(row["outline"]) == kind]))
+              for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
+    facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
+    paper = next(row for row in facing if row["distance_m"] == PAPER_DISTANCE_M)
+    mean_text = (
+        f"{paper['answer_mean']:.3f} of the range (paper: {PAPER_MEAN})" if normalised else f"{paper['mean_mm']:.0f} mm"
+    )
+    text = (
+        f"Predicted as background: {shares[RECTANGLE]:.0%} of a rectangular plane, {shares[FRAME]:.0%} of a plane that "
+        f"fills the frame, {shares[SILHOUETTE]:.0%} of a plane in an object's outline; "
+        f"{control['collapsed_share']:.0%} of real objects ({control['collapsed_share_true']:.0%} in truth). The "
+        f"prediction for the rectangle at 1.8 m has a mean of {mean_text} and a spread of {paper['answer_std']:.3g}, "
+        f"from {paper['answer_min']:.3g} to {paper['answer_max']:.3g}."
+    )
+    if not normalised:
+        means = ", ".join(f"{row['mean_mm']:.0f}" for row in facing)
+        distances = ", ".join(f"{1000 * row['distance_m']:.0f}" for row in facing)
+        text += f" Facing planes at {distances} mm are predicted with means of {means} mm."
+    return text
+
+
+def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> list[Table]:
+    """A row per plane; silhouettes as means over objects."""
+    unit = "of range" if normalised else "mm"
+    poses: dict[tuple[Any, ...], list[Row]] = {}
+    for kind in (FRAME, RECTANGLE, SILHOUETTE):
+        for row in rows:
+            if _kind(row["outline"]) == kind:
+                poses.setdefault((kind, row["distance_m"], *row["tilt_deg"]), []).append(row)
+    lines = []
+    for (kind, distance_m, across, down), same_pose in poses.items():
+        name = f"{kind}, {len(same_pose)} objects" if kind == SILHOUETTE else kind
+        least, most = min(row["answer_min"] for row in same_pose), max(row["answer_max"] for row in same_pose)
+        mean, std, *others = (
+            float(np.mean([row[key] for row in same_pose]))
+            for key in ("answer_mean", "answer_std", "collapsed_share", "mean_mm", "std_mm", "true_std_mm", "mae_mm")
+        )
+        pose = f"{distance_m:g} m", f"{across:g}, {down:g}"
+        lines.append((name, *pose, mean, std, f"{least:.4g} to {most:.4g}", *others))
+    return [
+        Table(
+            "Predictions for planes" + (", mm by the mean range of the test split" if normalised else ""),
+            ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
+             "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm"),
+            lines,
+        ),
+        Table(
+            "Share of background: the control", ("Pixels of", "Share"),
+            (("real objects, predicted", control["collapsed_share"]),
+             ("real objects, in truth", control["collapsed_share_true"])),
+        ),
+    ]  # fmt: skip
+
+
+def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> Figure:
+    """The paper's figure, input and prediction, for each outline at 1.8 m, and the distribution of the predictions."""
+    facing = [shown for shown in planes if shown.distance_m == PAPER_DISTANCE_M and shown.tilt_deg == (0.0, 0.0)]
+    examples = [next(shown for shown in facing if shown.outline == kind) for kind in (FRAME, RECTANGLE)]
+    examples += [shown for shown in facing if shown.kind == SILHOUETTE][:1]
+    sheet = Sheet(2, len(examples) + 1, 11, 5.2, width_ratios=[1] * len(examples) + [1.5])
+    low, high = (-0.2, 1.2) if normalised else (0.0, 2400.0)
+    unit, digits = ("share of range", 2) if normalised else ("mm", 0)
+    for (above, below), shown in zip(sheet.axes.T, examples, strict=False):
+        values = shown.prediction[shown.mask]
+        sheet.picture(above, shown.frame, f"{shown.outline}\n{shown.distance_m:g} m", "gray", 0, 255)
+        least, most, mean = (f"{value:.{digits}f}" for value in (values.min(), values.max(), values.mean()))
+        title = f"prediction over the plane:\n{least} to {most}, mean {mean}"
+        image = sheet.picture(below, shown.prediction, title, "viridis", low, high)
+    sheet.scale(image, sheet.axes[1, : len(examples)], fraction=0.05, pad=0.02, label=unit)
+    _against_distance(sheet, planes, normalised)
+    axis, bins = sheet.axes[1, -1], np.linspace(low, high, 57)
+    for shown in examples:
+        values = np.clip(shown.prediction[shown.mask], low, high)
+        axis.hist(values, bins, histtype="step", weights=np.full(values.size, 1 / values.size), label=shown.outline)
+    sheet.tidy(axis, "Predictions at 1.8 m (end bins: beyond)", unit, "share of pixels")
+    axis.legend(fontsize=7, frameon=False)
+    alt = "Fringes on planes in three outlines, the predictions, their means against the distance, and their spread"
+    return sheet.save(folder, "flat_plane.png", "Flat planes", alt)
+
+
+def _against_distance(sheet: Sheet, planes: Sequence[PlanePrediction], normalised: bool) -> None:
+    axis, scale = sheet.axes[0, -1], 1.0 if normalised else 1000.0
+    for kind, mark in ((FRAME, "o"), (RECTANGLE, "s"), (SILHOUETTE, "^")):
+        points: dict[float, list[float]] = {}
+        for shown in planes:
+            if shown.kind == kind and shown.tilt_deg == (0.0, 0.0):
+                mean = float(shown.prediction[shown.mask].mean(dtype=np.float64))
+                points.setdefault(shown.distance_m, []).append(mean)
+        means = [np.mean(values) / scale for values in points.values()]
+        axis.plot(list(points), means, mark + "-", markersize=5, label=kind)
+    if not normalised:
+        ends = min(DISTANCES_M), max(DISTANCES_M)
+        axis.plot(ends, ends, color=sheet.INK, linewidth=0.8, label="true")
+    sheet.tidy(axis, "Mean prediction of a facing plane", "distance, m", "share of range" if normalised else "m")
+    axis.legend(fontsize=7, frameon=False)

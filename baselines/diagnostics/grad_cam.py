@@ -8,24 +8,23 @@ does not depend on what was learned.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
+from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics.activations import batch_size, batches
-from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, correlation
-from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
+from fpp_ml_bench.baselines.diagnostics.fits import edge_map
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.diagnostics.targets import edge_map, fringe_variation
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
-
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.evaluation.score import Interval, object_interval
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Image = NDArray[np.float32]
 
@@ -35,47 +34,41 @@ PAPER_LAYERS = {
 """The six layers of the paper's table by our names (dec4 is the coarsest), with the paper's names (dec1 is)."""
 SAMPLES, QUICK_SAMPLES = 30, 6
 SEEDS = 2
+PAPER_RATIO = 1.28
+EDGES, FRINGES, OWN = "edges", "fringes", "own"
+_LEAST_SPREAD = 1e-12
+_EXAMPLES = 3
+_BAR = 0.2
 
 
-class GradCam:
+class GradCam(Probe):
     """Heatmaps of the test split against edges and fringes, for the network and for random weights."""
 
     name = "grad-cam"
     title = "Grad-CAM"
     question = "Which pixels change the mean prediction: those at edges, or those with fringes?"
-    version = 1
-
-    def applies_to(self, subject: Subject) -> str | None:
-        if subject.network is None:
-            return f"{subject.name} is a method without a network: it has no gradient to follow."
-        return None
+    without_network = "it has no gradient to follow"
 
     def run(
-        self, subject: Subject, dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
-        from fpp_ml_bench.baselines.diagnostics.grad_cam_report import draw, summary, tables
-
-        most_samples = settings.samples or (QUICK_SAMPLES if settings.quick else SAMPLES)
-        samples = spread(dataset.samples("test"), most_samples)
+        samples = settings.choose(dataset.samples("test"), SAMPLES, QUICK_SAMPLES)
         if not samples:
             raise DiagnosisError(f"{dataset.path}: split test holds no sample, which Grad-CAM needs")
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
         layers = cam_layers(subject)
         correlations = measure(subject, dataset, samples, layers, seeds, progress)
-        return Finding(
-            self.name,
-            self.title,
+        protocol = {
+            "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
+            "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
+        }  # fmt: skip
+        return self.finding(
             summary(correlations),
-            {
-                "protocol": {
-                    "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
-                    "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
-                },
-                **correlations.to_dict(),
-            },
+            {"protocol": protocol, **correlations.to_dict()},
             tables(correlations),
-            draw(correlations, subject, dataset, samples, layers, folder),
-        )  # fmt: skip
+            _draw_bars(correlations, folder),
+            _draw_heatmaps(subject, dataset, samples, layers, folder),
+        )
 
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
@@ -84,14 +77,11 @@ def cam_layers(subject: Subject) -> tuple[str, ...]:
     return six if len(six) == len(PAPER_LAYERS) else subject.layer_names
 
 
-def heatmaps(network: "nn.Module", layers: "dict[str, nn.Module]", fringe: "Tensor") -> "dict[str, Tensor]":
+def heatmaps(network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor) -> dict[str, Tensor]:
     """Grad-CAM of the mean prediction before its ReLU, by layer: (B, H, W) at the size of ``fringe`` (B, 1, H, W).
 
     Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction.
     """
-    import torch
-    from captum.attr import LayerAttribution, LayerGradCam
-
     heatmaps_by_layer = {}
     for name, layer in layers.items():
         cam = LayerGradCam(lambda x: network(x).mean(dim=(1, 2, 3)), layer)
@@ -101,7 +91,7 @@ def heatmaps(network: "nn.Module", layers: "dict[str, nn.Module]", fringe: "Tens
         except (RuntimeError, AssertionError, IndexError, AttributeError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise DiagnosisError(f"layer {name!r}: Grad-CAM failed ({reason}); leave it out") from None
-        if not isinstance(heat, torch.Tensor) or heat.dim() != 4:
+        if not isinstance(heat, Tensor) or heat.dim() != 4:
             raise DiagnosisError(f"layer {name!r}: expected activations (B, C, h, w); leave it out")
         scaled = LayerAttribution.interpolate(heat, tuple(fringe.shape[2:]), "bilinear")
         heatmaps_by_layer[name] = scaled[:, 0].detach()  # type: ignore[index]
@@ -109,48 +99,145 @@ def heatmaps(network: "nn.Module", layers: "dict[str, nn.Module]", fringe: "Tens
 
 
 def maps(
-    subject: Subject, network: "nn.Module", dataset: "DatasetFolder", samples: Sequence[str], layers: Sequence[str]
+    subject: Subject, network: nn.Module, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str]
 ) -> Iterator[tuple[str, dict[str, Image]]]:
     """Each sample with its heatmaps by layer after the ReLU, float32 (H, W)."""
     network_layers = subject.layers_of(network)
-    for names, fringe in batches(subject, dataset, samples):
+    for names, fringe in subject.batches(dataset, samples):
         heat = heatmaps(network, {name: network_layers[name] for name in layers}, fringe)
         for number, sample in enumerate(names):
             yield sample, {layer: batch_heat[number].clamp(min=0).numpy() for layer, batch_heat in heat.items()}
 
 
-def references(subject: Subject, dataset: "DatasetFolder", sample: str) -> dict[str, Image]:
+def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[str, Image]:
     """Reference maps for the heatmaps of ``sample``: edges, and the fringe's local standard deviation."""
     (index,) = subject.frames_used
     depth_mm = dataset.depth_mm(sample)
     frame = subject.as_input(dataset.frame(sample, index), depth_mm)
-    return {EDGES: edge_map(depth_mm), FRINGES: fringe_variation(frame, period_px(subject, dataset))}
+    # Image px per fringe period at the standoff; of horizontal fringes where the frame has no direction.
+    period_px = dataset.rig.image_px_per_period("vertical" if subject.direction == "vertical" else "horizontal")
+    return {EDGES: edge_map(depth_mm), FRINGES: fringe_variation(frame, period_px)}
 
 
-def period_px(subject: Subject, dataset: "DatasetFolder") -> float:
-    """Image px per fringe period at the standoff; of horizontal fringes where the frame has no direction."""
-    direction = subject.direction
-    return dataset.rig.image_px_per_period("horizontal" if direction == "both" else direction)
+def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
+    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32.
+
+    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the image is mirrored at its
+    border.
+    """
+    side = max(3, 2 * int(np.ceil((period_px - 1) / 2)) + 1)
+    image = np.asarray(grey, dtype=np.float64)
+    mean = cv2.blur(image, (side, side), borderType=cv2.BORDER_REFLECT_101)
+    square = cv2.blur(image * image, (side, side), borderType=cv2.BORDER_REFLECT_101)
+    return np.sqrt(np.maximum(square - mean * mean, 0)).astype(np.float32)
+
+
+# ---- correlations
+
+
+def correlation(first: NDArray, second: NDArray) -> float | None:
+    """Pearson's r of two maps of the same shape over all pixels; None where either is constant."""
+    a, b = first.astype(np.float64).ravel(), second.astype(np.float64).ravel()
+    a, b = a - a.mean(), b - b.mean()
+    sizes = float(np.sqrt((a @ a) * (b @ b)))
+    scale = max(1.0, float(np.abs(first).max()) * float(np.abs(second).max())) * a.size
+    return None if sizes <= _LEAST_SPREAD * min(1.0, scale) else float(np.clip(a @ b / sizes, -1, 1))
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Mean of ``count`` correlations and its 95% interval, resampled over objects; None without a correlation."""
+
+    r: float | None
+    interval: Interval | None
+    count: int
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"r": self.r, "interval": self.interval, "samples": self.count}
+
+
+@dataclass
+class Correlations:
+    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference map; one value per sample."""
+
+    layers: tuple[str, ...]
+    objects: list[str]
+    values: dict[tuple[str, str, str], list[float | None]] = field(default_factory=dict)
+    edges_with_fringes: list[float | None] = field(default_factory=list)
+
+    def add(self, weights: str, layer: str, reference: str, r: float | None) -> None:
+        """Append the next sample's ``r`` of a layer with a reference; `OWN` is the trained network's heatmap."""
+        self.values.setdefault((weights, layer, reference), []).append(r)
+
+    def mean(self, layer: str, reference: str, trained: bool = True) -> Mean:
+        """Mean over samples; with random weights, of each sample's mean over seeds."""
+        return self._over_samples(self._sample_means((layer,), reference, trained))
+
+    def average(self, reference: str, trained: bool = True) -> Mean:
+        """Mean over layers, as in the paper's bottom row, with an interval over samples."""
+        means = [self.mean(layer, reference, trained).r for layer in self.layers]
+        interval = self._over_samples(self._sample_means(self.layers, reference, trained)).interval
+        return Mean(_mean_of(means), interval, sum(r is not None for r in means))
+
+    @property
+    def references(self) -> Mean:
+        """Mean correlation of edges with fringes."""
+        return self._over_samples(self.edges_with_fringes)
+
+    def _sample_means(self, layers: Sequence[str], reference: str, trained: bool) -> list[float | None]:
+        columns = [
+            values for (weights, layer, target), values in self.values.items()
+            if layer in layers and target == reference and (weights == "trained") == trained
+        ]  # fmt: skip
+        return [_mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
+
+    def _over_samples(self, values: Sequence[float | None]) -> Mean:
+        return Mean(_mean_of(values), object_interval(values, self.objects), sum(r is not None for r in values))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``diagnose.json``."""
+
+        def of(layer: str) -> dict[str, Any]:
+            trained = {target: self.mean(layer, target).to_dict() for target in (EDGES, FRINGES)}
+            random = {target: self.mean(layer, target, trained=False).to_dict() for target in (EDGES, FRINGES, OWN)}
+            return {**trained, "ratio": ratio(self.mean(layer, EDGES).r, self.mean(layer, FRINGES).r), "random": random}
+
+        edges, fringes = self.average(EDGES), self.average(FRINGES)
+        random = {target: self.average(target, trained=False).to_dict() for target in (EDGES, FRINGES, OWN)}
+        return {
+            "layers": {layer: of(layer) for layer in self.layers},
+            "average": {EDGES: edges.to_dict(), FRINGES: fringes.to_dict(), "ratio": ratio(edges.r, fringes.r)},
+            "random_average": random,
+            "edges_with_fringes": self.references.to_dict(),
+        }
+
+
+def ratio(edges: float | None, fringes: float | None) -> float | None:
+    """The paper's ratio: correlation with edges over correlation with fringes; None where undefined."""
+    return None if edges is None or not fringes else edges / fringes
+
+
+def _mean_of(values: Sequence[float | None]) -> float | None:
+    defined = [value for value in values if value is not None]
+    return float(np.mean(defined)) if defined else None
 
 
 def measure(
-    subject: Subject, dataset: "DatasetFolder", samples: Sequence[str], layers: Sequence[str], seeds: int,
+    subject: Subject, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str], seeds: int,
     progress: Progress,
 ) -> Correlations:  # fmt: skip
     """Correlations of every heatmap with both references, and of random weights' heatmaps with the trained ones."""
-    network, untrained = subject.network, subject.untrained
-    if network is None or untrained is None:
-        raise DiagnosisError(f"{subject.name}: has no network to follow a gradient through")
+    network, untrained = subject.networks()
     correlations = Correlations(tuple(layers), [split_sample_name(name)[0] for name in samples])
     total, done = len(samples) * (1 + seeds), 0
-    random_networks: list[Any] = [untrained(seed) for seed in range(seeds)]
-    size = batch_size(subject)
+    random_networks = [untrained(seed) for seed in range(seeds)]
+    size = subject.batch_size
     for start in range(0, len(samples), size):
         batch_samples = samples[start : start + size]
         trained_maps = dict(maps(subject, network, dataset, batch_samples, layers))
         reference_maps = {sample: references(subject, dataset, sample) for sample in batch_samples}
         for sample in batch_samples:
-            correlations.add_references(correlation(reference_maps[sample][EDGES], reference_maps[sample][FRINGES]))
+            correlations.edges_with_fringes.append(correlation(*reference_maps[sample].values()))
             for layer, heat in trained_maps[sample].items():
                 for target, reference in reference_maps[sample].items():
                     correlations.add("trained", layer, target, correlation(heat, reference))
@@ -164,3 +251,114 @@ def measure(
             done += len(batch_samples)
             progress(done, total, "Grad-CAM of random weights")
     return correlations
+
+
+# ---- the report
+
+
+def summary(correlations: Correlations) -> str:
+    """The result in a few sentences."""
+    edges, fringes = correlations.average(EDGES), correlations.average(FRINGES)
+    random = correlations.average(EDGES, trained=False), correlations.average(FRINGES, trained=False)
+    own = correlations.average(OWN, trained=False).r
+    text = (
+        f"Over the layers, heatmaps correlate with edges by {_r(edges.r)} and with fringe variation by "
+        f"{_r(fringes.r)}, {ratio_text(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: "
+        f"{_r(random[0].r)} and {_r(random[1].r)}; edges and fringe variation themselves correlate by "
+        f"{_r(correlations.references.r)}, because both are strong where the object is."
+    )
+    if own is not None:
+        text += f" Random weights' heatmaps agree with the trained ones by {own:.2f}."
+    return text
+
+
+def ratio_text(edges: Mean, fringes: Mean) -> str:
+    """The ratio, with a note where the interval of the divisor holds 0."""
+    quotient, span = ratio(edges.r, fringes.r), fringes.interval
+    if quotient is None:
+        return "no ratio"
+    if span is not None and span[0] <= 0 <= span[1]:
+        return f"ratio {quotient:.2f}, which says nothing: its divisor can't be told from 0"
+    return f"ratio {quotient:.2f}"
+
+
+def tables(correlations: Correlations) -> list[Table]:
+    """The paper's table with random weights beside it, and the sanity check."""
+    has_paper_layers = set(correlations.layers) == set(PAPER_LAYERS)
+    pairs = {}
+    for layer in correlations.layers:
+        renamed = has_paper_layers and PAPER_LAYERS[layer] != layer
+        name = f"{layer} (paper's {PAPER_LAYERS[layer]})" if renamed else layer
+        pairs[name] = correlations.mean(layer, EDGES), correlations.mean(layer, FRINGES)
+    for name, trained in (("Average", True), ("Average, random weights", False)):
+        pairs[name] = correlations.average(EDGES, trained), correlations.average(FRINGES, trained)
+    rows = [(name, _cell(edges), _cell(fringes), ratio(edges.r, fringes.r)) for name, (edges, fringes) in pairs.items()]
+    check = [
+        (layer, *(_cell(correlations.mean(layer, target, trained=False)) for target in (EDGES, FRINGES, OWN)))
+        for layer in correlations.layers
+    ]
+    return [
+        Table(
+            f"Correlation of Grad-CAM with edges and fringes, {len(correlations.objects)} test samples (the paper's "
+            "table)",
+            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "Ratio"),
+            [*rows, ("Edges with fringes", _cell(correlations.references), None, None)],
+        ),
+        Table(
+            "Sanity check: the same with random weights",
+            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "r(CAM, trained CAM)"),
+            check,
+        ),
+    ]
+
+
+def _draw_bars(correlations: Correlations, folder: Path) -> Figure:
+    sheet = Sheet(1, 1, 9, 3.4)
+    axis, layers, positions = sheet.axes[0, 0], correlations.layers, np.arange(len(correlations.layers))
+    series = (
+        (EDGES, True, "edges", "edges"), (FRINGES, True, "phase", "fringes"),
+        (EDGES, False, "random", "edges, random weights"), (FRINGES, False, "raw", "fringes, random weights"),
+    )  # fmt: skip
+    for number, (target, trained, colour, label) in enumerate(series):
+        means = [correlations.mean(layer, target, trained) for layer in layers]
+        bars = [(mean.r, mean.interval) for mean in means]
+        sheet.bars(axis, positions + (number - 1.5) * _BAR, bars, width=_BAR, color=sheet.COLOURS[colour], label=label)
+    axis.axhline(0, color=sheet.INK, linewidth=0.8)
+    axis.set_xticks(positions, layers, rotation=30 if len(layers) > 8 else 0)
+    sheet.tidy(axis, f"Grad-CAM against edges and fringes, {len(correlations.objects)} test samples", y="Pearson r")
+    axis.legend(fontsize=8, frameon=False, ncols=2)
+    alt = "Correlation of Grad-CAM with edges and with fringes by layer"
+    return sheet.save(folder, "grad_cam_correlations.png", "Correlation by layer", alt)
+
+
+def _draw_heatmaps(
+    subject: Subject, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str], folder: Path
+) -> Figure:
+    picks = sorted({round(share * (len(samples) - 1)) for share in np.linspace(0, 1, _EXAMPLES)})
+    examples = [samples[pick] for pick in picks]
+    sheet = Sheet(len(examples), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(examples))
+    (index,), titles = subject.frames_used, ["input", "edges", "fringes", *layers]
+    sample_maps = maps(subject, subject.networks()[0], dataset, examples, layers)
+    for row, (sample, heat) in zip(sheet.axes, sample_maps, strict=True):
+        frame = subject.as_input(dataset.frame(sample, index), dataset.depth_mm(sample))
+        edges, fringes = references(subject, dataset, sample).values()
+        sheet.picture(row[0], frame, titles[0], "gray", 0, 255)
+        sheet.picture(row[1], edges, titles[1], "gray", 0, edges.max())
+        sheet.picture(row[2], fringes, titles[2], "gray", 0, fringes.max())
+        row[0].set_ylabel(sample, fontsize=7)
+        for axis, layer, title in zip(row[3:], layers, titles[3:], strict=True):
+            sheet.picture(axis, heat[layer], title, "inferno", 0, float(heat[layer].max()) or 1.0)
+        titles = [""] * len(titles)  # only above the first row
+    title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
+    return sheet.save(folder, "grad_cam_heatmaps.png", title, alt)
+
+
+def _r(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _cell(mean: Mean) -> str:
+    if mean.r is None:
+        return "-"
+    span = "" if mean.interval is None else f" ({mean.interval[0]:.3f} to {mean.interval[1]:.3f})"
+    return f"{mean.r:.3f}{span}"

@@ -1,172 +1,305 @@
-"""Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls."""
+"""Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls.
 
-from collections.abc import Sequence
+Probes of two kinds (`fpp_ml_bench.baselines.diagnostics.fits`) are fitted to the layers of a network, of the same
+network with random weights, and to controls: the raw input and the pixel's position.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics.activations import INPUT
-from fpp_ml_bench.baselines.diagnostics.convolution_probe import BATCH, EPOCHS, WIDTH, grid_step
-from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress, spread
-from fpp_ml_bench.baselines.diagnostics.scores import (
-    CONTROLS,
-    TRAINED,
-    UNTRAINED,
-    Layers,
-    Scores,
-    mean_ratio,
-    ratio,
-    ratio_of_means,
-    score,
-)
+from fpp_ml_bench.baselines.diagnostics import fits, linear_report
+from fpp_ml_bench.baselines.diagnostics.linear_report import CONTROLS, TRAINED, UNTRAINED, Scores, score
+from fpp_ml_bench.baselines.diagnostics.probe import Finding, Probe, ProbeSettings, Progress
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 """Training samples of the probes, and training samples and epochs of a quick run."""
 SEEDS = 2
-PAPER_RATIO = 2.82
+POSITION = "position"
+"""The pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image."""
+PIXELS = 1024
+"""Pixels drawn with replacement from each sample: so many over the image, and as many within the object."""
+TARGETS: dict[str, tuple[str, ...]] = {
+    "edges": ("edges",), "depth": ("depth",), "distance": ("depth_mm",), "phase": ("sine", "cosine"),
+    "order": ("order",),
+}  # fmt: skip
+"""Targets of the linear probe, by the names in `Truth`; the phase is an angle and so has two."""
+INSIDE = ("distance", "phase", "order")
+"""Targets on object pixels only."""
+FRINGE = ("phase", "order")
+"""Targets that need fringes of a single direction."""
+SPATIAL = ("edges", "depth")
+"""Targets of the four-convolution probes, as in the paper."""
+
+Errors = dict[tuple[str, str], list[float]]
+"""Squared error of each sample, by layer and target."""
 
 
-class LinearProbing:
+class LinearProbing(Probe):
     """Probes on frozen activations, trained on the training split and validated on the validation split."""
 
     name = "linear"
     title = "Linear probing"
     question = "What can be read from each layer: edges, depth, the fringe's phase, its order?"
-    version = 1
-
-    def applies_to(self, subject: Subject) -> str | None:
-        if subject.network is None:
-            return f"{subject.name} is a method without a network: it has no layers to probe."
-        return None
+    without_network = "it has no layers to probe"
 
     def run(
-        self, subject: Subject, dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
-        from fpp_ml_bench.baselines.diagnostics.linear_figures import draw
-        from fpp_ml_bench.baselines.diagnostics.linear_tables import tables
-
-        most_samples = settings.samples or (QUICK_SAMPLES if settings.quick else SAMPLES)
-        train, validation = (
-            _samples_with_object(dataset, "train", most_samples),
-            _samples_with_object(dataset, "validation", settings.samples),
-        )
+        train = settings.choose(_samples_with_object(dataset, "train"), SAMPLES, QUICK_SAMPLES)
+        validation = settings.choose(_samples_with_object(dataset, "validation"))
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
-        epochs = QUICK_EPOCHS if settings.quick else EPOCHS
-        linear, spatial = measure(subject, dataset, train, validation, seeds, epochs, progress)
-        return Finding(
-            self.name,
-            self.title,
-            summary(linear, spatial),
+        epochs = QUICK_EPOCHS if settings.quick else fits.EPOCHS
+        total, done = (len(train) + len(validation)) * (2 + seeds) + epochs * len(train), 0
+
+        def tick(samples: int, activity: str) -> None:
+            nonlocal done
+            done += samples
+            progress(done, total, activity)
+
+        experiment = Experiment(subject, dataset, train, validation, tick)
+        linear, spatial = experiment.linear_scores(seeds), experiment.spatial_scores(seeds, epochs)
+        protocol = {
+            "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
+            "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
+            "image_px_a_grid_step": fits.grid_step(subject.image_size),
+        }  # fmt: skip
+        return self.finding(
+            linear_report.summary(linear, spatial),
             {
-                "protocol": {
-                    "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
-                    "epochs": epochs, "batch": BATCH, "probe_width": WIDTH,
-                    "image_px_a_grid_step": grid_step(subject.image_size),
-                },
-                "four_convolutions": _to_dict(spatial),
-                "ratio": mean_ratio(spatial[TRAINED]),
-                "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]),
-                "linear": _to_dict(linear),
+                "protocol": protocol,
+                "four_convolutions": linear_report.to_dict(spatial),
+                "ratio": linear_report.mean_ratio(spatial[TRAINED]),
+                "ratio_of_means": linear_report.ratio_of_means(spatial[CONTROLS][fits.INPUT]),
+                "linear": linear_report.to_dict(linear),
             },
-            tables(linear, spatial),
-            draw(linear, spatial, folder),
-        )  # fmt: skip
-
-
-def measure(
-    subject: Subject, dataset: "DatasetFolder", train: Sequence[str], validation: Sequence[str], seeds: int,
-    epochs: int, progress: Progress,
-) -> tuple[Scores, Scores]:  # fmt: skip
-    """Scores of the linear and the four-convolution probes: network, ``seeds`` untrained copies, and controls."""
-    from fpp_ml_bench.baselines.diagnostics import linear_measure as measuring
-
-    network, untrained = subject.network, subject.untrained
-    if network is None or untrained is None:
-        raise DiagnosisError(f"{subject.name}: has no network to probe")
-    objects = [split_sample_name(name)[0] for name in validation]
-    total = (len(train) + len(validation)) * (2 + seeds) + epochs * len(train)
-    done = 0
-
-    def tick(samples: int, activity: str) -> None:
-        nonlocal done
-        done += samples
-        progress(done, total, activity)
-
-    targets = [name for name in measuring.TARGETS if subject.direction != "both" or name not in measuring.FRINGE]
-    pixels = measuring.Pixels(subject, dataset, targets)
-    linear: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
-    errors, reference = measuring.linear_errors(subject, network, pixels, train, validation, True, tick)
-    for (layer, target), sample_errors in errors.items():
-        source = CONTROLS if layer in (INPUT, measuring.POSITION) else TRAINED
-        linear[source].setdefault(layer, {})[target] = score([sample_errors], reference[target], objects)
-    random_errors = [
-        measuring.linear_errors(subject, untrained(seed), pixels, train, validation, False, tick)[0]
-        for seed in range(seeds)
-    ]
-    for layer, target in random_errors[0]:
-        seed_errors = [sample_errors[layer, target] for sample_errors in random_errors]
-        linear[UNTRAINED].setdefault(layer, {})[target] = score(seed_errors, reference[target], objects)
-    networks = {TRAINED: network, UNTRAINED: untrained(0)}
-    # Each seed of the untrained network costs another forward pass per batch, so there is one.
-    seed_counts = {TRAINED: seeds, INPUT: seeds, UNTRAINED: 1}
-    spatial_errors, reference = measuring.spatial_errors(
-        subject, networks, dataset, train, validation, seed_counts, epochs, tick
-    )
-    spatial: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
-    for source, layer, target in dict.fromkeys(key[:3] for key in spatial_errors):
-        seed_errors = [spatial_errors[source, layer, target, seed] for seed in range(seed_counts[source])]
-        layer_scores = spatial[CONTROLS if source == INPUT else source].setdefault(layer, {})
-        layer_scores[target] = score(seed_errors, reference[target], objects)
-    return linear, spatial
-
-
-def summary(linear: Scores, spatial: Scores) -> str:
-    """The result in a few sentences."""
-    trained, raw = spatial[TRAINED], spatial[CONTROLS][INPUT]
-    edges, depth = (float(np.mean([layer[target].r2 for layer in trained.values()])) for target in ("edges", "depth"))
-    easier = "edges" if edges > depth else "depth"
-    parts = [
-        f"The paper's ratio, depth MSE over edge MSE, is {mean_ratio(trained):.2f} (paper: {PAPER_RATIO}). The raw "
-        f"input alone gives {ratio(raw):.2f}, and a probe that predicts each target's mean {ratio_of_means(raw):.2f}, "
-        "because the two errors have different units. As a share of the explained variance, "
-        f"{easier} {'are' if easier == 'edges' else 'is'} easier to read on average over layers (R2 {edges:.2f} for "
-        f"edges, {depth:.2f} for depth)."
-    ]
-    if "phase" in linear[CONTROLS][INPUT]:
-        best, last = _best(linear[TRAINED], "phase"), list(linear[TRAINED])[-1]
-        last_r2, random = linear[TRAINED][last]["phase"].r2, linear[UNTRAINED][last]["phase"].r2
-        parts.append(
-            f"Linear probes read the wrapped phase best from {best[0]} (R2 {best[1]:.2f}). From the last layer, "
-            f"{last}, they reach R2 {last_r2:.2f}; with random weights {random:.2f}."
+            linear_report.tables(linear, spatial),
+            linear_report.draw_four_convolutions(spatial, folder),
+            linear_report.draw_one_by_one(linear, folder),
         )
-    return " ".join(parts)
 
 
-def _best(layers: Layers, target: str) -> tuple[str, float]:
-    return max(((layer, scores[target].r2) for layer, scores in layers.items()), key=lambda pair: pair[1])
-
-
-def _to_dict(scores: Scores) -> dict[str, Any]:
-    return {
-        source: {
-            layer: {target: target_score.to_dict() for target, target_score in targets.items()}
-            for layer, targets in layers.items()
-        }
-        for source, layers in scores.items()
-    }
-
-
-def _samples_with_object(dataset: "DatasetFolder", split: str, limit: int | None) -> list[str]:
-    """At most ``limit`` samples of ``split`` that show an object. Raises `DiagnosisError` where there is none."""
+def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
+    """The samples of ``split`` that show an object. Raises `DiagnosisError` where there is none."""
     names = [name for name in dataset.samples(split) if object_mask(dataset.depth_mm(name)).any()]
     if not names:
         raise DiagnosisError(f"{dataset.path}: split {split} holds no object; probes need training and validation data")
-    return spread(names, limit)
+    return names
+
+
+@dataclass
+class _Drawn:
+    """Pixels of a sample (P,) and their target values (P, T), over the image (False) and within the object (True)."""
+
+    pixels: dict[bool, Tensor]
+    targets: dict[bool, Tensor]
+
+
+class Pixels:
+    """Pixels drawn from each sample, the same for every network, and cached.
+
+    ``columns``: for each target its set (over the image or within the object) and its columns in that set's
+    ``targets``.
+    """
+
+    def __init__(self, subject: Subject, dataset: DatasetFolder) -> None:
+        self.dataset, self.direction = dataset, subject.direction
+        self.fields: dict[bool, list[str]] = {False: [], True: []}
+        self.columns: dict[str, tuple[bool, slice]] = {}
+        for target, names in TARGETS.items():
+            if self.direction != "both" or target not in FRINGE:
+                fields = self.fields[target in INSIDE]
+                self.columns[target] = target in INSIDE, slice(len(fields), len(fields) + len(names))
+                fields += names
+        self._drawn: dict[str, _Drawn] = {}
+
+    def of(self, sample: str) -> _Drawn:
+        if sample not in self._drawn:
+            self._drawn[sample] = self._draw(sample)
+        return self._drawn[sample]
+
+    def _draw(self, sample: str) -> _Drawn:
+        dataset, split = self.dataset, self.dataset.split_of_sample(sample)
+        rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
+        direction = "horizontal" if self.direction == "both" else self.direction
+        ground_truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
+        inside, size = np.flatnonzero(ground_truth.inside), ground_truth.inside.size
+        drawn = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
+        targets = {
+            key: np.stack([getattr(ground_truth, name).ravel()[drawn[key]] for name in fields], axis=1)
+            for key, fields in self.fields.items()
+        }
+        return _Drawn(*({key: torch.from_numpy(part[key]) for key in part} for part in (drawn, targets)))
+
+    def errors_of(self, layer: str, inside: bool, errors: Tensor) -> Iterator[tuple[tuple[str, str], float]]:
+        """Layer, target, and mean square of one sample's ``errors`` (P, T), for every target of its set."""
+        for target, (within_object, columns) in self.columns.items():
+            if within_object == inside:
+                yield (layer, target), float(errors[:, columns].square().mean())
+
+
+@dataclass
+class Experiment:
+    """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``.
+
+    ``tick`` is called with the number of samples just processed and the activity.
+    """
+
+    subject: Subject
+    dataset: DatasetFolder
+    train: Sequence[str]
+    validation: Sequence[str]
+    tick: Callable[[int, str], None]
+
+    def __post_init__(self) -> None:
+        self.pixels = Pixels(self.subject, self.dataset)
+        self.objects = [split_sample_name(name)[0] for name in self.validation]
+
+    def linear_scores(self, seeds: int) -> Scores:
+        """Scores of the linear probes: of the network, of ``seeds`` untrained copies, and of the controls."""
+        network, untrained = self.subject.networks()
+        scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
+        errors, reference = self.linear_errors(network, controls=True)
+        for (layer, target), sample_errors in errors.items():
+            source = CONTROLS if layer in (fits.INPUT, POSITION) else TRAINED
+            scores[source].setdefault(layer, {})[target] = score([sample_errors], reference[target], self.objects)
+        random_errors = [self.linear_errors(untrained(seed))[0] for seed in range(seeds)]
+        for layer, target in random_errors[0]:
+            seed_errors = [sample_errors[layer, target] for sample_errors in random_errors]
+            scores[UNTRAINED].setdefault(layer, {})[target] = score(seed_errors, reference[target], self.objects)
+        return scores
+
+    def linear_errors(self, network: nn.Module, controls: bool = False) -> tuple[Errors, dict[str, list[float]]]:
+        """Errors of the 1 x 1 probes of ``network``'s layers.
+
+        The second value holds the errors of predicting the mean, by target. With ``controls`` the raw input and the
+        position are probed like layers.
+        """
+        equations: dict[tuple[str, bool], fits.NormalEquations] = {}
+        for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
+            if (layer, key) not in equations:
+                equations[layer, key] = fits.NormalEquations(features.shape[2], targets.shape[2])
+            equations[layer, key].add(features.flatten(0, 1), targets.flatten(0, 1))
+        weights = {probe: normal_equations.solve() for probe, normal_equations in equations.items()}
+        errors: Errors = {}
+        for layer, key, features, targets in self._pixel_batches(network, self.validation, "validating", controls):
+            for sample_features, sample_targets in zip(features, targets, strict=True):
+                difference = fits.apply(weights[layer, key], sample_features) - sample_targets.double()
+                for name, error in self.pixels.errors_of(layer, key, difference):
+                    errors.setdefault(name, []).append(error)
+        means: dict[bool, Tensor] = {}
+        for (_, key), normal_equations in equations.items():
+            means.setdefault(key, normal_equations.target_mean)
+        reference: dict[str, list[float]] = {}
+        for sample in self.validation:
+            for key, mean in means.items():
+                difference = self.pixels.of(sample).targets[key].double() - mean
+                for (_, target), error in self.pixels.errors_of("", key, difference):
+                    reference.setdefault(target, []).append(error)
+        return errors, reference
+
+    def _pixel_batches(
+        self, network: nn.Module, samples: Sequence[str], activity: str, controls: bool
+    ) -> Iterator[tuple[str, bool, Tensor, Tensor]]:
+        """Layer, set, features (B, P, C) and targets (B, P, T)."""
+        layers, size = self.subject.layers_of(network), self.subject.image_size
+        drawn: dict[bool, Tensor] = {}
+
+        def take(features: Tensor) -> Tensor:
+            return torch.stack([fits.at_pixels(features, pixels, size) for pixels in drawn.values()])
+
+        with fits.tapped(layers, take) as activations:
+            for names, fringe in self.subject.batches(self.dataset, samples):
+                batch = [self.pixels.of(name) for name in names]
+                drawn.update({key: torch.stack([sample.pixels[key] for sample in batch]) for key in (False, True)})
+                fits.run_network(network, fringe, activations, list(layers), self.subject.name)
+                if controls:
+                    activations[fits.INPUT] = take(fringe)
+                    activations[POSITION] = torch.stack([_position(pixels, size) for pixels in drawn.values()])
+                for layer, of_sets in activations.items():
+                    for key, features in zip(drawn, of_sets, strict=True):
+                        yield layer, key, features, torch.stack([sample.targets[key] for sample in batch])
+                self.tick(len(names), f"{activity} linear probes")
+
+    def spatial_scores(self, seeds: int, epochs: int) -> Scores:
+        """Scores of the four-convolution probes: of the network, of an untrained copy, and of the raw input."""
+        network, untrained = self.subject.networks()
+        # Each seed of the untrained network costs another forward pass per batch, so there is one.
+        seed_counts = {TRAINED: seeds, fits.INPUT: seeds, UNTRAINED: 1}
+        errors, reference = self.spatial_errors({TRAINED: network, UNTRAINED: untrained(0)}, seed_counts, epochs)
+        scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
+        for (source, layer), target in dict.fromkeys(key[:2] for key in errors):
+            seed_errors = [errors[(source, layer), target, seed] for seed in range(seed_counts[source])]
+            layer_scores = scores[CONTROLS if source == fits.INPUT else source].setdefault(layer, {})
+            layer_scores[target] = score(seed_errors, reference[target], self.objects)
+        return scores
+
+    def spatial_errors(
+        self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
+    ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
+        """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed.
+
+        The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input. The
+        second value holds the errors of predicting the mean.
+        """
+        moments: dict[fits.Source, fits.Moments] = {}
+        sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
+        for features, targets in self._map_batches(networks, self.train, "spread of the activations"):
+            for source, maps in features.items():
+                moments.setdefault(source, fits.Moments()).add(maps)
+            for target, values in targets.items():
+                sums[target] += float(values.double().sum())
+                counts[target] += values.numel()
+        means = {target: sums[target] / counts[target] for target in SPATIAL}
+        steps = epochs * -(-len(self.train) // fits.BATCH)
+        probes = fits.ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
+        for epoch in range(epochs):
+            order = np.random.default_rng([1, epoch]).permutation(len(self.train))
+            shuffled = [self.train[index] for index in order]
+            for features, targets in self._map_batches(networks, shuffled, "training four-convolution probes"):
+                probes.step(features, targets)
+        errors: dict[tuple[fits.Source, str, int], list[float]] = {}
+        reference: dict[str, list[float]] = {target: [] for target in SPATIAL}
+        for features, targets in self._map_batches(networks, self.validation, "validating four-convolution probes"):
+            for probe, sample_errors in probes.errors(features, targets).items():
+                errors.setdefault(probe, []).extend(sample_errors)
+            for target, values in targets.items():
+                reference[target] += (values.double() - means[target]).square().mean((1, 2, 3)).tolist()
+        return errors, reference
+
+    def _map_batches(
+        self, networks: Mapping[str, nn.Module], samples: Sequence[str], activity: str
+    ) -> Iterator[tuple[dict[fits.Source, Tensor], dict[str, Tensor]]]:
+        """Activations (B, C, h, w) of every layer and targets (B, 1, h, w), on one grid."""
+        height, width = self.subject.image_size
+        step = fits.grid_step((height, width))
+        side = max(1, height // step), max(1, width // step)
+        for names, fringe in self.subject.batches(self.dataset, samples, fits.BATCH):
+            features = {(fits.INPUT, fits.INPUT): fits.at_size(fringe, side)}
+            for source, network in networks.items():
+                layers = self.subject.layers_of(network)
+                with fits.tapped(layers, lambda maps: fits.at_size(maps, side)) as activations:
+                    fits.run_network(network, fringe, activations, list(layers), self.subject.name)
+                    features |= {(source, layer): activations[layer] for layer in layers}
+            depths = [self.dataset.depth_mm(name) for name in names]
+            targets = {
+                "edges": np.stack([fits.edge_map(depth_mm) for depth_mm in depths]),
+                "depth": np.stack([fits.normalised_depth(depth_mm) for depth_mm in depths]),
+            }
+            yield features, {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in targets.items()}
+            self.tick(len(names), activity)
+
+
+def _position(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    rows, columns = pixels // size[1], pixels % size[1]
+    y, x = (2 * rows + 1) / size[0] - 1, (2 * columns + 1) / size[1] - 1
+    return torch.stack([x, y, x * x, x * y, y * y], dim=-1)

@@ -1,15 +1,21 @@
-"""Settings and results of probes; a finding is stored on disk, so that no probe runs twice."""
+"""What all probes share: their base class, settings and results, their names, and the style of figures.
 
-import json
+Importing this module imports neither numpy nor matplotlib, so that the command line can name the probes.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from hashlib import sha256
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from fpp_ml_bench.errors import DiagnosisError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -35,6 +41,27 @@ class ProbeSettings:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise DiagnosisError(f"{name}: expected 1 or more, got {value}")
+
+    def choose(self, names: Sequence[str], usual: int | None = None, quick: int | None = None) -> list[str]:
+        """At most ``samples`` of ``names``, by default ``usual``, or ``quick`` of them in a quick run."""
+        return spread(names, self.samples or (quick if self.quick else usual))
+
+
+def spread(names: Sequence[str], limit: int | None) -> list[str]:
+    """At most ``limit`` of ``names``, taken evenly, in their order."""
+    if limit is None or limit >= len(names):
+        return list(names)
+    return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
+
+
+class Progress(Protocol):
+    """Called by a running probe with its progress."""
+
+    def __call__(self, done: int, total: int, activity: str = "") -> None: ...
+
+
+def silent(done: int, total: int, activity: str = "") -> None:
+    """A `Progress` that shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -77,72 +104,101 @@ class Finding:
     skipped: str | None = None
 
 
-class Progress(Protocol):
-    """Called by a running probe with its progress."""
-
-    def __call__(self, done: int, total: int, activity: str = "") -> None: ...
-
-
-def silent(done: int, total: int, activity: str = "") -> None:
-    """A `Progress` that shows nothing."""
-
-
-class Probe(Protocol):
+class Probe:
     """A test of a model. ``version`` goes up when its result for the same model changes."""
 
     name: str
     title: str
     question: str
-    version: int
+    version = 1
+    without_network: str | None = None
+    """What a method without a network lacks for this probe, or None."""
 
     def applies_to(self, subject: "Subject") -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
+        if self.without_network is None or subject.network is not None:
+            return None
+        return f"{subject.name} is a method without a network: {self.without_network}."
 
     def run(
         self, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         """Measure ``subject``; pictures are written into ``folder``, which exists."""
+        raise NotImplementedError
+
+    def finding(self, summary: str, values: Mapping[str, Any], tables: Sequence[Table], *figures: Figure) -> Finding:
+        """The result of this probe."""
+        return Finding(self.name, self.title, summary, values, tables, figures)
 
 
-def spread(names: Sequence[str], limit: int | None) -> list[str]:
-    """At most ``limit`` of ``names``, taken evenly, in their order."""
-    if limit is None or limit >= len(names):
-        return list(names)
-    return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
+PROBES = {
+    "linear": ("linear", "LinearProbing"),
+    "grad-cam": ("grad_cam", "GradCam"),
+    "flat-plane": ("flat_plane", "FlatPlane"),
+    "counterfactual": ("counterfactual", "Counterfactual"),
+    "theory": ("theory", "Theory"),
+}
+"""The probes by name, in the order of the report: module below this package, which is imported on first use, and class
+in it, which is made without arguments."""
 
 
-def finding_key(probe: Probe, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings) -> str:
-    """Hash (64 hex digits) of everything that a finding depends on."""
-    content = {
-        "probe": probe.name, "version": probe.version, "subject": subject.sha256, "layers": list(subject.layer_names),
-        "dataset": dataset.fingerprint, "settings": asdict(settings),
-    }  # fmt: skip
-    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+class Sheet:
+    """A figure of ``rows x columns`` axes in the report's style, black on white; sizes in inches.
 
-
-def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already.
-
-    Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
+    ``options`` as of ``subplots``. ``axes``: an array of that shape.
     """
-    from fpp_ml_bench.files import write_atomically
 
-    content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(folder / f"{finding.probe}.json", (text + "\n").encode("utf-8"))
+    COLOURS: ClassVar = {
+        "edges": "#2e8b57", "depth": "#c0392b", "distance": "#c0392b", "phase": "#1b5bb8", "order": "#8a4b00",
+        "raw": "#59616b", "random": "#9aa3ad",
+    }  # fmt: skip
+    """Colours of the targets, edges and depth as in the paper's figure; of the raw input, and of random weights."""
+    INK, GRID = "#191c20", "#dfe1e5"
+    DPI = 130
 
+    def __init__(self, rows: int, columns: int, width: float, height: float, **options: Any) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
-def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
-    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
-    try:
-        content = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        if content["key"] != key:
-            return None
-        fields = dict(content["finding"])
-        fields["tables"] = tuple(Table(**table) for table in fields["tables"])
-        fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
-        finding = Finding(**fields)
-        seconds = float(content["seconds"])
-    except (OSError, ValueError, TypeError, KeyError):
-        return None  # absent, half written, or of another version: it is made again
-    return (finding, seconds) if all((folder / figure.file).is_file() for figure in finding.figures) else None
+        self.figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(self.figure)
+        self.axes: Any = self.figure.subplots(rows, columns, squeeze=False, **options)
+
+    def tidy(self, axes: "Axes", title: str = "", x: str = "", y: str = "") -> None:
+        """Set titles and a light grid, and remove the box."""
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.set_xlabel(x, fontsize=9)
+        axes.set_ylabel(y, fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.grid(axis="y", color=self.GRID, linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+
+    def picture(self, axes: "Axes", image: "NDArray", title: str = "", colours: str = "gray", *limits: float) -> Any:
+        """An image (H, W) without ticks; ``limits``, low and high, default to its own range."""
+        axes.set_title(title, fontsize=9)
+        axes.set(xticks=[], yticks=[])
+        low, high = limits or (None, None)
+        return axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+
+    def scale(self, image: Any, axes: Any, size: int = 7, **options: Any) -> None:
+        """The colour scale of a `picture` beside ``axes``."""
+        self.figure.colorbar(image, ax=axes, **options).ax.tick_params(labelsize=size)
+
+    def bars(self, axes: "Axes", positions: Sequence[float], bars: Sequence[tuple[Any, Any]], **style: Any) -> None:
+        """Bars of (value, interval), each of which may be None; ``style`` as of ``bar``."""
+        axes.bar(positions, [math.nan if value is None else value for value, _ in bars], **style)
+        for x, (value, interval) in zip(positions, bars, strict=True):
+            if value is not None and interval is not None:
+                axes.plot([x, x], interval, color=self.INK, linewidth=1)
+
+    def save(self, folder: Path, file: str, title: str, alt: str) -> Figure:
+        """Write ``file`` with 256 colours, a third of the size; the bytes are reproducible."""
+        from PIL import Image
+
+        buffer = BytesIO()
+        self.figure.savefig(buffer, format="png", dpi=self.DPI, facecolor="white", metadata={"Software": None})
+        buffer.seek(0)
+        reduced = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        reduced.save(folder / file, optimize=True)
+        return Figure(title, file, alt)

@@ -1,30 +1,38 @@
 """The model under diagnosis: shipped weights, a weights file, a method without a network, or a user's torch module."""
 
 import hashlib
+import importlib.util
 import json
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.method import METHODS, Method, load_method
-from fpp_ml_bench.depth import Normalisation, object_mask
-from fpp_ml_bench.errors import DiagnosisError, WeightsError
+from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
+from fpp_ml_bench.baselines.training import shipped_names, weights_path
+from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
+from fpp_ml_bench.errors import DiagnosisError, FppBenchError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Units
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
-
-    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
 OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
 FACTORY_MARK = ".py:"
+BATCH = 8
+PIXELS_AT_ONCE = BATCH * 224 * 224
+"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +60,24 @@ class Subject:
     predict_frames: Callable[[Frames], NDArray[np.float32]]
     uses_ground_truth_mask: bool = False
     normalisation: Normalisation | None = None
-    network: "nn.Module | None" = None
+    network: nn.Module | None = None
     layer_names: tuple[str, ...] = ()
-    find_layers: "Callable[[nn.Module], dict[str, nn.Module]] | None" = None
-    untrained: "Callable[[int], nn.Module] | None" = None
+    find_layers: Callable[[nn.Module], dict[str, nn.Module]] | None = None
+    untrained: Callable[[int], nn.Module] | None = None
     weights_sha256: str | None = None
 
-    @property
-    def layers(self) -> "dict[str, nn.Module]":
-        """The layers to probe of ``network`` by name, in forward order; empty without a network."""
-        return {} if self.network is None else self.layers_of(self.network)
+    def networks(self) -> tuple[nn.Module, Callable[[int], nn.Module]]:
+        """``network`` and ``untrained``. Raises `DiagnosisError` for a method without a network."""
+        if self.network is None or self.untrained is None:
+            raise DiagnosisError(f"{self.name} has no network to probe")
+        return self.network, self.untrained
 
-    def layers_of(self, network: "nn.Module") -> "dict[str, nn.Module]":
+    def layers_of(self, network: nn.Module) -> dict[str, nn.Module]:
         """The layers to probe of a ``network`` of this architecture, for example of `untrained`."""
         all_layers = {} if self.find_layers is None else self.find_layers(network)
         return {name: all_layers[name] for name in self.layer_names}
 
-    def captured(self, dataset: "DatasetFolder", sample: str) -> list[NDArray[np.uint8] | None]:
+    def captured(self, dataset: DatasetFolder, sample: str) -> list[NDArray[np.uint8] | None]:
         """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
         frames: list[NDArray[np.uint8] | None] = [None] * len(dataset.sequence)
         for index in self.frames_used:
@@ -88,39 +97,41 @@ class Subject:
             raise DiagnosisError(f"{self.name}: its prediction holds NaN or infinity, so it can't be diagnosed")
         return depth.astype(np.float32, copy=False)
 
-    def input_tensor(self, frames: Frames) -> "Tensor":
-        """The input of ``network``: float32 (1, 1, H, W) in [0, 1]. Raises `DiagnosisError` without a network or its
-        frame."""
-        return self.input_batch([frames])
-
-    def input_batch(self, stacks: Sequence[Frames]) -> "Tensor":
-        """`input_tensor` of several samples: float32 (B, 1, H, W)."""
-        from fpp_ml_bench.baselines.networks import fringe_batch
-
-        if self.network is None:
-            raise DiagnosisError(f"{self.name} has no network, so there is no input to it")
+    def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
+        """The input of ``network`` for several samples: float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without
+        its frame."""
         (index,) = self.frames_used
         images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
         if len(images) != len(stacks):
             raise DiagnosisError(f"{self.name} needs frame {index}, which is missing")
         return fringe_batch(images, self.image_size, self.name)
 
+    @property
+    def batch_size(self) -> int:
+        """Images in a batch, so that memory stays bounded."""
+        return max(1, min(BATCH, PIXELS_AT_ONCE // (self.image_size[0] * self.image_size[1])))
+
+    def batches(
+        self, dataset: DatasetFolder, samples: Sequence[str], size: int | None = None
+    ) -> Iterator[tuple[list[str], Tensor]]:
+        """``samples`` in batches of ``size`` (default: `batch_size`), with their input (B, 1, H, W)."""
+        size = size or self.batch_size
+        for start in range(0, len(samples), size):
+            names = list(samples[start : start + size])
+            yield names, self.input_batch([self.captured(dataset, name) for name in names])
+
     def represent(self, frames: Frames) -> NDArray[np.float32]:
         """The network's output float32 (H, W) in its ``normalisation``.
 
-        Raises `DiagnosisError` as `input_tensor`, and for an output of another shape or with values that are not
-        finite.
+        Raises `DiagnosisError` without a network or its frame, and for an output of another shape or not finite.
         """
-        import torch
-
-        if self.network is None:
-            raise DiagnosisError(f"{self.name} has no network, so it has no network output")
-        batch = self.input_tensor(frames)
+        network, _ = self.networks()
+        batch = self.input_batch([frames])
         with torch.inference_mode():
-            return checked_output(self.network(batch), batch, self.name)[0, 0].numpy()
+            return checked_output(network(batch), batch, self.name)[0, 0].numpy()
 
 
-def checked_output(output: "Tensor", batch: "Tensor", name: str) -> "Tensor":
+def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:
     """``output`` if it is finite and shaped as ``batch`` (B, 1, H, W); else `DiagnosisError`."""
     shape = tuple(getattr(output, "shape", ()))
     if shape != tuple(batch.shape):
@@ -135,7 +146,7 @@ def checked_output(output: "Tensor", batch: "Tensor", name: str) -> "Tensor":
 
 
 def subject(
-    name: str, dataset: "DatasetFolder", layers: Sequence[str] | None = None, units: OutputUnits | None = None,
+    name: str, dataset: DatasetFolder, layers: Sequence[str] | None = None, units: OutputUnits | None = None,
     frame: int | None = None, threads: int = 1,
 ) -> Subject:  # fmt: skip
     """The model called ``name``, ready to be diagnosed on ``dataset``.
@@ -149,37 +160,38 @@ def subject(
     Raises `DiagnosisError` for a name, layer or module that can't be used, and other `FppBenchError` of the model.
     """
     if FACTORY_MARK in name:
-        from fpp_ml_bench.baselines.diagnostics.user_module import subject_of_factory
-
-        return subject_of_factory(name, dataset, layers, units or "normalised", 0 if frame is None else frame, threads)
+        return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
-    if name in METHODS:
-        _refuse_options(name, layers=layers, frame=frame)
-        return subject_of_method(load_method(name, dataset.rig), dataset)
-    return _weights(name, dataset, layers, frame, threads)
+    if name not in METHODS:
+        return _subject_of_weights(name, dataset, layers, frame, threads)
+    for option, value in (("layers", layers), ("frame", frame)):
+        if value is not None:
+            raise DiagnosisError(f"{name} is a method without a network, so it has no {option}; leave it out")
+    return subject_of_method(load_method(name, dataset.rig), dataset)
 
 
-def subject_of_method(depth_method: Method, dataset: "DatasetFolder") -> Subject:
-    """A method without a network as a subject."""
+def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
+    """A method as a subject; ``network``: the fields of a `Subject` with one."""
+    # A network's settings hold the hash of its weights; those of the machine don't matter.
+    settings = {key: value for key, value in depth_method.settings.items() if key not in ("threads", "device")}
     return Subject(
         name=depth_method.name,
         title=depth_method.title,
-        sha256=_digest(depth_method.name, depth_method.settings),
+        sha256=hashlib.sha256(json.dumps([depth_method.name, settings], sort_keys=True).encode()).hexdigest(),
         units=depth_method.units,
         image_size=dataset.size,
         frames_used=depth_method.frames_used,
-        direction=direction_of(dataset, depth_method.frames_used),
+        direction=_direction_of(dataset, depth_method.frames_used),
         predict_frames=depth_method.predict,
         uses_ground_truth_mask=depth_method.uses_ground_truth_mask,
+        **network,
     )
 
 
-def _weights(
-    name: str, dataset: "DatasetFolder", layers: Sequence[str] | None, frame: int | None, threads: int
+def _subject_of_weights(
+    name: str, dataset: DatasetFolder, layers: Sequence[str] | None, frame: int | None, threads: int
 ) -> Subject:
-    from fpp_ml_bench.baselines.training import shipped_names, weights_path
-
     try:
         path = weights_path(name)
     except WeightsError:
@@ -188,81 +200,182 @@ def _weights(
             f"unknown model {name!r}; there are {names}, every .safetensors file of trained weights, and your own "
             "module as file.py:factory"
         ) from None
-    import torch
-
-    from fpp_ml_bench.baselines.networks import NetworkMethod, load
-
     torch.set_num_threads(threads)
     model = load(path, "cpu")
-    if model.config.image_size != dataset.size:
+    config = model.config
+    if config.image_size != dataset.size:
         raise WeightsError(
-            f"{path}: was trained at {model.config.image_size} px (H x W), {dataset.path} has images of {dataset.size} "
+            f"{path}: was trained at {config.image_size} px (H x W), {dataset.path} has images of {dataset.size} "
             "px; give a dataset built at the weights' size"
         )
-    network_method = NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence)
-    return subject_of_network(network_method, dataset, layers)
 
-
-def subject_of_network(network_method: Any, dataset: "DatasetFolder", layers: Sequence[str] | None = None) -> Subject:
-    """A `fpp_ml_bench.baselines.networks.network_method.NetworkMethod` as a subject."""
-    import torch
-
-    from fpp_ml_bench.baselines.networks import build
-
-    model = network_method.model
-    names = select_layers(layers, model.network.probe_layers, model.config.name)
-
-    def untrained(seed: int) -> "nn.Module":
+    def untrained(seed: int) -> nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            network: nn.Module = build(model.config.network, **model.config.options)
+            network: nn.Module = build(config.network, **config.options)
         network = network.eval().requires_grad_(False)
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
-    return Subject(
-        name=network_method.name,
-        title=network_method.title,
-        sha256=_digest(network_method.name, network_method.settings),
-        units=network_method.units,
-        image_size=model.config.image_size,
-        frames_used=network_method.frames_used,
-        direction=direction_of(dataset, network_method.frames_used),
-        predict_frames=network_method.predict,
-        uses_ground_truth_mask=network_method.uses_ground_truth_mask,
-        normalisation=model.config.normalisation,
+    return subject_of_method(
+        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence),
+        dataset,
+        normalisation=config.normalisation,
         network=model.network,
-        layer_names=names,
-        find_layers=lambda network: network.probe_layers,  # type: ignore[arg-type, return-value]
+        layer_names=_select_layers(layers, model.network.probe_layers, config.name),
+        find_layers=lambda network: network.probe_layers,
         untrained=untrained,
         weights_sha256=model.sha256,
     )
 
 
-def select_layers(requested: Sequence[str] | None, available: "dict[str, nn.Module]", name: str) -> tuple[str, ...]:
+def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
     """The ``requested`` layers, or all ``available``, in forward order. Raises `DiagnosisError` for unknown ones."""
     unknown = [layer for layer in requested or () if layer not in available]
     if unknown:
-        from difflib import get_close_matches
-
         suggestions = get_close_matches(unknown[0], available, n=3) or list(available)[:12]
         raise DiagnosisError(f"{name} has no layer {unknown[0]!r}; there are {', '.join(suggestions)}")
-    return tuple(available) if not requested else tuple(layer for layer in available if layer in set(requested))
+    return tuple(layer for layer in available if not requested or layer in requested)
 
 
-def direction_of(dataset: "DatasetFolder", frames: Sequence[int]) -> Direction | Literal["both"]:
+def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | Literal["both"]:
     """Fringe direction of ``frames``; ``both`` where they differ or have no direction."""
     directions = {dataset.sequence.frames[index].direction for index in frames} - {None}
     direction = next(iter(directions)) if len(directions) == 1 else None
     return "both" if direction is None else direction
 
 
-def _digest(name: str, settings: Mapping[str, Any]) -> str:
-    """Hash of name and settings without those of the machine; a network's settings hold the hash of its weights."""
-    relevant = {key: value for key, value in settings.items() if key not in ("threads", "device")}
-    return hashlib.sha256(json.dumps([name, relevant], sort_keys=True).encode()).hexdigest()
+# ---- a user's torch module: path/to/file.py:factory
 
 
-def _refuse_options(name: str, **options: object) -> None:
-    for option, value in options.items():
-        if value is not None:
-            raise DiagnosisError(f"{name} is a method without a network, so it has no {option}; leave it out")
+def _subject_of_factory(
+    name: str, dataset: DatasetFolder, layers: Sequence[str] | None, units: OutputUnits, frame: int, threads: int
+) -> Subject:
+    """The module that ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits show early.
+
+    The file is the user's own code and is executed. Raises `DiagnosisError` for a file, factory, layer, frame or output
+    that can't be used; its message quotes errors of the user's code.
+    """
+    if units not in NORMALISATION_OF:
+        raise DiagnosisError(f"unknown units {units!r}; there are {', '.join(NORMALISATION_OF)}")
+    if not 0 <= frame < len(dataset.sequence):
+        raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
+    torch.set_num_threads(threads)
+    path, factory = _factory(name)
+    network = _build_network(name, factory)
+    normalisation = NORMALISATION_OF[units]
+
+    def predict(frames: Frames) -> NDArray[np.float32]:
+        image = frames[frame]
+        if image is None:
+            raise DiagnosisError(f"{name} needs frame {frame}, which is missing")
+        batch = fringe_batch([image], dataset.size, name)
+        try:
+            with torch.inference_mode():
+                values = checked_output(network(batch), batch, name)[0, 0].numpy()
+        except FppBenchError:
+            raise
+        except Exception as error:
+            reason = f"on fringes of shape {tuple(batch.shape)} it failed: {_error_text(error)}"
+            raise DiagnosisError(f"{name}: {reason}") from error
+        return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
+
+    user_subject = Subject(
+        name=path.stem,
+        title=f"{path.name}:{name.rpartition(':')[2]}",
+        sha256=_digest(path, network, f"{units} {frame}"),
+        units="normalised" if units == "normalised" else "mm",
+        image_size=dataset.size,
+        frames_used=(frame,),
+        direction=_direction_of(dataset, (frame,)),
+        predict_frames=predict,
+        normalisation=normalisation,
+        network=network,
+        layer_names=_select_layers(layers, _layers(network, bool(layers)), name),
+        find_layers=lambda model: _layers(model, bool(layers)),
+        untrained=lambda seed: randomised(_build_network(name, factory), seed),
+    )
+    first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
+    if first is None:
+        raise DiagnosisError(f"{dataset.path}: holds no sample")
+    user_subject.predict(user_subject.captured(dataset, first))
+    return user_subject
+
+
+def randomised(network: nn.Module, seed: int) -> nn.Module:
+    """``network`` with random weights, changed in place.
+
+    Layers with ``reset_parameters`` are initialised again, with the buffers of normalisation layers. The parameters of
+    the others are shuffled, which keeps their scale.
+    """
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(seed)
+        for module in network.modules():
+            reset = getattr(module, "reset_parameters", None)
+            if callable(reset):
+                reset()
+                continue
+            for parameter in module.parameters(recurse=False):
+                order = torch.randperm(parameter.numel())
+                parameter.copy_(parameter.reshape(-1)[order].reshape(parameter.shape))
+    return network
+
+
+def _layers(network: nn.Module, every: bool) -> dict[str, nn.Module]:
+    """A module's own ``probe_layers``, else its children; with ``every`` also all modules below it."""
+    own = getattr(network, "probe_layers", None)
+    if isinstance(own, dict) and not every:
+        return own
+    named = {name: module for name, module in network.named_modules() if name}
+    return {**named, **(own or {})} if every else dict(network.named_children())
+
+
+def _factory(name: str) -> tuple[Path, Any]:
+    file, _, attribute = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise DiagnosisError(f"{file}: no such file; expected path/to/file{FACTORY_MARK}factory")
+    spec = importlib.util.spec_from_file_location(f"fpp_bench_user_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise DiagnosisError(f"{file}: can't be imported as Python")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.insert(0, str(path.parent.resolve()))  # for imports from its own folder
+    try:
+        spec.loader.exec_module(module)
+    except FppBenchError:
+        raise
+    except (Exception, SystemExit) as error:  # the user's code can raise anything
+        raise DiagnosisError(f"{file}: importing it failed: {_error_text(error)}") from error
+    finally:
+        sys.path.remove(str(path.parent.resolve()))
+    factory = getattr(module, attribute, None)
+    if not callable(factory):
+        names = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+        raise DiagnosisError(f"{file}: holds no function {attribute!r}; there are {names or 'none'}")
+    return path, factory
+
+
+def _build_network(name: str, factory: Any) -> nn.Module:
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # random weights are the same every time
+            network = factory()
+    except (Exception, SystemExit) as error:
+        raise DiagnosisError(f"{name}: calling it without arguments failed: {_error_text(error)}") from error
+    if not isinstance(network, nn.Module):
+        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+    return network.eval().requires_grad_(False).cpu()
+
+
+def _digest(path: Path, network: nn.Module, settings: str) -> str:
+    digest = hashlib.sha256(settings.encode())
+    digest.update(path.read_bytes())
+    for key, value in network.state_dict().items():
+        if isinstance(value, Tensor):
+            content = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
+            digest.update(key.encode() + content)
+    return digest.hexdigest()
+
+
+def _error_text(error: BaseException) -> str:
+    return printable(f"{type(error).__name__}: {error}", 400)

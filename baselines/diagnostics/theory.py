@@ -11,28 +11,23 @@ Z^2 kappa / (1 -+ Z kappa), one sign for each side. The exponent of Z is 2 +- Z 
 Z kappa, the error relative to the disparity, is small.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_original import Original, original
-from fpp_ml_bench.baselines.diagnostics.probe import Finding, ProbeSettings, Progress
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, Surface, constant, moved, times
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.diagnostics.synth import Scene, SceneRenderer
-from fpp_ml_bench.baselines.diagnostics.synth_surface import Surface, moved
-from fpp_ml_bench.baselines.diagnostics.theory_report import draw, summary, tables
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction, Rig
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import DatasetFolder
 
 DISTANCES_M = (0.3, 10.0)
 POINTS = 400
@@ -44,6 +39,8 @@ STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own position."""
 SET_BACK_M = 0.1
 """Distance of the projector behind the camera in the rig that shows the limit of the thin baseline."""
+_SHOWN_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,9 @@ class Twins:
     frame: int
     other_frame: int
     depths_mm: tuple[NDArray[np.float64], NDArray[np.float64]]
-    frames: tuple[NDArray[np.uint8], NDArray[np.uint8]]
-    noiseless: tuple[NDArray[np.uint8], NDArray[np.uint8]]
-    other_frames: tuple[NDArray[np.uint8], NDArray[np.uint8]]
+    frames: Pair
+    noiseless: Pair
+    other_frames: Pair
     paint: NDArray[np.float64]
 
     def to_dict(self) -> dict[str, Any]:
@@ -68,9 +65,9 @@ class Twins:
             "direction": self.direction,
             "frame": self.frame,
             "object_pixels": int(inside.sum()),
-            "differing_pixels": int((self.frames[0] != self.frames[1]).sum()),
-            "differing_pixels_noiseless": int((self.noiseless[0] != self.noiseless[1]).sum()),
-            "differing_pixels_other_direction": int((self.other_frames[0] != self.other_frames[1]).sum()),
+            "differing_pixels": int(np.not_equal(*self.frames).sum()),
+            "differing_pixels_noiseless": int(np.not_equal(*self.noiseless).sum()),
+            "differing_pixels_other_direction": int(np.not_equal(*self.other_frames).sum()),
             "depth_apart_mean_mm": float(distance_mm.mean()),
             "depth_apart_least_mm": float(distance_mm.min()),
             "paint_least": float(self.paint.min()),
@@ -96,20 +93,20 @@ class ErrorCurve:
         quadratic = self.distances_m[np.abs(self.local - 2) <= 2 * WITHIN]
         return (float(quadratic.min()), float(quadratic.max())) if quadratic.size else None
 
+    def to_dict(self) -> dict[str, Any]:
+        about = {"name": self.name, "periods": self.periods, "exponent": self.exponent}
+        return {**about, "fitted_m": list(self.fitted_m), "quadratic_m": self.quadratic_m()}
 
-class Theory:
+
+class Theory(Probe):
     """Both theorems on the dataset's rig."""
 
     name = "theory"
     title = "Theory in numbers"
     question = "Can two depths give the same fringe, and how large is the depth error of one period at each distance?"
-    version = 1
-
-    def applies_to(self, subject: Subject) -> str | None:
-        return None
 
     def run(
-        self, subject: Subject, dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         progress(0, 2, "two scenes, one frame")
         twins = twins_of(dataset, SceneRenderer.of(dataset))
@@ -118,18 +115,13 @@ class Theory:
         values = {
             "twins": twins.to_dict(),
             "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": [
-                {"name": curve.name, "periods": curve.periods, "exponent": curve.exponent,
-                 "fitted_m": list(curve.fitted_m), "quadratic_m": curve.quadratic_m()}
-                for curve in curves
-            ],
-        }  # fmt: skip
-        return Finding(
-            self.name, self.title, summary(values), values, tables(values, curves), draw(twins, curves, folder)
-        )
+            "curves": [curve.to_dict() for curve in curves],
+        }
+        figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
+        return self.finding(summary(values), values, tables(values, curves), *figures)
 
 
-def twins_of(dataset: "DatasetFolder", renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
+def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
     """The first test object that fits into the working range twice, a whole period apart: at its own position and a
     period away, or half a period to either side.
 
@@ -141,10 +133,8 @@ def twins_of(dataset: "DatasetFolder", renderer: SceneRenderer, direction: Direc
         if not first.target.any():
             continue
         for start in STARTS_PERIODS:
-            pair = tuple(
-                moved(first.surface, renderer.rig, direction, partial(_constant, TAU * turns))
-                for turns in (start, start + 1)
-            )
+            shifts = [times(TAU * turns, constant) for turns in (start, start + 1)]
+            pair = [moved(first.surface, renderer.rig, direction, shift) for shift in shifts]
             if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
                 return _photographed(renderer, first, pair, direction)
     raise DiagnosisError(
@@ -153,11 +143,7 @@ def twins_of(dataset: "DatasetFolder", renderer: SceneRenderer, direction: Direc
     )
 
 
-def _constant(turn_rad: float, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.full_like(x, turn_rad)
-
-
-def _photographed(renderer: SceneRenderer, first: Original, pair: tuple[Surface, ...], direction: Direction) -> Twins:
+def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surface], direction: Direction) -> Twins:
     lights = [renderer.light(surface) for surface in pair]
     gains = [light.gain.astype(np.float64) for light in lights]
     # Albedo can only be lowered, so at each pixel it is lowered on the brighter surface.
@@ -175,21 +161,20 @@ def _photographed(renderer: SceneRenderer, first: Original, pair: tuple[Surface,
     )  # fmt: skip
 
 
-def _pair(renderer: SceneRenderer, scenes: Sequence[Scene], index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    first, second = (renderer.frames(scene, [index])[index] for scene in scenes)
-    if first is None or second is None:
-        raise ValueError(f"frame {index} is missing")
+def _pair(renderer: SceneRenderer, scenes: Sequence[Scene], index: int) -> Pair:
+    first, second = (np.asarray(renderer.frames(scene, [index])[index]) for scene in scenes)
     return first, second
+
+
+def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
+    """The layer on the camera's axis alone."""
+    return CalibrationLayer.of(rig, direction, (np.zeros(1), np.zeros(1)))
 
 
 def kappa_per_m(rig: Rig, direction: Direction) -> float:
     """P / (f_p b) on the camera's axis in 1 / m: a period relative to the disparity, per metre of distance."""
     layer = _axis(rig, direction)
     return float(TAU / abs(layer.gain[0]) * layer.forward[0])
-
-
-def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
-    return CalibrationLayer.of(rig, direction, (np.zeros(1), np.zeros(1)))
 
 
 def depth_error_mm(
@@ -210,18 +195,17 @@ def error_curves(rig: Rig, direction: Direction) -> list[ErrorCurve]:
     """Curves of a small error, of a period away from and toward the camera, of their mean, and of a small error on a
     rig whose projector is behind the camera."""
     distances = np.geomspace(*DISTANCES_M, POINTS)
-    away, toward = (depth_error_mm(rig, direction, distances, periods) for periods in (1.0, -1.0))
+    small, away, toward = (depth_error_mm(rig, direction, distances, p) for p in (SMALL_PERIODS, 1.0, -1.0))
     # The set-back is along the projector's axis, in its own frame.
     behind = replace(rig, translation_m=(rig.translation_m[0], rig.translation_m[1], rig.translation_m[2] + SET_BACK_M))
+    small_behind = depth_error_mm(behind, direction, distances, SMALL_PERIODS)
     return [
-        _curve("1/64 period", SMALL_PERIODS, distances,
-               depth_error_mm(rig, direction, distances, SMALL_PERIODS)),
+        _curve("1/64 period", SMALL_PERIODS, distances, small),
         _curve("one period, away", 1.0, distances, away),
         _curve("one period, toward", -1.0, distances, toward),
         _curve("one period, mean of both", 1.0, distances, (away + toward) / 2),
-        _curve(f"1/64 period, projector {SET_BACK_M:g} m behind", SMALL_PERIODS, distances,
-               depth_error_mm(behind, direction, distances, SMALL_PERIODS)),
-    ]  # fmt: skip
+        _curve(f"1/64 period, projector {SET_BACK_M:g} m behind", SMALL_PERIODS, distances, small_behind),
+    ]
 
 
 def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: NDArray[np.float64]) -> ErrorCurve:
@@ -234,3 +218,98 @@ def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: 
     exponent = float(np.polyfit(np.log(distances[fitted]), np.log(error_mm[fitted]), 1)[0])
     ends = float(distances[fitted].min()), float(distances[fitted].max())
     return ErrorCurve(name, periods, distances, error_mm, np.where(finite, local, np.nan), exponent, ends)
+
+
+# ---- the report
+
+
+def summary(values: Mapping[str, Any]) -> str:
+    """Both theorems with their numbers."""
+    twins, curves = values["twins"], {curve["name"]: curve for curve in values["curves"]}
+    small = next(iter(curves.values()))
+    away, both = curves["one period, away"], curves["one period, mean of both"]
+    return (
+        f"{twins['sample']} and a surface {twins['depth_apart_mean_mm']:.0f} mm from it on average give the same "
+        f"{twins['direction']} fringe: {twins['differing_pixels']} of the image's pixels differ (the frame of the "
+        f"other direction: {twins['differing_pixels_other_direction']}). The depth error of a small phase error grows "
+        f"with exponent {small['exponent']:.3f} over {_span(small['fitted_m'])}. For a whole period the exponent is 2 "
+        f"within 1% {_where(away['quadratic_m'])} for an error away from the camera, and {_where(both['quadratic_m'])} "
+        f"for the mean of both sides."
+    )
+
+
+def _span(ends: Sequence[float]) -> str:
+    return f"{ends[0]:.2g} to {ends[1]:.2g} m"
+
+
+def _where(ends: Sequence[float] | None) -> str:
+    return "at no distance from 0.3 m" if ends is None else f"from {_span(ends)}"
+
+
+def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Table]:
+    """Exponents, and errors at some distances."""
+    exponents, errors = [], []
+    for curve in curves:
+        quadratic = curve.quadratic_m()
+        exponents.append(
+            (curve.name, curve.exponent, _span(curve.fitted_m), "-" if quadratic is None else _span(quadratic))
+        )
+        shown = np.interp(np.log(_SHOWN_M), np.log(curve.distances_m), curve.error_mm)
+        errors.append((curve.name, *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
+    same = {
+        "pixels of the object": "object_pixels",
+        "depth between the two, mean, mm": "depth_apart_mean_mm",
+        "pixels that differ, with noise": "differing_pixels",
+        "pixels that differ, without noise": "differing_pixels_noiseless",
+        "pixels that differ in the other direction's frame": "differing_pixels_other_direction",
+        "least albedo factor on the brighter surface": "paint_least",
+    }
+    header = ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2")
+    return [
+        Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
+        Table("Exponent of distance in the depth error", header, exponents),
+        Table("Depth error, mm", ("Phase error", *(f"{z:g} m" for z in _SHOWN_M)), errors),
+    ]
+
+
+def _draw_twins(twins: Twins, folder: Path) -> Figure:
+    sheet = Sheet(2, 4, 10, 5.0)
+    inside = twins.depths_mm[0] > 0
+    depths = [depth[inside] for depth in twins.depths_mm]
+    low, high = min(depth.min() for depth in depths), max(depth.max() for depth in depths)
+    pairs = (twins.frames, twins.direction), (twins.other_frames, "other direction")
+    for row, (name, axis, depth) in enumerate(zip("AB", sheet.axes, twins.depths_mm, strict=True)):
+        depth_mm = np.where(inside, depth, np.nan)
+        shown = sheet.picture(axis[0], depth_mm, f"scene {name}: depth, mm", "viridis", low, high)
+        sheet.picture(axis[1], twins.frames[row], f"its {twins.direction} fringe", "gray", 0, 255)
+        sheet.picture(axis[2], twins.other_frames[row], "its other direction", "gray", 0, 255)
+        sheet.scale(shown, axis[0], fraction=0.05, pad=0.03)
+    for axis, ((first, second), direction) in zip(sheet.axes[:, 3], pairs, strict=True):
+        difference = second.astype(np.int64) - first
+        title = f"B - A, {direction}:\n{np.count_nonzero(difference)} pixels differ"
+        shown = sheet.picture(axis, difference, title, "coolwarm", -60, 60)
+    sheet.scale(shown, sheet.axes[:, 3], fraction=0.05, pad=0.03, label="grey levels")
+    alt = "Two depths a period apart, their identical fringes, and their difference"
+    return sheet.save(folder, "theory_twins.png", "Two scenes, one frame", alt)
+
+
+def _draw_curves(curves: Sequence[ErrorCurve], folder: Path) -> Figure:
+    sheet = Sheet(1, 2, 10, 3.8)
+    errors, exponents = sheet.axes[0]
+    for curve, name in zip(curves, ("edges", "depth", "phase", "order", "raw"), strict=True):
+        finite, style = np.isfinite(curve.error_mm), {"color": sheet.COLOURS[name], "linewidth": 1.4}
+        errors.loglog(curve.distances_m[finite], curve.error_mm[finite], label=curve.name, **style)
+        exponents.semilogx(curve.distances_m, curve.local, **style)
+    exponents.axhspan(1.98, 2.02, color=sheet.GRID)
+    exponents.text(0.31, 2.2, "grey: 2 within 1%", fontsize=7)
+    exponents.set_ylim(1.0, 3.5)
+    sheet.tidy(errors, "Depth error of a phase error", "distance, m", "mm")
+    sheet.tidy(exponents, "Local exponent of distance", "distance, m")
+    for axis in (errors, exponents):
+        axis.axvspan(1.5, 2.1, color="#f0e6d2", zorder=0)
+        axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
+        axis.minorticks_off()
+    errors.legend(fontsize=7, frameon=False)
+    errors.text(1.53, errors.get_ylim()[0] * 1.3, "working\nrange", fontsize=7)
+    alt = "Depth error of a phase error from 0.3 to 10 m, and its exponent"
+    return sheet.save(folder, "theory_range.png", "Depth error against distance", alt)

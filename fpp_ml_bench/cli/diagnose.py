@@ -1,17 +1,20 @@
 """``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
 
 import argparse
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from fpp_ml_bench.baselines.diagnostics import PROBES
+from rich import progress as bar
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from fpp_ml_bench.baselines.diagnostics import Diagnosis, Probe, Progress
+from fpp_ml_bench.baselines import diagnostics
+from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import limit_threads, usable_cores
 
 SUMMARY = (
     "Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file."
@@ -37,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
     parser.add_argument(
         "--probe", action="append", default=[], metavar="NAME",
-        help=f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)",
+        help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
     )  # fmt: skip
     parser.add_argument(
         "--samples", type=_count, metavar="N", help="most samples of a split, taken evenly (default: the probe's)"
@@ -65,38 +68,29 @@ def _count(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run the probes, write the report, print the summaries. Raises FppBenchError for what can't be diagnosed."""
-    from fpp_ml_bench.machine import limit_threads, usable_cores
-
     threads = args.threads or usable_cores()
-    limit_threads(threads)
-    from fpp_ml_bench.baselines.diagnostics import ProbeSettings, checked_names, diagnose, subject
-    from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.loaders.storage import DatasetFolder
-
-    probe_names = checked_names(args.probe)
-    dataset = DatasetFolder(args.dataset)
-    model = subject(args.model, dataset, args.layers, args.units, args.frame, threads)
-    settings = ProbeSettings(args.samples, args.seeds, args.quick)
+    limit_threads(threads)  # before NumPy is loaded
+    probe_names = diagnostics.checked_names(args.probe)
+    dataset = storage.DatasetFolder(args.dataset)
+    model = diagnostics.subject(args.model, dataset, args.layers, args.units, args.frame, threads)
+    settings = diagnostics.ProbeSettings(args.samples, args.seeds, args.quick)
     with _bars() as progress:
-        diagnosis = diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+        diagnosis = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
     show(_table(model.title, diagnosis))
     print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
     return 0
 
 
 @contextmanager
-def _bars() -> "Iterator[Callable[[Probe], Progress]]":
+def _bars() -> "Iterator[Callable[[diagnostics.Probe], diagnostics.Progress]]":
     """A bar for each probe, on standard error."""
-    from rich import progress as bar
-    from rich.console import Console
-
     columns = (
         bar.TextColumn("{task.description}"), bar.BarColumn(), bar.TaskProgressColumn(), bar.TimeElapsedColumn(),
         bar.TimeRemainingColumn(),
     )  # fmt: skip
     with bar.Progress(*columns, console=Console(stderr=True)) as bars:
 
-        def started(probe: "Probe") -> "Progress":
+        def started(probe: "diagnostics.Probe") -> "diagnostics.Progress":
             task = bars.add_task(probe.title, total=None)
 
             def show_progress(done: int, total: int, activity: str = "") -> None:
@@ -108,10 +102,7 @@ def _bars() -> "Iterator[Callable[[Probe], Progress]]":
         yield started
 
 
-def _table(title: str, diagnosis: "Diagnosis") -> "Table":
-    from rich.table import Table
-    from rich.text import Text
-
+def _table(title: str, diagnosis: "diagnostics.Diagnosis") -> Table:
     table = Table(title=Text(title), title_justify="left")
     table.add_column("Probe")
     table.add_column("Summary", overflow="fold")
@@ -124,8 +115,6 @@ def _table(title: str, diagnosis: "Diagnosis") -> "Table":
 
 def _command(args: argparse.Namespace) -> str:
     """The command that makes the same report, without the machine's settings."""
-    import shlex
-
     words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
     for name in args.probe:
         words += ["--probe", name]

@@ -2,14 +2,17 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from rich.table import Table
+from rich.text import Text
+
+from fpp_ml_bench.baselines import diagnostics
+from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from fpp_ml_bench.evaluation.result import Reliance
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import limit_threads
 
 SUMMARY = "Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?"
 EXAMPLES = (
@@ -38,25 +41,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write, print. A file that can't take the score raises FppBenchError before measuring."""
-    from fpp_ml_bench.machine import limit_threads
-
-    limit_threads(args.threads)
-    from fpp_ml_bench.baselines.diagnostics import SceneSet, measure
-    from fpp_ml_bench.cli.console import progress_bar, show
-    from fpp_ml_bench.errors import PredictionError
-    from fpp_ml_bench.evaluation.result import write_json
+    limit_threads(args.threads)  # before NumPy is loaded
     from fpp_ml_bench.leaderboard.reliance import check_same_method, write_reliance
     from fpp_ml_bench.leaderboard.rows import read_entry
-    from fpp_ml_bench.loaders.storage import DatasetFolder
 
     if not 1 <= args.views <= 6:
         raise PredictionError(f"--views {args.views}: expected 1 to 6, an object has six views")
-    dataset = DatasetFolder(args.dataset)
+    dataset = storage.DatasetFolder(args.dataset)
     method = chosen_method(args, dataset)
     entry = None if args.into is None else read_entry(args.into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = SceneSet(dataset, args.views)
+    scene_set = diagnostics.SceneSet(dataset, args.views)
     advanced = 0
     with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
 
@@ -66,24 +62,18 @@ def run(args: argparse.Namespace) -> int:
             advanced = done
 
         sha256 = method.settings.get("weights_sha256")
-        reliance, _ = measure(method, scene_set, sha256 if isinstance(sha256, str) else None, progress)
+        reliance, _ = diagnostics.measure(method, scene_set, sha256 if isinstance(sha256, str) else None, progress)
     if args.json is not None:
-        write_json(reliance.model_dump(mode="json"), args.json)
+        result.write_json(reliance.model_dump(mode="json"), args.json)
     if entry is not None:
         write_reliance(entry, reliance)
     show(_table(method.title, reliance))
     return 0
 
 
-def _table(title: str, reliance: "Reliance") -> "Table":
-    from rich.table import Table
-    from rich.text import Text
-
-    from fpp_ml_bench.evaluation.result import PART_TITLES
-
-    table = Table(
-        title=Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects"), title_justify="left"
-    )
+def _table(title: str, reliance: "result.Reliance") -> Table:
+    heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
+    table = Table(title=heading, title_justify="left")
     table.add_column("")
     table.add_column("value", justify="right")
     low, high = reliance.interval
@@ -91,7 +81,7 @@ def _table(title: str, reliance: "Reliance") -> "Table":
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
     if reliance.order_free_score is not None:
         table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
-    for key, words in PART_TITLES.items():
+    for key, words in result.PART_TITLES.items():
         value = getattr(reliance.parts, key)
         if value is not None:
             table.add_row(words, f"{value:.3f}")

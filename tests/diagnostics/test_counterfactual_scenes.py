@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_original import original
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import LARGEST_SHIFT_RAD, chosen_samples, counterfactuals
-from fpp_ml_bench.baselines.diagnostics.synth import PITCH_FACTOR, SceneRenderer
-from fpp_ml_bench.baselines.diagnostics.synth_surface import moved, normals_of_depth, plane
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
+    LARGEST_SHIFT_RAD,
+    chosen_samples,
+    counterfactuals,
+    original,
+)
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
+    PITCH_FACTOR,
+    SceneRenderer,
+    moved,
+    normals_of_depth,
+    plane,
+)
 from fpp_ml_bench.errors import DiagnosisError
 
 SAMPLE, OTHER = "power_drill_A0", "mug_A60"

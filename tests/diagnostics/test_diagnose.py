@@ -10,10 +10,10 @@ import torch
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines.diagnostics import diagnosis
-from fpp_ml_bench.baselines.diagnostics.page import report_page
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Table, load_finding, save_finding
-from fpp_ml_bench.baselines.diagnostics.probe import spread as spread_over
-from fpp_ml_bench.baselines.diagnostics.registry import PROBES, checked_names
+from fpp_ml_bench.baselines.diagnostics.diagnosis import checked_names, load_finding, save_finding
+from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam
+from fpp_ml_bench.baselines.diagnostics.linear import LinearProbing
+from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, ProbeSettings, Table, spread
 from fpp_ml_bench.baselines.diagnostics.subjects import subject
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.baselines.training import save_weights
@@ -96,7 +96,8 @@ def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, modul
     def never(*args):
         raise AssertionError("run again")
 
-    monkeypatch.setattr(diagnosis, "_run_probe", never)
+    monkeypatch.setattr(LinearProbing, "run", never)
+    monkeypatch.setattr(GradCam, "run", never)
     assert call(*arguments, "--probe", "linear", "--probe", "grad-cam", "--threads", 1) == 0
     assert (out / "index.html").read_text().count("data:image/png") == 4
 
@@ -169,7 +170,7 @@ class Counted:
 
 def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_path, monkeypatch):
     counted = Counted()
-    monkeypatch.setattr(diagnosis, "probe", lambda name: counted)
+    monkeypatch.setattr(diagnosis, "make_probe", lambda name: counted)
     classical, phase = subject("classical", opened), subject("phase", opened)
 
     def ask(model, settings):
@@ -215,7 +216,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
         "settings": {"samples": None}, "software": {}, "command": "fpp-bench <i>", "hardware": {"cpu": "c", "cores": 1},
     }  # fmt: skip
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
-    page = report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
+    page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page
@@ -224,8 +225,8 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
 def test_probes_by_name_and_samples_evenly():
     assert checked_names(()) == tuple(PROBES)
     assert checked_names(("theory", "linear", "theory")) == ("linear", "theory")
-    assert spread_over("abcdefgh", 3) == ["b", "e", "g"]
-    assert spread_over("abc", None) == spread_over("abc", 9) == ["a", "b", "c"]
+    assert spread("abcdefgh", 3) == ["b", "e", "g"]
+    assert spread("abc", None) == spread("abc", 9) == ["a", "b", "c"]
     with pytest.raises(DiagnosisError, match="expected 1 or more"):
         ProbeSettings(samples=0)
 
@@ -266,12 +267,12 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     )
     assert not frames[0][~inside].any() and frames[0][inside].any() and frames[1] is None
     with torch.inference_mode():
-        expected = deepcopy(network).double()(weights_subject.input_tensor(frames).double())[0, 0].numpy()
+        expected = deepcopy(network).double()(weights_subject.input_batch([frames]).double())[0, 0].numpy()
     tolerance = float32_tolerance(network, expected)
     with torch.inference_mode():
         changed = deepcopy(network)
         changed.head.weight.mul_(1.01)  # a layer that is wrong by 1% must show
-        assert np.abs(changed(weights_subject.input_tensor(frames))[0, 0].numpy() - expected).max() > 4 * tolerance
+        assert np.abs(changed(weights_subject.input_batch([frames]))[0, 0].numpy() - expected).max() > 4 * tolerance
     assert weights_subject.represent(frames) == pytest.approx(expected, abs=tolerance)
     assert weights_subject.predict(frames) == pytest.approx(expected, abs=tolerance)
     same_seed, other_seed = weights_subject.untrained(3), weights_subject.untrained(4)
@@ -281,7 +282,7 @@ def test_a_weights_file_is_a_subject_with_the_networks_own_layers(opened, tmp_pa
     two_layers = subject(str(path), opened, layers=["dec1", "enc1"])
     assert two_layers.layer_names == ("enc1", "dec1") and two_layers.sha256 == weights_subject.sha256
     with pytest.raises(DiagnosisError, match="frame 0, which is missing"):
-        weights_subject.input_tensor([None])
+        weights_subject.input_batch([[None]])
     with pytest.raises(DiagnosisError, match="no network"):
         subject("classical", opened).represent(frames)
 

@@ -7,8 +7,9 @@ import pytest
 
 from fpp_ml_bench.baselines.diagnostics import flat_plane
 from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
+from fpp_ml_bench.baselines.diagnostics.diagnosis import save_finding
 from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
-from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
+from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.stability import U32

@@ -5,15 +5,26 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from test_probes import oracle
+from known_networks import oracle
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics.correlation import EDGES, FRINGES, OWN, Correlations, Mean, correlation, ratio
-from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam, cam_layers, heatmaps, measure
-from fpp_ml_bench.baselines.diagnostics.grad_cam_report import ratio_text
+from fpp_ml_bench.baselines.diagnostics.grad_cam import (
+    EDGES,
+    FRINGES,
+    OWN,
+    Correlations,
+    GradCam,
+    Mean,
+    cam_layers,
+    correlation,
+    heatmaps,
+    measure,
+    ratio,
+    ratio_text,
+)
 from fpp_ml_bench.baselines.diagnostics.probe import silent
-from fpp_ml_bench.baselines.diagnostics.user_module import randomised
+from fpp_ml_bench.baselines.diagnostics.subjects import randomised
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.errors import DiagnosisError
 

@@ -3,56 +3,30 @@
 import numpy as np
 import pytest
 import torch
+from known_networks import oracle, subject_with
 from scipy import ndimage
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics import convolution_probe as convolution
-from fpp_ml_bench.baselines.diagnostics import linear_measure as measuring
-from fpp_ml_bench.baselines.diagnostics.activations import INPUT, at_pixels, at_size, tapped
-from fpp_ml_bench.baselines.diagnostics.ridge import NormalEquations, apply
-from fpp_ml_bench.baselines.diagnostics.scores import score
-from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.diagnostics.targets import edge_map, fringe_variation, truth
+from fpp_ml_bench.baselines.diagnostics import fits, linear
+from fpp_ml_bench.baselines.diagnostics.fits import (
+    INPUT,
+    NormalEquations,
+    apply,
+    at_pixels,
+    at_size,
+    edge_map,
+    tapped,
+    truth,
+)
+from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
+from fpp_ml_bench.baselines.diagnostics.linear_report import score
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.decoding import depth_from_coordinate, wrapped_phase
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 
 RNG = np.random.default_rng(7)
-
-
-class Oracle(nn.Module):
-    """A network that knows the truth of the samples it is shown: its layer ``out`` holds the maps it was given."""
-
-    def __init__(self, maps: dict[float, torch.Tensor]) -> None:
-        super().__init__()
-        self.out = nn.Identity()
-        self.maps = maps
-
-    def forward(self, fringe: torch.Tensor) -> torch.Tensor:
-        maps = torch.stack([self.maps[float(image.detach().double().sum())] for image in fringe])
-        return self.out(maps + 0 * fringe).mean(1, keepdim=True)
-
-
-def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
-    """A subject around ``network``, whose ``layers`` are its children."""
-    return Subject(
-        name="known", title="known", sha256="0" * 64, units="normalised", image_size=size, frames_used=(0,),
-        direction="horizontal", predict_frames=lambda frames: np.zeros(size, np.float32), normalisation="individual",
-        network=network, layer_names=layers, find_layers=lambda any_network: dict(any_network.named_children()),
-        untrained=lambda seed: network,
-    )  # fmt: skip
-
-
-def oracle(opened, fields):
-    """An `Oracle` of the maps ``fields`` of `Truth`, as a subject."""
-    maps = {}
-    for sample in opened.samples("all"):
-        ground_truth = truth(opened.depth_mm(sample), opened.rig, "horizontal")
-        key = subject_with(nn.Identity(), opened.size).input_tensor([opened.frame(sample, 0)])[0]
-        maps[float(key.double().sum())] = torch.from_numpy(np.stack([getattr(ground_truth, name) for name in fields]))
-    return subject_with(Oracle(maps), opened.size)
 
 
 # ---- what is asked for
@@ -199,7 +173,7 @@ def test_score_is_share_of_variance_with_an_interval_that_holds_it():
 
 def test_moments_are_mean_and_spread_of_each_channel():
     batches = [torch.randn(n, 3, 4, 5) * torch.tensor([1.0, 10.0, 0.0]).view(3, 1, 1) + 2 for n in (2, 3)]
-    moments = convolution.Moments()
+    moments = fits.Moments()
     for batch in batches:
         moments.add(batch)
     mean, factor = moments.standard()
@@ -219,11 +193,11 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
         return features, {"edges": functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)}
 
     features, target = batch()
-    moments = {name: convolution.Moments() for name in features}
+    moments = {name: fits.Moments() for name in features}
     for name, moment in moments.items():
         moment.add(features[name])
     mean = float(target["edges"].mean())
-    probes = convolution.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
+    probes = fits.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
     assert set(probes.probes) == {("here/a", "edges", 0), ("here/a", "edges", 1), ("else/b", "edges", 0)}
     reference = (target["edges"].double() - mean).square().mean((1, 2, 3))
     for errors in probes.errors(features, target).values():
@@ -241,19 +215,20 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
 # ---- networks whose answer is known
 
 
-def linear_r2(subject, opened, targets=tuple(measuring.TARGETS)):
-    train, validation = opened.samples("train")[::2], opened.samples("validation")
-    pixels = measuring.Pixels(subject, opened, targets)
-    errors, reference = measuring.linear_errors(
-        subject, subject.network, pixels, train, validation, True, lambda count, activity: None
-    )
+def experiment_of(subject, opened, step):
+    train, validation = opened.samples("train")[::step], opened.samples("validation")
+    return linear.Experiment(subject, opened, train, validation, lambda count, activity: None)
+
+
+def linear_r2(subject, opened):
+    errors, reference = experiment_of(subject, opened, 2).linear_errors(subject.network, controls=True)
     return {key: 1 - np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
 
 
-@pytest.mark.parametrize("target", measuring.TARGETS)
+@pytest.mark.parametrize("target", linear.TARGETS)
 def test_what_a_layer_holds_is_read_from_it(opened, target):
     """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine reads the phase."""
-    r2 = linear_r2(oracle(opened, measuring.TARGETS[target]), opened)
+    r2 = linear_r2(oracle(opened, linear.TARGETS[target]), opened)
     assert r2["out", target] > 0.999
     for other_target in {"edges", "phase"} - {target}:
         assert r2["out", other_target] < 0.5
@@ -269,7 +244,7 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
             return self.out(fringe)
 
     r2 = linear_r2(subject_with(Same(), opened.size), opened)
-    for target in measuring.TARGETS:
+    for target in linear.TARGETS:
         assert r2["out", target] == r2[INPUT, target]
     # One grey level holds the cosine, up to brightness, and nothing of the sine: half of the phase at most.
     assert 0.2 < r2[INPUT, "phase"] < 0.5
@@ -278,11 +253,8 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
 
 def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     subject = oracle(opened, ("edges",))
-    train, validation = opened.samples("train")[::3], opened.samples("validation")
-    errors, reference = measuring.spatial_errors(
-        subject, {"trained": subject.network}, opened, train, validation, {"trained": 1, INPUT: 1}, 25,
-        lambda count, activity: None,
-    )  # fmt: skip
-    remaining = {key[:3]: np.mean(sample_errors) / np.mean(reference[key[2]]) for key, sample_errors in errors.items()}
-    assert remaining["trained", "out", "edges"] < 0.25
-    assert remaining["trained", "out", "edges"] < remaining[INPUT, INPUT, "edges"]
+    networks, seeds = {"trained": subject.network}, {"trained": 1, INPUT: 1}
+    errors, reference = experiment_of(subject, opened, 3).spatial_errors(networks, seeds, 25)
+    remaining = {key[:2]: np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
+    trained, raw = remaining[("trained", "out"), "edges"], remaining[(INPUT, INPUT), "edges"]
+    assert trained < 0.25 and trained < raw

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
-from fpp_ml_bench.baselines.diagnostics.reliance import (
+from fpp_ml_bench.baselines.diagnostics.phase_reliance import (
     Change,
     follows,
+    measure,
     order_free,
     order_free_follows,
     relative_change,
     rms_expected,
     sample_score,
 )
-from fpp_ml_bench.baselines.diagnostics.reliance_measure import measure
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import object_interval

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
-from fpp_ml_bench.baselines.diagnostics.synth import SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.theory import Theory, depth_error_mm, error_curves, kappa_per_m, twins_of
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.optics import paper_rig

@@ -1,0 +1,345 @@
+"""What probes read from a frozen network: activations of its layers, the true maps as targets, and fits between them.
+
+*Linear probes* have a weight per channel, the same at every pixel (a 1 x 1 convolution), in closed form. The normal
+equations are accumulated batch by batch in float64: activations need not be in memory together, and the solution is the
+same as for all of them at once.
+
+*Four-convolution probes* are the paper's (Section 7.1), which gives only "four convolutional layers"; the other choices
+are ours. A 1 x 1 convolution to `WIDTH` channels, two of 3 x 3, and a 1 x 1 to the target, with ReLU between them. The
+first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is 5 x 5
+grid points. Activations and targets are resized to a grid of a quarter of the image's sides (`grid_step`): area means
+to shrink, bilinear to enlarge. Channels are standardised over the training samples. Adam with cosine decay. All probes
+learn from one forward pass of the network over a batch, so no activations are stored.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fpp_ml_bench.baselines.diagnostics.subjects import checked_output
+from fpp_ml_bench.baselines.phase_route import TAU
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.depth import normalise, object_mask
+from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.optics import Direction, Rig
+
+Image = NDArray[np.float32]
+Source = tuple[str, str]
+"""A network, or `INPUT`, and a layer."""
+INPUT = "input"
+"""Name of the raw input, which is probed like a layer as a control."""
+RIDGE = 1e-6
+"""Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
+WIDTH = 16
+SHARE, LONGEST = 4, 120
+"""Image px per grid step, and the most grid points along a side; for larger images the step grows."""
+LEARNING_RATE = 3e-3
+EPOCHS = 6
+BATCH = 4
+_LEAST_SPREAD = 1e-6
+
+
+# ---- activations
+
+
+@contextmanager
+def tapped(layers: dict[str, nn.Module], reduce: Callable[[Tensor], Tensor]) -> Iterator[dict[str, Tensor]]:
+    """Yields a dict that each forward pass in this block fills with ``reduce(activations)`` of every layer, by name.
+
+    ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
+    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w).
+    """
+    activations: dict[str, Tensor] = {}
+
+    def hook(name: str) -> Any:
+        def record(module: nn.Module, inputs: object, output: object) -> None:
+            if not isinstance(output, Tensor) or output.dim() != 4:
+                shape = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
+                raise DiagnosisError(f"layer {name!r}: expected activations (B, C, h, w), got {shape}; leave it out")
+            activations[name] = reduce(output.float())
+
+        return record
+
+    handles = [layer.register_forward_hook(hook(name)) for name, layer in layers.items()]
+    try:
+        yield activations
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def run_network(
+    network: nn.Module, fringe: Tensor, activations: dict[str, Tensor], layers: Sequence[str], name: str
+) -> None:
+    """One forward pass that fills ``activations`` of ``layers``.
+
+    Raises `DiagnosisError` for an output that is not a depth map, and for a layer that the pass does not reach.
+    """
+    activations.clear()
+    with torch.no_grad():
+        checked_output(network(fringe), fringe, name)
+    unreached = [layer for layer in layers if layer not in activations]
+    if unreached:
+        raise DiagnosisError(f"{name}: layer {unreached[0]!r} takes no part in a forward pass; leave it out")
+
+
+def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
+    """Activations (B, C, h, w) resized to a new tensor (B, C, *side): area means to shrink, bilinear to enlarge."""
+    if tuple(features.shape[2:]) == side:
+        return features.clone()
+    if features.shape[2] >= side[0] and features.shape[3] >= side[1]:
+        return functional.adaptive_avg_pool2d(features, side)
+    return functional.interpolate(features, size=side, mode="bilinear", align_corners=False)
+
+
+def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, P, C).
+
+    A layer as large as the image is read directly; others are interpolated bilinearly between their pixel centres.
+    """
+    if tuple(features.shape[2:]) == size:
+        flat = features.flatten(2)
+        return flat.gather(2, pixels[:, None].expand(-1, flat.shape[1], -1)).transpose(1, 2)
+    rows, columns = pixels // size[1], pixels % size[1]
+    position = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
+    values = functional.grid_sample(
+        features, position[:, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return values[:, :, 0].transpose(1, 2)
+
+
+# ---- targets
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of a sample, each map (H, W).
+
+    ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range,
+    background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object.
+    ``order``: the fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order
+    follows from the pixel's position alone.
+    """
+
+    inside: NDArray[np.bool_]
+    edges: Image
+    depth: Image
+    depth_mm: Image
+    sine: Image
+    cosine: Image
+    order: Image
+
+
+def truth(depth_mm: Image, rig: Rig, direction: Direction) -> Truth:
+    """`Truth` of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``.
+
+    Raises ``ValueError`` for a map without an object.
+    """
+    inside = object_mask(depth_mm)
+    if not inside.any():
+        raise ValueError("expected a depth map with an object, got background throughout")
+    periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
+    phase = TAU * (periods - np.floor(periods))
+    order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
+    return Truth(
+        inside,
+        edge_map(depth_mm),
+        normalised_depth(depth_mm),
+        np.asarray(depth_mm, dtype=np.float32),
+        np.where(inside, np.sin(phase), 0.0).astype(np.float32),
+        np.where(inside, np.cos(phase), 0.0).astype(np.float32),
+        order.astype(np.float32),
+    )
+
+
+def normalised_depth(depth_mm: Image) -> Image:
+    """``depth_mm`` normalised to its own range, background 0."""
+    inside = depth_mm[object_mask(depth_mm)]
+    return normalise(depth_mm, "individual", float(inside.min()), float(inside.max()))
+
+
+def edge_map(depth_mm: NDArray) -> Image:
+    """Sobel gradient magnitude (3 x 3) of a depth map (H, W), divided by its largest value: float32 in [0, 1].
+
+    The paper specifies only "Sobel filtering of the ground truth depth"; the scale is ours. A constant map gives 0.
+    """
+    depth = np.asarray(depth_mm, dtype=np.float32)
+    across = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=3)
+    down = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=3)
+    strength = np.hypot(across, down).astype(np.float32)
+    top = float(strength.max())
+    return (strength / top).astype(np.float32) if top > 0 else strength
+
+
+def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.float64]:
+    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W).
+
+    The fraction is the wrapped phase / 2 pi and the integer part the fringe order. NaN where depth is 0.
+    """
+    x, y = rig.camera.rays()
+    z = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) / MM_PER_M
+    projected = rig.project(np.stack([x * z, y * z, z], axis=-1))
+    return projected[0 if direction == "vertical" else 1] / rig.pitch(direction)
+
+
+@lru_cache(maxsize=2)
+def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
+    plane = np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M)
+    return periods_at(plane, rig, direction)
+
+
+# ---- linear probes
+
+
+class NormalEquations:
+    """Sums of products of N observations of C features and T targets."""
+
+    def __init__(self, features: int, targets: int) -> None:
+        self.count = 0
+        self.inner = torch.zeros(features + 1, features + 1, dtype=torch.float64)
+        self.cross = torch.zeros(features + 1, targets, dtype=torch.float64)
+
+    def add(self, features: Tensor, targets: Tensor) -> None:
+        """Add observations (N, C) and their targets (N, T)."""
+        augmented = _with_bias_column(features)
+        self.count += len(augmented)
+        self.inner += augmented.T @ augmented
+        self.cross += augmented.T @ targets.double()
+
+    @property
+    def target_mean(self) -> Tensor:
+        """Mean of the targets, (T,)."""
+        return self.cross[-1] / self.count
+
+    def solve(self, strength: float = RIDGE) -> Tensor:
+        """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
+        the squared weights of standardised features; the bias is free. Raises ``ValueError`` without observations."""
+        if not self.count:
+            raise ValueError("a linear probe needs observations, but none were added")
+        mean, target = self.inner[-1, :-1] / self.count, self.target_mean
+        spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
+        scale = torch.where(spread > 1e-9 * (1 + mean.abs()), spread, torch.full_like(spread, torch.inf))
+        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) / torch.outer(scale, scale)
+        cross = (self.cross[:-1] / self.count - torch.outer(mean, target)) / scale[:, None]
+        inner.diagonal().add_(strength)
+        weight = torch.linalg.solve(inner, cross) / scale[:, None]
+        return torch.cat([weight, (target - mean @ weight)[None]])
+
+
+def apply(weights: Tensor, features: Tensor) -> Tensor:
+    """Predictions (N, T) float64 of a solved probe for features (N, C)."""
+    return _with_bias_column(features) @ weights
+
+
+def _with_bias_column(features: Tensor) -> Tensor:
+    return torch.cat([features.double(), torch.ones(len(features), 1, dtype=torch.float64)], dim=1)
+
+
+# ---- four-convolution probes
+
+
+def grid_step(size: tuple[int, int]) -> int:
+    """Image px per grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
+    return max(SHARE, -(-max(size) // LONGEST))
+
+
+@dataclass
+class Moments:
+    """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
+
+    count: int = 0
+    total: Tensor | None = None
+    square: Tensor | None = None
+
+    def add(self, features: Tensor) -> None:
+        """Add a batch (B, C, h, w)."""
+        flat = features.double().transpose(0, 1).flatten(1)
+        total, square = flat.sum(1), flat.square().sum(1)
+        self.count += flat.shape[1]
+        self.total = total if self.total is None else self.total + total
+        self.square = square if self.square is None else self.square + square
+
+    def standard(self) -> tuple[Tensor, Tensor]:
+        """Mean and 1 / standard deviation, float32 (C,); 0 for a constant channel, which removes it."""
+        if self.total is None or self.square is None:
+            raise ValueError("moments need at least one batch")
+        mean = self.total / self.count
+        spread = (self.square / self.count - mean * mean).clamp(min=0).sqrt()
+        factor = torch.where(spread > _LEAST_SPREAD * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
+        return mean.float(), factor.float()
+
+
+class ConvolutionProbe(nn.Module):
+    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``."""
+
+    mean: Tensor
+    factor: Tensor
+
+    def __init__(self, moments: Moments, target_mean: float) -> None:
+        super().__init__()
+        mean, factor = moments.standard()
+        self.register_buffer("mean", mean[:, None, None])
+        self.register_buffer("factor", factor[:, None, None])
+        self.body = nn.Sequential(
+            nn.Conv2d(len(mean), WIDTH, 1), nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(WIDTH, 1, 1),
+        )  # fmt: skip
+        last = self.body[-1]
+        nn.init.zeros_(last.weight)  # type: ignore[arg-type]
+        nn.init.constant_(last.bias, target_mean)  # type: ignore[arg-type]
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.body((features - self.mean) * self.factor)
+
+
+class ProbeSet:
+    """Probes that are trained together, one for each (features, target, seed).
+
+    ``seeds``: number of seeds by features; ``steps``: number of training steps, for the learning rate schedule.
+    """
+
+    def __init__(
+        self, moments: Mapping[Source, Moments], target_means: Mapping[str, float], seeds: Mapping[Source, int],
+        steps: int,
+    ) -> None:  # fmt: skip
+        self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
+        for features in moments:
+            for seed in range(seeds[features]):
+                for target, mean in target_means.items():
+                    with torch.random.fork_rng(devices=[]):
+                        torch.manual_seed(seed)
+                        self.probes[features, target, seed] = ConvolutionProbe(moments[features], mean)
+        parameters = [parameter for probe in self.probes.values() for parameter in probe.parameters()]
+        self._optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE, foreach=True)
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, max(1, steps))
+
+    def step(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
+        """One training step of every probe on a batch: activations (B, C, h, w) and targets (B, 1, h, w) by name."""
+        self._optimiser.zero_grad(set_to_none=True)
+        for (source, target, _), probe in self.probes.items():
+            # One backward pass per probe: a graph of all probes would hold every intermediate map at once.
+            nn.functional.mse_loss(probe(features[source]), targets[target]).backward()
+        self._optimiser.step()
+        self._schedule.step()
+
+    @torch.no_grad()
+    def errors(
+        self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]
+    ) -> dict[tuple[Source, str, int], list[float]]:
+        """Mean squared error of every probe on each sample of a batch."""
+        errors = {}
+        for (source, target, seed), probe in self.probes.items():
+            squared = (probe(features[source]) - targets[target]).double().square().mean((1, 2, 3))
+            errors[source, target, seed] = squared.tolist()
+        return errors

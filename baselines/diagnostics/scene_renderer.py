@@ -1,0 +1,271 @@
+"""Surfaces seen by a rig's camera, and rendered frames of scenes with them that are not in a dataset.
+
+Light and sensor are the dataset's own: an unchanged scene gives the frames of its dataset, noise included, except for a
+few pixels in 50,000 that differ by a grey level (tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel
+depends only on the dataset's seed, the object, view, frame and pixel, so it is the same in a changed scene.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
+from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.loaders import render
+from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Direction, Rig
+
+Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
+
+
+def constant(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The `Field` that is 1 everywhere."""
+    return np.ones_like(x)
+
+
+def times(amplitude: float, field: Field) -> Field:
+    """``amplitude`` times ``field``."""
+    return lambda x, y: amplitude * field(x, y)
+
+
+_STEP = 1e-6
+"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
+_SAME_SURFACE_M = 1e-3
+"""A traced depth that differs from the stored depth by more belongs to another triangle."""
+_GRAZING = 0.02
+"""Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface seen by some pixels: flat image indices ``pixels`` int64 (n,), normalised rays ``x``, ``y`` (n,),
+    ``depth_m`` float64 (n,), and unit ``normals`` (n, 3) toward the camera, in camera coordinates."""
+
+    pixels: NDArray[np.int64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    def points_m(self) -> NDArray[np.float64]:
+        """Camera coordinates in metres (n, 3)."""
+        return np.column_stack([self.x, self.y, np.ones_like(self.x)]) * self.depth_m[:, None]
+
+    def joined(self, other: "Surface") -> "Surface":
+        """The pixels of both."""
+        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(self))
+        return Surface(*(np.concatenate(pair) for pair in pairs))
+
+    def depth_mm(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Depth map (H, W) in mm, 0 outside the surface."""
+        whole = np.zeros(shape[0] * shape[1])
+        whole[self.pixels] = self.depth_m * MM_PER_M
+        return whole.reshape(shape)
+
+
+def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
+    """The object of ``sample``: exact depth where the dataset has it, else the decoded depth.
+
+    Normals come from the mesh in a built dataset. Without a mesh (an imported dataset), and at pixels whose ray misses
+    it, they come from the depth map.
+    """
+    depth_mm = dataset.depth_mm(sample, DEPTH_EXACT if dataset.has_exact else DEPTH).astype(np.float64)
+    x, y = dataset.rig.camera.rays()
+    pixels = np.flatnonzero(object_mask(depth_mm))
+    normals, depth_m = normals_of_depth(depth_mm, x, y)[pixels], depth_mm.ravel()[pixels] / MM_PER_M
+    record = dataset.measured(sample)
+    mesh_file = dataset.path / render.MESH_FOLDER / f"{record['object']}.ply"
+    if mesh_file.is_file() and record.get("distance_mm") is not None:
+        solid = render.load_user_mesh(render.UserMesh(mesh_file.stem, str(mesh_file), centre=False))
+        vertices_m = render.turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
+        placed_m = vertices_m + np.array([0, 0, record["distance_mm"] / MM_PER_M])
+        hits = render.TracedObject(solid, placed_m).primary(render.PixelRays.of(dataset.rig.camera))
+        _, seen, hit = np.intersect1d(pixels, hits.pixels, assume_unique=True, return_indices=True)
+        same = np.abs(hits.depth_m[hit] - depth_m[seen]) < _SAME_SURFACE_M
+        normals[seen[same]] = hits.normals[hit[same]]
+        depth_m[seen[same]] = hits.depth_m[hit[same]]  # the stored depth is rounded to float32
+    return Surface(pixels, x.ravel()[pixels], y.ravel()[pixels], depth_m, normals)
+
+
+def normals_of_depth(depth_mm: NDArray[np.float64], x: NDArray, y: NDArray) -> NDArray[np.float64]:
+    """Unit normals (H W, 3) toward the camera of a depth map (H, W), 0 = background.
+
+    They come from differences between neighbouring object pixels; a pixel without neighbours gets (0, 0, -1).
+    """
+    inside = object_mask(depth_mm)
+    points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_mm[..., None]
+    tangents = []
+    for axis in (1, 0):
+        ahead, behind = np.roll(points, -1, axis), np.roll(points, 1, axis)
+        has_ahead, has_behind = np.roll(inside, -1, axis), np.roll(inside, 1, axis)
+        np.moveaxis(has_ahead, axis, 0)[-1] = False  # np.roll wraps around the image's edge
+        np.moveaxis(has_behind, axis, 0)[0] = False
+        ahead = np.where(has_ahead[..., None], ahead, points)
+        behind = np.where(has_behind[..., None], behind, points)
+        tangents.append(ahead - behind)
+    normals = np.cross(tangents[1], tangents[0]).reshape(-1, 3)
+    lengths = np.linalg.norm(normals, axis=1)
+    defined = inside.ravel() & (lengths > 0)
+    normals[defined] /= lengths[defined, None]
+    normals[~defined] = (0.0, 0.0, -1.0)
+    return normals
+
+
+def plane(
+    rig: Rig, distance_m: float, tilt_deg: tuple[float, float] = (0.0, 0.0), mask: NDArray[np.bool_] | None = None
+) -> Surface:
+    """A plane that crosses the camera's axis at ``distance_m``, tilted by ``tilt_deg`` so that it recedes to the right
+    and downward. It fills the frame, or is cut to ``mask`` (H, W)."""
+    x, y = (rays.ravel() for rays in rig.camera.rays())
+    across, down = np.tan(np.deg2rad(tilt_deg))
+    pixels = np.arange(x.size) if mask is None else np.flatnonzero(mask)
+    x, y = x[pixels], y[pixels]
+    depth_m = distance_m / (1 - across * x - down * y)
+    normal = np.array([across, down, -1.0])
+    return Surface(pixels, x, y, depth_m, np.tile(normal / np.linalg.norm(normal), (pixels.size, 1)))
+
+
+def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) -> Surface:
+    """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``shift_rad``.
+
+    Each pixel keeps its ray, so the outline stays. Normals are those of the moved surface.
+    """
+    new_m = _moved_m(surface.x, surface.y, surface.depth_m, rig, direction, shift_rad)
+    rays = np.column_stack([surface.x, surface.y, np.ones_like(surface.x)])
+    facing = np.einsum("ij,ij->i", surface.normals, rays)
+    usable = np.abs(facing) > _GRAZING * np.linalg.norm(rays, axis=1)
+    gradient = []
+    for axis in (0, 1):
+        # The tangent plane gives the depth on a neighbouring ray, which is moved in the same way as the pixel.
+        x, y = surface.x + _STEP * (axis == 0), surface.y + _STEP * (axis == 1)
+        facing_beside = np.where(usable, facing + _STEP * surface.normals[:, axis], 1.0)
+        beside_m = np.where(usable, surface.depth_m * facing / facing_beside, surface.depth_m)
+        gradient.append((_moved_m(x, y, beside_m, rig, direction, shift_rad) - new_m) / _STEP)
+    across, down = gradient
+    # Z(x, y) has the normal (Z_x, Z_y, -(Z + x Z_x + y Z_y)), up to its length.
+    normals = np.column_stack([across, down, -(new_m + surface.x * across + surface.y * down)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(usable[:, None] & np.isfinite(normals), normals, surface.normals)
+    return Surface(surface.pixels, surface.x, surface.y, new_m, normals)
+
+
+def _moved_m(
+    x: NDArray, y: NDArray, depth_m: NDArray, rig: Rig, direction: Direction, shift_rad: Field
+) -> NDArray[np.float64]:
+    layer = CalibrationLayer.of(rig, direction, (x, y))
+    phase = layer.absolute_phase(depth_m * MM_PER_M) + shift_rad(x, y)
+    residual = phase - layer.infinity_rad - TAU * layer.infinity_order
+    depth: NDArray[np.float64] = layer.depth_of_residual_mm(residual) / MM_PER_M
+    return depth
+
+
+Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
+PITCH_FACTOR = 4 / 3
+"""Factor of the changed pitch: 18 px become 24."""
+Frames = list[NDArray[np.uint8] | None]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Lit pixels in front of the empty scene, and the pattern that is projected on them.
+
+    ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
+    it. ``stream``: key of the noise. ``projected``: the unchanged sequence, its mean light inside or outside the
+    object, the frames of the other direction, or fringes of another pitch.
+    """
+
+    pixels: NDArray[np.uint32]
+    lit: render.LitPixels
+    mask: NDArray[np.bool_]
+    stream: tuple[object, ...]
+    projected: Projected = "sequence"
+
+
+class SceneRenderer:
+    """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
+
+    def __init__(self, rig: Rig, noise_sigma_grey: float = render.BuildSettings.noise_sigma_grey) -> None:
+        self.rig, self.lighting = rig, render.Lighting()
+        self.shape = (rig.camera.height, rig.camera.width)
+        self.noise = render.Noise.of_sigma(noise_sigma_grey)
+        self._all_pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
+        self._background_stream: tuple[object, ...] = ()
+        self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
+
+    @classmethod
+    def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
+        """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
+        return cls(
+            dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", render.BuildSettings.noise_sigma_grey)
+        )
+
+    @cached_property
+    def exposure(self) -> render.Exposure:
+        return render.Exposure.of(self.rig, self.noise)
+
+    @cached_property
+    def _uniform(self) -> render.Exposure:
+        light = np.broadcast_to(self.exposure.light.mean(axis=1, keepdims=True), self.exposure.light.shape)
+        return replace(self.exposure, light=np.ascontiguousarray(light))
+
+    @cached_property
+    def _other_pitch(self) -> render.Exposure:
+        horizontal_px, vertical_px = (
+            PITCH_FACTOR * self.rig.pitch_horizontal_px,
+            PITCH_FACTOR * self.rig.pitch_vertical_px,
+        )
+        return render.Exposure.of(
+            replace(self.rig, pitch_horizontal_px=horizontal_px, pitch_vertical_px=vertical_px), self.noise
+        )
+
+    @cached_property
+    def _empty(self) -> render.LitPixels:
+        return render.background_plane(self.rig, self.lighting)
+
+    def light(self, surface: Surface) -> render.LitPixels:
+        """The light on ``surface``; no cast shadows, as in the paper."""
+        return render.light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
+
+    def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
+        """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
+        0 outside ``scene.mask``."""
+        inside, outside = {
+            "no fringe inside": (self._uniform, self.exposure),
+            "no fringe outside": (self.exposure, self._uniform),
+            "other pitch": (self._other_pitch, self._other_pitch),
+        }.get(scene.projected, (self.exposure, self.exposure))
+        swapped = scene.projected == "other direction"
+        projected_indices = [self._partner(index) if swapped else index for index in indices]
+        object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
+        frames: Frames = [None] * len(self.rig.sequence)
+        for index, projected_index, values in zip(indices, projected_indices, object_values, strict=True):
+            image = self._background(scene.stream, projected_index, outside).copy()
+            image.ravel()[scene.pixels] = values
+            frames[index] = image * scene.mask if masked else image
+        return frames
+
+    def _background(self, stream: tuple[object, ...], index: int, exposure: render.Exposure) -> NDArray[np.uint8]:
+        if self._background_stream != stream:
+            self._background_stream, self._backgrounds = stream, {}
+        key = id(exposure), index  # the three exposures live as long as the renderer
+        if key not in self._backgrounds:
+            image = exposure.expose([index], self._empty, self._all_pixels, stream)[0]
+            self._backgrounds[key] = image.reshape(self.shape)
+        return self._backgrounds[key]
+
+    def _partner(self, index: int) -> int:
+        """The frame of the other direction with the same step or bit; black and white frames map to themselves."""
+        sequence = self.rig.sequence
+        frame = sequence.frames[index]
+        if frame.direction is None:
+            return index
+        frames_of = sequence.sinusoids if frame.kind == "sinusoid" else sequence.gray
+        others = frames_of("vertical" if frame.direction == "horizontal" else "horizontal")
+        return others[min(frame.step, len(others) - 1)]
