@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
+from fpp_ml_bench.machine import njit
 
 
 @njit

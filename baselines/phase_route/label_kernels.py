@@ -1,12 +1,12 @@
 """Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") over a few candidates a pixel.
 
-Imported only where `fpp_ml_bench.compiled` compiles; `label_sweeps` gives the same numbers in NumPy. Messages are
+Imported only where `fpp_ml_bench.machine` compiles; `label_sweeps` gives the same numbers in NumPy. Messages are
 stored at the node that receives them: 0 from the left, 1 from above, 2 from the right, 3 from below.
 """
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
+from fpp_ml_bench.machine import njit
 
 
 @njit

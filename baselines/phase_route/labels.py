@@ -10,7 +10,7 @@ pixels). The tree-reweighted kind counts the evidence of every pixel once and fi
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
+from fpp_ml_bench.machine import numba_enabled
 
 Image = NDArray[np.float32]
 

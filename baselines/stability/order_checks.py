@@ -16,10 +16,10 @@ from fpp_ml_bench.baselines.stability.frames import (
     worst_angle,
 )
 from fpp_ml_bench.baselines.stability.roundoff import U64, difference, high_precision
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import Limits, Reason, decode_direction, decode_stack, minus_atan2
 from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.optics import (
     INCONSISTENT_RAD,
     Direction,

@@ -9,9 +9,9 @@ from typing import Any
 from fpp_ml_bench.baselines.stability.case import Verdict
 from fpp_ml_bench.baselines.stability.report_html import report_page
 from fpp_ml_bench.baselines.stability.run import Row
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.evaluation.result import environment
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.machine import numba_enabled
 
 PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
 SCHEMA_VERSION = "1.0.0"

@@ -11,10 +11,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.phase import choose_steps, minus_atan2, phase_weights, weighted_sums
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, rotated_ray
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.optics import (
     AMBIGUOUS_FRACTION,
     INCONSISTENT_RAD,

@@ -24,8 +24,8 @@ from fpp_ml_bench.decoding.blocks import (
     reach_is_bounded,
     within_reach,
 )
+from fpp_ml_bench.decoding.checks import check_frames
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
-from fpp_ml_bench.decoding.frame_check import check_frames
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 from fpp_ml_bench.skipping import skipping_enabled
@@ -290,7 +290,7 @@ def decode_stack(
 
     Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this also removes the background
     plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose capture
-    failed (`fpp_ml_bench.decoding.frame_check`).
+    failed (`fpp_ml_bench.decoding.checks`).
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")

@@ -21,7 +21,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.blocks import (
     MAX_DISAGREEMENT_PX,
@@ -32,6 +31,7 @@ from fpp_ml_bench.decoding.blocks import (
     decode_direction,
 )
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
 
 _GRID = 33

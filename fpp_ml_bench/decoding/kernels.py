@@ -1,6 +1,6 @@
 """Compiled kernels of the decoder: the sums of `phase`, `gray_code` and `triangulation` in the same order, fused.
 
-Import only where `fpp_ml_bench.compiled.numba_enabled`. Pixels are processed in tiles that stay in the first-level
+Import only where `fpp_ml_bench.machine.numba_enabled`. Pixels are processed in tiles that stay in the first-level
 cache, frame by frame within a tile, so that the compiler can use vector instructions and each grey level is read once.
 The loops have no branches for the same reason. The NumPy functions are the reference; tests compare the two.
 """
@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
 from fpp_ml_bench.decoding.triangulation import GAUSS_NEWTON_STEPS, LEAST_PARALLAX
+from fpp_ml_bench.machine import njit
 from fpp_ml_bench.portable import ATAN_BOTTOM as BOTTOM
 from fpp_ml_bench.portable import ATAN_TOP as TOP
 from fpp_ml_bench.portable import TAN_EIGHTH

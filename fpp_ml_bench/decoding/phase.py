@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.sensor import Noise, normal_table, quantise, stream_keys
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.optics import Rig, pattern_profiles
 
 _FLOAT = np.float32

@@ -3,13 +3,13 @@
 Which triangle a ray meets is decided by the signs of three edge functions, ``d . (a x b)`` for the edge from a to b as
 seen from the ray's origin. Two triangles that share an edge compute exactly opposite values for it, so no ray passes
 between them. There is no fastmath and no fused multiply-add, so every processor gives the same answer (see
-`fpp_ml_bench.compiled`).
+`fpp_ml_bench.machine`).
 """
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
 from fpp_ml_bench.loaders.render.raycast import SLACK
+from fpp_ml_bench.machine import njit
 
 NARROWED_FROM_PX = 8
 """From this width on the columns of a row that a triangle can cover are computed, and not just tried."""

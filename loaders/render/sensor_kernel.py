@@ -7,8 +7,8 @@ loops into vector instructions (2.5 times faster here than a single loop with al
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
 from fpp_ml_bench.loaders.render.sensor import TABLE_BITS
+from fpp_ml_bench.machine import njit
 
 _CHUNK = 2048
 _MASK = (1 << TABLE_BITS) - 1

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.compiled import SWITCH, numba_enabled
 from fpp_ml_bench.decoding.blocks import Limits, Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.phase import phase_weights
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 from fpp_ml_bench.optics import Pinhole, Rig, Sequence, paper_rig, pattern_image, rotation_matrix
 
 MODULATION = 0.45 * 127.5
@@ -108,7 +108,7 @@ def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
     for frame in frames[::3]:
         frame[:20] = np.random.default_rng(1).integers(0, 256, frame[:20].shape, dtype=np.uint8)  # no signal at all
     compiled = decode_stack(frames, rig, direction, details=True)
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(NUMBA_SWITCH, "0")
     plain = decode_stack(frames, rig, direction, details=True)
     assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
     assert len(np.unique(plain.reason)) >= 3
@@ -138,7 +138,7 @@ def test_the_compiled_arctangent_is_numpys_on_every_side():
 
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_mask_threads_and_layout_change_no_bit(switch, monkeypatch):
-    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv(NUMBA_SWITCH, switch)
     frames = capture(PAPER, tilted(PAPER))
     full = decode_stack(frames, PAPER, details=True)
     mask = np.random.default_rng(3).random(frames[0].shape) < 0.3
@@ -164,7 +164,7 @@ def reasons(frames, rig=PAPER, direction="both", **arguments):
 
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_every_reason_is_given_where_it_holds(switch, monkeypatch):
-    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv(NUMBA_SWITCH, switch)
     depth = tilted(PAPER)
     frames = capture(PAPER, depth, noise=0.3)
     inside = np.s_[80:120, 80:120]
@@ -266,7 +266,7 @@ def test_without_numba_the_decoder_still_works():
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import numpy as np\n"
-        "from fpp_ml_bench.compiled import numba_enabled, njit\n"
+        "from fpp_ml_bench.machine import numba_enabled, njit\n"
         "from fpp_ml_bench.decoding.decode import decode_stack\n"
         "from fpp_ml_bench.optics.rig import paper_rig\n"
         "assert not numba_enabled() and njit(len) is len\n"

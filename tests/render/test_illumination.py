@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from fpp_ml_bench.compiled import SWITCH
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.loaders.render.camera import Exposure
@@ -22,6 +21,7 @@ from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.loaders.render.sensor import Noise
 from fpp_ml_bench.loaders.render.settings import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics import paper_rig
 
 RIG = paper_rig(176)
