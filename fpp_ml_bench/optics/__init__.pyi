@@ -25,6 +25,7 @@ from .rig import paper_rig as paper_rig
 from .rig import rig_from_dict as rig_from_dict
 from .rig import rotation_matrix as rotation_matrix
 from .rig import save_rig as save_rig
+from .sequence import AXES as AXES
 from .sequence import CONFIGS as CONFIGS
 from .sequence import DIRECTIONS as DIRECTIONS
 from .sequence import PAPER_SEQUENCE as PAPER_SEQUENCE

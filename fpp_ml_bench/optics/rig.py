@@ -33,7 +33,7 @@ from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.gray_code import bits_needed, cell_count
 from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers
-from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
+from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
 
 ROTATION_TOLERANCE = 1e-6
 """Largest accepted |R R^T - I|: what seven printed digits of a calibration leave."""
@@ -166,7 +166,7 @@ class Rig:
     def _central_coordinate(self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0) -> NDArray:
         """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths (K,)."""
         centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
-        axis = 0 if direction == "vertical" else 1
+        axis = AXES.index(direction)
         pixel = [c + (shift_px if i == axis else 0.0) for i, c in enumerate(centre)]
         x, y = self.camera.normalised(*pixel)
         depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))

@@ -14,6 +14,8 @@ Direction = Literal["horizontal", "vertical"]
 Kind = Literal["sinusoid", "gray", "black", "white"]
 
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
+AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
+"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
 CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 

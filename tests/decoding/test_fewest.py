@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE
-from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main

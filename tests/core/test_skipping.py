@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE, file_bytes, tiny_settings
-from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
