@@ -1,30 +1,35 @@
 """FPP-ML-Bench: data, strict evaluation, baselines and leaderboard for single-shot fringe projection profilometry.
 
-This package is the core: rig, patterns, phase, triangulation. The subpackages build on it in the order
-``loaders <- evaluation <- baselines <- leaderboard``; each imports only the core and the packages to its left.
-Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes a few milliseconds.
+The front door is the seven functions of `fpp_ml_bench.api`. Behind it: ``optics`` and ``decoding`` (rig, patterns,
+phase, triangulation), then the subpackages ``loaders <- evaluation <- baselines <- leaderboard``; each imports only the
+core and those to its left. Nothing heavy is imported until it is used: ``import fpp_ml_bench`` takes milliseconds.
 """
 
+import sys as _sys
+from importlib.machinery import ModuleSpec as _ModuleSpec
+from importlib.machinery import PathFinder as _PathFinder
 from pathlib import Path as _Path
-from typing import TYPE_CHECKING
+
+import lazy_loader as _lazy_loader
 
 __version__ = "0.2.0"
 
 _ROOT = _Path(__file__).resolve().parent.parent
+_ROOMS = frozenset(f"{__name__}.{room}" for room in ("loaders", "evaluation", "baselines", "leaderboard"))
+
+
+class _Checkout:
+    """Finds the four subpackages of a source checkout, which are folders beside this one, and nothing else there.
+
+    When the checkout is only the current folder, it shadows an installed wheel; the two must not mix.
+    """
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> _ModuleSpec | None:
+        return _PathFinder.find_spec(name, [str(_ROOT)]) if name in _ROOMS else None
+
+
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "loaders" / "__init__.py").is_file():
-    # A source checkout: the subpackages are folders beside this one. An editable install finds them by itself. When the
-    # checkout is only the current folder it shadows an installed wheel; core and subpackages must not mix the two.
-    __path__.append(str(_ROOT))
+    _sys.meta_path.insert(0, _Checkout)  # type: ignore[arg-type]
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders import load_dataset as load_dataset
-
-_LAZY = {"load_dataset": "fpp_ml_bench.loaders"}
-
-
-def __getattr__(name: str) -> object:
-    if name in _LAZY:
-        from importlib import import_module
-
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'fpp_ml_bench' has no attribute {name!r}")
+__getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)

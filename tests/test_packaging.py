@@ -1,9 +1,14 @@
 """Packaging: every package folder is installed, and the checkout works as the current folder too."""
 
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+
+import pytest
+
+from fpp_ml_bench.cli import EXTRAS
 
 ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
@@ -62,7 +67,7 @@ def test_dependencies_flow_one_way():
         for path in (ROOT / top).rglob("*.py"):
             relative = path.relative_to(ROOT).parts
             if relative[:2] == ("fpp_ml_bench", "cli") or (
-                path.name in ("__init__.py", "__main__.py") and position == 0
+                path.name in ("__init__.py", "__main__.py", "api.py") and position == 0
             ):
                 continue
             text = path.read_text()
@@ -83,3 +88,60 @@ def test_the_project_refers_to_no_outside_folder():
     for path in ROOT.rglob("*"):
         if path.suffix in (".py", ".md", ".toml", ".yaml", ".txt") and not {".git", ".venv", "build"} & set(path.parts):
             assert "../" + "shared" not in path.read_text(encoding="utf-8"), path
+
+
+WITHOUT_EXTRAS = """
+import sys
+from fpp_ml_bench.cli import EXTRAS, main
+from fpp_ml_bench.cli.evaluate import main as evaluate
+for library in sum(EXTRAS.values(), ()):
+    sys.modules[library] = None  # as if it were not installed
+words = sys.argv[1:]
+sys.exit(evaluate(words[1:]) if words[0] == "fpp-eval" else main(words))
+"""
+
+
+def _without_extras(folder, *words):
+    command = [sys.executable, "-c", WITHOUT_EXTRAS, *map(str, words)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_the_main_job_needs_no_extra(tiny, tmp_path):
+    for words in (
+        ("build", "built", "--objects", "cork", "--size", "176"),
+        ("predict", "classical", tiny, "--out", "predictions"),
+        ("fpp-eval", "predictions", "--dataset", tiny, "--json", "result.json"),
+        ("leaderboard", "result.json"),
+    ):
+        done = _without_extras(tmp_path, *words)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "library", "extra"),
+    [
+        (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
+        (("leaderboard", "--page", "page"), "(jinja2|matplotlib)", "page"),
+        (("stability", "--quick", "--out", "out"), "(mpmath|torch)", "(diagnose|train)"),
+    ],
+)
+def test_a_missing_library_is_answered_with_its_extra(tiny, tmp_path, words, library, extra):
+    done = _without_extras(tmp_path, *(str(tiny) if word == "DATA" else word for word in words))
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert re.search(
+        rf"this needs {library}, which is not installed; pip install 'fpp-ml-bench\[{extra}\]'", done.stderr
+    )
+
+
+def test_every_extra_lists_its_libraries():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for extra, libraries in EXTRAS.items():
+        assert set(libraries) <= {re.split(r"[>=\[]", line)[0] for line in extras[extra]}
+
+
+def test_nothing_else_of_a_checkout_is_importable():
+    code = (
+        "import importlib.util as u; print(u.find_spec('fpp_ml_bench.tests'), u.find_spec('fpp_ml_bench.benchmarks'))"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert printed == "None None\n"

@@ -16,6 +16,15 @@ from fpp_ml_bench.errors import FppBenchError
 
 OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
+EXTRAS = {
+    "train": ("torch", "torchmetrics", "accelerate", "safetensors"),
+    "page": ("jinja2", "matplotlib"),
+    "diagnose": ("captum", "mpmath"),
+    "published": ("h5py",),
+    "onnx": ("onnx", "onnxruntime", "onnxscript"),
+}
+"""The optional parts of the package (pyproject.toml) and the libraries that only they need."""
+
 COMMANDS: dict[str, tuple[str, str]] = {
     "build": ("build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
     "import": ("import_tree", "read a published tree (PNG + .mat) into the same dataset format"),
@@ -75,6 +84,16 @@ def guarded(run: Callable[[], int], prog: str) -> int:
         return run()
     except FppBenchError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)
+        if extra is None:
+            raise
+        print(
+            f"{prog}: error: this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'",
+            file=sys.stderr,
+        )
         return BAD_INPUT
     except BrokenPipeError:
         # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
