@@ -9,14 +9,13 @@ Gray code tells all periods of the pattern apart. There are two ways to capture 
   cells.
 - With both directions, no bit may be needed (`orders_from_phases`): the two fringes' periods along the ray differ, and
   together they are unambiguous over their beat, as in two-frequency unwrapping. The (u, v) of the right pair of orders
-  lies on the pixel's epipolar line; that of a wrong pair is several px away.
-
-Own derivation.
+  lies on the pixel's epipolar line; that of a wrong pair is several px away. Own derivation.
 """
 
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,18 +121,17 @@ def orders_from_phases(rig: Rig) -> JointCode:
     low = (np.minimum(near, far) - MAX_DISAGREEMENT_PX - background) / pitch
     high = (np.maximum(near, far) + MAX_DISAGREEMENT_PX - background) / pitch
     most_orders = int(np.ceil(max(span.max(), np.abs(low).max(), np.abs(high).max())))
-    gaps = {"range": math.inf, "background": math.inf}
-    for i in range(-most_orders, most_orders + 1):
-        for j in range(-most_orders, most_orders + 1):
-            distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
-            inside = (abs(i) <= span[0]) & (abs(j) <= span[1]) & ((i, j) != (0, 0))
-            on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
-            for name, possible in (("range", inside), ("background", on_background)):
-                if possible.any():
-                    gaps[name] = min(gaps[name], float(distance_px[possible].min()))
+    range_gap = background_gap = math.inf
+    for i, j in product(range(-most_orders, most_orders + 1), repeat=2):
+        distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
+        if (i, j) != (0, 0):
+            inside = (abs(i) <= span[0]) & (abs(j) <= span[1])
+            range_gap = distance_px.min(where=inside, initial=range_gap)
+        on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
+        background_gap = distance_px.min(where=on_background, initial=background_gap)
     periods = (np.abs(line) / pitch).max(axis=1)
     driver = AXES[int(periods[1] > periods[0])]
-    return JointCode(gaps["range"], gaps["background"], driver, float(periods.max()))
+    return JointCode(float(range_gap), float(background_gap), driver, float(periods.max()))
 
 
 def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
