@@ -48,6 +48,9 @@ class Measured:
     modulation: NDArray[np.float32]
     phase: NDArray[np.float64]
 
+    def reshaped(self, shape: tuple[int, int]) -> "Measured":
+        return Measured(self.coordinate_px.reshape(shape), self.modulation.reshape(shape), self.phase.reshape(shape))
+
 
 @dataclass(frozen=True)
 class Decoded:
@@ -117,13 +120,6 @@ class _Image:
         for plan in job.plans if job.details else []:
             u, b, phase = np.full(size, np.nan), np.full(size, np.nan, dtype=np.float32), np.full(size, np.nan)
             self.details[plan.direction] = Measured(u, b, phase)
-
-    def measured(self, direction: Direction) -> Measured:
-        """Details of ``direction`` as images (H, W)."""
-        flat, camera = self.details[direction], self.job.rig.camera
-        return Measured(
-            *(part.reshape(camera.height, camera.width) for part in (flat.coordinate_px, flat.modulation, flat.phase))
-        )
 
     def decode_from(self, start: int) -> int:
         """Decode a block; returns the number of its pixels that were read in every direction."""
@@ -282,6 +278,6 @@ def decode_stack(
         reason=image.reason.reshape(shape),
         counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
         frames_used=used,
-        details={name: image.measured(name) for name in image.details},
+        details={name: measured.reshaped(shape) for name, measured in image.details.items()},
         second_px=second_px if len(plans) == 2 else 0,
     )
