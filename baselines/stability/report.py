@@ -1,35 +1,44 @@
 """The output of a run: JSON with every case, an HTML page, and a picture of the heat maps."""
 
+import io
 import json
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.stability.case import Verdict
-from fpp_ml_bench.baselines.stability.report_html import report_page
-from fpp_ml_bench.baselines.stability.run import Row
+from fpp_ml_bench.baselines.stability.cases import Row, Verdict, parameter_text
+from fpp_ml_bench.evaluation.report import data_uri, page, render
 from fpp_ml_bench.evaluation.result import environment
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.machine import numba_enabled
 
 PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
 SCHEMA_VERSION = "1.0.0"
-
-
-def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """By group, and under "all": cases per verdict, the largest error / bound, and processor time."""
-    groups: dict[str, dict[str, Any]] = {}
-    for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
-        part = [row for row in rows if group in (row.case.group, "all")]
-        ratios = [row.outcome.ratio for row in part if row.outcome.ratio is not None]
-        groups[group] = {
-            "cases": len(part),
-            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
-            "largest_ratio": number(max(ratios, default=None)),
-            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
-        }
-    return groups
+LEVELS = {
+    "error 0": "#dff1ea",
+    "error under 1/1000 of its bound": "#b5dfcf",
+    "1/1000 to 1/10 of the bound": "#74bf9f",
+    "1/10 to 1/2 of the bound": "#2f9470",
+    "1/2 to the whole bound": "#0b6b50",
+    "correctly refused or masked": "#b9c0c8",
+    "FAIL": "#d1242f",
+}
+"""What a square of the heat maps says, and its colour."""
+_DPI, _SQUARE_PX, _LINE_PX = 90, 15, 19
+_ACROSS, _LABEL, _COLUMN, _KEY = 24, 15.5, 40.0, 2.0
+"""Squares in a line; widths of its label and of a column of groups in squares, height of the key in lines."""
+_FILLED = 0.86, 0.84
+"""Share of its place that a square fills, across and down."""
+_STYLE = """
+img.heat { max-width: none; display: block; background: #fff; border-radius: 4px; }
+details { margin: .5rem 0; }
+summary { cursor: pointer; padding: .25rem 0; }
+td.verdict { white-space: nowrap; }
+td.FAIL { color: #d1242f; font-weight: 600; }
+.about { margin: .25rem 0 .75rem; }
+"""
 
 
 def number(value: float | None) -> float | str | None:
@@ -37,15 +46,48 @@ def number(value: float | None) -> float | str | None:
     return value if value is None or math.isfinite(value) else str(value)
 
 
-def row_dict(row: Row) -> dict[str, Any]:
+def short(value: float | None) -> str:
+    """A number for a table."""
+    if value is None:
+        return "-"
+    return f"{value:.2g}" if math.isfinite(value) else str(value)
+
+
+def families(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
+    """Rows by group and family, in the order in which they ran."""
+    grouped: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
+        grouped.setdefault(row.case.group, {}).setdefault(row.case.family, []).append(row)
+    return grouped
+
+
+def largest_ratio(rows: Iterable[Row]) -> float | None:
+    """The largest error / bound, None where nothing was computed."""
+    return max((row.outcome.ratio for row in rows if row.outcome.ratio is not None), default=None)
+
+
+def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """By group, and under "all": cases per verdict, the largest error / bound, and processor time."""
+    groups: dict[str, dict[str, Any]] = {}
+    for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
+        part = [row for row in rows if group in (row.case.group, "all")]
+        groups[group] = {
+            "cases": len(part),
+            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
+            "largest_ratio": number(largest_ratio(part)),
+            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
+        }
+    return groups
+
+
+def row_content(row: Row) -> dict[str, Any]:
     """A case as JSON values."""
     case, outcome = row.case, row.outcome
+    parameters = {key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()}
     return {
         "group": case.group,
         "family": case.family,
-        "parameters": {
-            key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()
-        },
+        "parameters": parameters,
         "computes": case.computes,
         "reference": case.reference,
         "predicts": case.predicts,
@@ -60,7 +102,7 @@ def row_dict(row: Row) -> dict[str, Any]:
         "note": outcome.note,
         "against": row.against,
         "cpu_seconds": round(row.cpu_seconds, 3),
-    }  # fmt: skip
+    }
 
 
 def document(rows: Sequence[Row]) -> dict[str, Any]:
@@ -70,18 +112,98 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
         "summary": summary(rows),
         "compiled_decoder": numba_enabled(),
         "environment": environment().model_dump(mode="json"),
-        "cases": [row_dict(row) for row in rows],
+        "cases": [row_content(row) for row in rows],
     }
+
+
+def level(row: Row) -> str:
+    """Which of `LEVELS` a case has."""
+    refused, failed = list(LEVELS)[5:]
+    if row.verdict is not Verdict.WITHIN:
+        return failed if row.verdict is Verdict.FAIL else refused
+    ratio = row.outcome.ratio or 0.0
+    return list(LEVELS)[0 if ratio == 0 else 1 + sum(ratio >= limit for limit in (1e-3, 0.1, 0.5))]
+
+
+def row_text(row: Row) -> str:
+    """A case and its result in a line."""
+    outcome = row.outcome
+    if outcome.error is None:
+        result = outcome.note
+    else:
+        result = f"error {short(outcome.error)} {row.case.unit}, bound {short(outcome.bound)}"
+        result += f", {outcome.flagged:.0%} masked" if outcome.flagged else ""
+    return f"{row.case.name}: {row.verdict.value}, {result}"
+
+
+def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
+    """The heat maps as PNG: two columns of groups, a line per family, a square per case; and for an HTML image map each
+    square's corners in px and its text."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch, Rectangle
+
+    grouped = families(rows)
+    lines = {
+        group: 2 + sum(math.ceil(len(members) / _ACROSS) for members in kinds.values())
+        for group, kinds in grouped.items()
+    }
+    figure = Figure(dpi=_DPI, facecolor="white")
+    axes = figure.add_axes((0, 0, 1, 1))
+    squares, ends = [], [_KEY, _KEY]  # the line where each column goes on
+    for group, kinds in grouped.items():
+        column = (
+            0 if ends[0] - _KEY + lines[group] / 2 <= sum(lines.values()) / 2 else 1
+        )  # the left until it holds half
+        left, y = column * _COLUMN + 0.3, ends[column]
+        axes.text(left, y + 1.0, group, fontsize=11, fontweight="bold", va="center")
+        y += 1.6
+        for family, members in kinds.items():
+            axes.text(left + _LABEL - 0.4, y + 0.5, family, fontsize=8, va="center", ha="right", color="#333333")
+            for place, row in enumerate(members):
+                down, across = divmod(place, _ACROSS)
+                corner = left + _LABEL + across, y + down
+                axes.add_patch(Rectangle(corner, *_FILLED, color=LEVELS[level(row)], lw=0))
+                opposite = corner[0] + _FILLED[0], corner[1] + _FILLED[1]
+                pixels = (f"{px * _SQUARE_PX:.0f},{line * _LINE_PX:.0f}" for px, line in (corner, opposite))
+                squares.append((",".join(pixels), row_text(row)))
+            y += down + 1
+        ends[column] = y + 0.4
+    axes.set_xlim(0, 2 * _COLUMN)
+    axes.set_ylim(max(ends), 0)
+    axes.axis("off")
+    figure.set_size_inches(2 * _COLUMN * _SQUARE_PX / _DPI, max(ends) * _LINE_PX / _DPI)
+    key = [Patch(color=colour, label=meaning) for meaning, colour in LEVELS.items()]
+    figure.legend(handles=key, ncols=4, fontsize=8, frameon=False, loc="upper center")
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue(), squares
+
+
+def report_page(rows: Sequence[Row], content: dict[str, Any], picture: bytes, squares: list[tuple[str, str]]) -> str:
+    """The page as HTML without external resources."""
+    machine, hardware = content["environment"], content["environment"].get("hardware", {})
+    about = [f"{hardware.get('cpu', 'unknown processor')}, {hardware.get('cores', '?')} cores"]
+    about += [f"Python {machine.get('python', '?')}"]
+    about += [f"{name} {version}" for name, version in machine.get("packages", {}).items()]
+    body = render(
+        __package__, "stability.html", total=content["summary"]["all"], machine=", ".join(about), squares=squares,
+        failed=[row for row in rows if row.verdict is Verdict.FAIL], picture=data_uri(picture), families=families(rows),
+        short=short, parameter_text=parameter_text, largest_ratio=largest_ratio,
+        counts=lambda members: Counter(row.verdict.value for row in members),
+    )  # fmt: skip
+    return page("Numerical stability", body, style=_STYLE)
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write `PAGE`, `DATA` and `PICTURE` into ``folder``, which is made; their paths. Raises OSError."""
-    from fpp_ml_bench.baselines.stability.picture import write_picture
-
     folder.mkdir(parents=True, exist_ok=True)
     content = document(rows)
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_atomically(folder / DATA, text.encode("utf-8"))
-    write_atomically(folder / PAGE, report_page(rows, content).encode("utf-8"))
-    write_picture(rows, folder / PICTURE)
-    return [folder / PAGE, folder / DATA, folder / PICTURE]
+    picture, squares = heat_maps(rows)
+    files = {
+        PAGE: report_page(rows, content, picture, squares).encode("utf-8"),
+        DATA: (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"),
+        PICTURE: picture,
+    }
+    for name, data in files.items():
+        write_atomically(folder / name, data)
+    return [folder / name for name in files]

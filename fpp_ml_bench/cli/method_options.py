@@ -123,9 +123,9 @@ def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "Method":
 def weights_of_recipe(recipe: str, size: int) -> Path:
     """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
     wide. Raises FppBenchError where there are none."""
+    from fpp_ml_bench.baselines.reproduce import RUNS, Folders, current_weights
     from fpp_ml_bench.baselines.training import load_recipe
     from fpp_ml_bench.errors import RecipeError
-    from fpp_ml_bench.leaderboard.reproduce import RUNS, Folders, current_weights
 
     resolved = [load_recipe(recipe, preset) for preset in PRESETS]
     searched = []

@@ -2,14 +2,13 @@
 
 import argparse
 import shlex
+import sys
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from fpp_ml_bench.baselines.training import PRESETS
-from fpp_ml_bench.leaderboard.paper import PAPER_TABLES
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.leaderboard.reproduce import Folders
+from fpp_ml_bench.baselines import reproduce
+from fpp_ml_bench.baselines.training import PRESETS, TABLES
+from fpp_ml_bench.errors import RecipeError, TrainingError
 
 SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
 EXAMPLES = (
@@ -24,7 +23,7 @@ ALL = "all"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument(
-        "table", nargs="?", choices=(*PAPER_TABLES, ALL), metavar="TABLE", help=f"{', '.join(PAPER_TABLES)} or {ALL}"
+        "table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}"
     )
     parser.add_argument(
         "--preset", choices=PRESETS, default="cpu",
@@ -64,36 +63,30 @@ def _minutes(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
-    from fpp_ml_bench.cli import CHECK_FAILED
+    from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.errors import RecipeError, TrainingError
-    from fpp_ml_bench.leaderboard.reproduce import Folders
 
     below = args.runs / args.preset
-    folders = Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
-    tables = PAPER_TABLES if args.table in (None, ALL) else (args.table,)
+    folders = reproduce.Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
+    tables = TABLES if args.table in (None, ALL) else (args.table,)
     if args.list:
-        return _list(tables, folders)
+        _list(tables, folders)
+        return OK
     if args.table is None:
-        raise RecipeError(f"expected a table: {', '.join(PAPER_TABLES)} or {ALL}; --list shows their rows")
-    from fpp_ml_bench.leaderboard.reproduce import (
-        ReproduceSettings,
-        orderings,
-        orderings_sentence,
-        reproduce,
-        table_lines,
-        table_rich,
-    )
+        raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
+    from fpp_ml_bench.leaderboard import reproduced
 
     command = _command(args)
-    outcome = reproduce(
-        ReproduceSettings(
-            tables, folders, command, args.data, args.only_missing, args.minutes, args.anyway, report=_report
+    outcome = reproduce.reproduce(
+        reproduce.ReproduceSettings(
+            tables, folders, command, reproduced, args.data, args.only_missing, args.minutes, args.anyway,
+            report=_report,
         )
-    )
+    )  # fmt: skip
     for table, path in zip(tables, outcome.tables, strict=True):
-        lines = table_lines(table, outcome.jobs, folders, outcome.opened)
-        show(table_rich(table, lines, args.preset), orderings_sentence(orderings(lines)))
+        lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
+        orderings = reproduced.orderings_sentence(reproduced.orderings(lines))
+        show(reproduced.table_rich(table, lines, args.preset), orderings)
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
@@ -101,14 +94,11 @@ def run(args: argparse.Namespace) -> int:
     if outcome.stopped is not None:
         print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Continue with: {command}")
         return CHECK_FAILED
-    return 0
+    return OK
 
 
 def _report(line: str) -> None:
     """Print a line with the time on stderr, where the engine's progress is too."""
-    import sys
-    from datetime import datetime
-
     print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
 
@@ -124,24 +114,18 @@ def _command(args: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def _list(tables: "tuple[str, ...]", folders: "Folders") -> int:
+def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> None:
     from rich.table import Table
 
     from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.leaderboard.reproduce import planned, state_of, variants
 
-    jobs = planned(tables, folders.preset)
+    jobs = reproduce.planned(tables, folders.preset)
     table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     for title in ("Row", "Training", "State", "Rows written"):
         table.add_column(title, overflow="fold")
     for job in jobs:
-        row_files = [folders.row(job.recipe, variant) for variant in variants(job.recipe)]
-        table.add_row(
-            "\n".join(place.recipe_name for place in job.places),
-            job.recipe.name,
-            state_of(folders.training(job.recipe)),
-            f"{sum(path.is_file() for path in row_files)} of {len(row_files)}",
-        )
+        row_files = [folders.row(job.recipe, variant) for variant in reproduce.variants(job.recipe)]
+        written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
+        table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
     show(table)
-    print(f"{len(jobs)} trainings fill {sum(len(job.places) for job in jobs)} rows.")
-    return 0
+    print(f"{len(jobs)} trainings fill {sum(len(job.rows) for job in jobs)} rows.")

@@ -1,13 +1,12 @@
 """``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical bounds."""
 
 import argparse
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from fpp_ml_bench.baselines.stability import Case, Row
+from fpp_ml_bench.baselines import stability
+from fpp_ml_bench.errors import StabilityError
 
 SUMMARY = "Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds."
 EXAMPLES = (
@@ -36,71 +35,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the cases; 1 if any FAILs."""
-    import json
-
-    from fpp_ml_bench.baselines.stability import Verdict, all_cases, run_cases
     from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import progress_bar, show
-    from fpp_ml_bench.errors import StabilityError
 
     groups = [group for group in _GROUPS if group in (args.group or _GROUPS)]
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise StabilityError(f"--out {args.out}: expected a folder or a new path, got a file")
-    cases = all_cases(groups, quick=args.quick)
+    cases = stability.all_cases(groups, quick=args.quick)
     if args.list:
-        return _list(cases)
+        _list(cases)
+        return OK
     with progress_bar("stability", len(cases), "cases") as advance:
-        rows = run_cases(cases, lambda _: advance(1))
-    written = []
-    if args.out is not None:
-        from fpp_ml_bench.baselines.stability import write_report
-
-        written = write_report(rows, args.out)
+        rows = stability.run_cases(cases, lambda _: advance(1))
+    written = [] if args.out is None else stability.write_report(rows, args.out)
     if args.json:
-        from fpp_ml_bench.baselines.stability import document
-
-        print(json.dumps(document(rows), indent=1, allow_nan=False))
+        print(json.dumps(stability.document(rows), indent=1, allow_nan=False))
     else:
         _show(rows)
         for path in written:
             show(f"Written: {path}")
-    return CHECK_FAILED if any(row.verdict is Verdict.FAIL for row in rows) else OK
+    return CHECK_FAILED if any(row.verdict is stability.Verdict.FAIL for row in rows) else OK
 
 
-def _show(rows: "Sequence[Row]") -> None:
+def _show(rows: "Sequence[stability.Row]") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from fpp_ml_bench.baselines.stability import Verdict, figure, summary
     from fpp_ml_bench.cli.console import show
 
     table = Table()
     for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
         table.add_column(title, justify="left" if title == "group" else "right")
-    for group, counts in summary(rows).items():
+    for group, counts in stability.summary(rows).items():
         ratio = counts["largest_ratio"]
         table.add_row(
             group, str(counts["cases"]), str(counts["within"]), str(counts["flagged"]), str(counts["FAIL"]),
-            ratio if isinstance(ratio, str) else figure(ratio), f"{counts['cpu_seconds']:.1f}",
+            ratio if isinstance(ratio, str) else stability.short(ratio), f"{counts['cpu_seconds']:.1f}",
         )  # fmt: skip
     show(table)
     for row in rows:
-        if row.verdict is Verdict.FAIL:
+        if row.verdict is stability.Verdict.FAIL:
             show(Text(f"FAIL {row.case.group}: {row.case.name}: {row.against}"))
 
 
-def _list(cases: "Sequence[Case]") -> int:
+def _list(cases: "Sequence[stability.Case]") -> None:
     from rich.text import Text
 
-    from fpp_ml_bench.cli import OK
     from fpp_ml_bench.cli.console import show
 
-    listed = set()
+    families: dict[tuple[str, str], list[stability.Case]] = {}
     for case in cases:
-        if (case.group, case.family) not in listed:
-            listed.add((case.group, case.family))
-            members = sum((member.group, member.family) == (case.group, case.family) for member in cases)
-            show(Text(f"{case.group}: {case.family} ({members}): {case.computes}; against {case.reference}"))
-            show(Text(f"    bound: {case.predicts}"))
+        families.setdefault((case.group, case.family), []).append(case)
+    for (group, family), (case, *others) in families.items():
+        show(Text(f"{group}: {family} ({1 + len(others)}): {case.computes}; against {case.reference}"))
+        show(Text(f"    bound: {case.predicts}"))
     show(Text(f"{len(cases)} cases"))
-    return OK

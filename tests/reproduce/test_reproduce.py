@@ -9,6 +9,14 @@ import torch
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.reproduce import plan, scoring, work
+from fpp_ml_bench.baselines.reproduce.scoring import (
+    SPLIT,
+    all_frames_that_hold,
+    read_all_frames,
+    score_all_frames,
+    write_all_frames,
+)
 from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import engine, load_recipe, model_config, save_weights
 from fpp_ml_bench.cli import main
@@ -16,20 +24,11 @@ from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.leaderboard.reproduce import plan as reproduce_plan
-from fpp_ml_bench.leaderboard.reproduce import row as reproduce_row
-from fpp_ml_bench.leaderboard.reproduce import run_tables as reproduce
-from fpp_ml_bench.leaderboard.reproduce import train_row as reproduce_training
-from fpp_ml_bench.leaderboard.reproduce.frames import (
-    all_frames_that_hold,
-    read_all_frames,
-    score_all_frames,
-    write_all_frames,
-)
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 TABLE = "normalization"
+ABOUT = {"recipe": "r", "weights_sha256": 64 * "a"}
 NAMES = ("cpu-unet-raw-rmse", "cpu-unet-global-rmse", "cpu-unet-individual-rmse")
 TWINS = tuple(f"cpu-unet-individual-rmse-range-{source}" for source in ("predicted", "mean"))
 
@@ -53,12 +52,12 @@ def small(monkeypatch, opened, request):
         recipe = load_recipe(name, preset)
         return recipe.model_copy(update={"size": opened.size[0], "width": 1})
 
-    monkeypatch.setattr(reproduce_plan, "load_recipe", tiny_recipe)
-    monkeypatch.setattr("fpp_ml_bench.leaderboard.reproduce.row.REPEATS", 2)
+    monkeypatch.setattr(plan, "load_recipe", tiny_recipe)
+    monkeypatch.setattr(scoring, "REPEATS", 2)
     for constant in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
         monkeypatch.setattr(f"fpp_ml_bench.baselines.networks.range_heads.{constant}", 4)
     if "from_trainings" not in request.node.name:  # there the time is really measured
-        monkeypatch.setattr(reproduce_row, "time_method", reused_timing)
+        monkeypatch.setattr(scoring, "time_method", reused_timing)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -99,14 +98,14 @@ class Trainer:
 @pytest.fixture
 def trainer(monkeypatch):
     stand_in = Trainer()
-    monkeypatch.setattr(reproduce, "train", stand_in)
+    monkeypatch.setattr(work, "train", stand_in)
     return stand_in
 
 
 @pytest.fixture
 def unscored(monkeypatch):
     """Trainings only: nothing is predicted or scored."""
-    monkeypatch.setattr(reproduce, "_score", lambda *arguments: None)
+    monkeypatch.setattr(work, "_score", lambda *arguments: None)
 
 
 @pytest.fixture
@@ -213,7 +212,7 @@ def test_ctrl_c_leaves_what_is_done_and_a_table(run, trainer, unscored, tmp_path
 def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, tmp_path, capsys):
     out = tmp_path / "runs" / "cpu" / "unet-individual-rmse"
     out.mkdir(parents=True)
-    recipe = reproduce_plan.load_recipe("normalization/individual", "cpu")
+    recipe = plan.load_recipe("normalization/individual", "cpu")
     other = {**recipe.to_dict(), "batch": 8, "seed": 1}
     (out / engine.RECIPE).write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
     assert run(TABLE) == 2
@@ -225,7 +224,7 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
 
 
 def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
-    monkeypatch.setattr(reproduce_training, "_gpu", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2
     error = capsys.readouterr().err
     assert (
@@ -264,7 +263,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
     def zeros(frame):
         return np.zeros(frame.shape, np.float32)
 
-    scores = score_all_frames(opened, zeros, [0, 3], "mm", "standard", "r", 64 * "a")
+    scores = score_all_frames(opened, zeros, [0, 3], ("mm", "standard"), ABOUT)
     path = tmp_path / "all.json"
     write_all_frames(scores, path)
     assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
@@ -275,12 +274,10 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
         read_all_frames(path)
     assert all_frames_that_hold(path, opened.fingerprint, 64 * "a") is None
     with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
-        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], "mm", "standard", "r", 64 * "a")
+        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], ("mm", "standard"), ABOUT)
 
 
 def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
-    from fpp_ml_bench.leaderboard.reproduce.row import SPLIT
-
     rng = np.random.default_rng(0)
     noise = {sample: rng.uniform(0.0, 1.0, opened.size).astype(np.float32) for sample in opened.samples(SPLIT)}
     waiting = iter(noise.values())
@@ -292,7 +289,7 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper-individual")
-    scores = score_all_frames(opened, lambda frame: next(waiting), [0], "normalised", "paper-individual", "r", 64 * "a")
+    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper-individual"), ABOUT)
     for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 

@@ -7,18 +7,24 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
+from fpp_ml_bench.baselines.reproduce import Folders, plan, planned, variants
+from fpp_ml_bench.baselines.reproduce.plan import default_folder, open_dataset
 from fpp_ml_bench.baselines.training import PRESETS, TABLES, load_recipe
 from fpp_ml_bench.cli import reproduce as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
-from fpp_ml_bench.leaderboard.reproduce import plan as reproduce_plan
-from fpp_ml_bench.leaderboard.reproduce.data import default_folder, open_dataset
-from fpp_ml_bench.leaderboard.reproduce.lines import Line, Scored, scored_entry
-from fpp_ml_bench.leaderboard.reproduce.paper_order import Ordering, orderings
-from fpp_ml_bench.leaderboard.reproduce.plan import Folders, places, planned, variants
-from fpp_ml_bench.leaderboard.reproduce.table import orderings_sentence, table_markdown
+from fpp_ml_bench.leaderboard.reproduced import (
+    Line,
+    Ordering,
+    Scored,
+    orderings,
+    orderings_sentence,
+    scored_result,
+    table_lines,
+    table_markdown,
+)
 from fpp_ml_bench.leaderboard.rows import Entry
 
 
@@ -32,15 +38,15 @@ def folders(tmp_path, preset="cpu"):
 
 
 def test_the_command_knows_the_recipes_tables_and_presets():
-    assert PAPER_TABLES == TABLES and command.PRESETS == PRESETS
+    assert PAPER_TABLES == command.TABLES == TABLES and command.PRESETS == PRESETS
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_rows_of_one_recipe_are_one_training(preset):
     jobs = planned(PAPER_TABLES, preset)
-    rows = [place.recipe_name for job in jobs for place in job.places]
+    rows = [row for job in jobs for row in job.rows]
     assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 5 and len(jobs) == 23
-    shared = [{place.recipe_name for place in job.places} for job in jobs if len(job.places) > 1]
+    shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
     assert shared == [
         {"normalization/individual", "multi_frame/frame0", "loss/rmse"},
         {"loss/hybrid_l1_0.7", "architecture/unet"},
@@ -51,13 +57,15 @@ def test_rows_of_one_recipe_are_one_training(preset):
     assert len(set(titles)) == len(titles)
 
 
-def test_places_hold_the_papers_numbers():
+def test_lines_hold_the_papers_numbers(tmp_path, dataset):
+    jobs = planned(PAPER_TABLES, "cpu")
     for table in PAPER_TABLES:
-        by_row = {place.row: place for place in places(table)}
+        by_row = {line.row: line for line in table_lines(table, jobs, folders(tmp_path), dataset)}
         for row in paper_tables()[table].rows:
-            assert (by_row[row.row].errors_mm, by_row[row.row].pairs) == (row.errors_mm, row.test_samples)
-        extra = [name for name, place in by_row.items() if place.errors_mm is None]
-        assert extra == (["hformer"] if table == "architecture" else [])
+            assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
+        extra = [line.label for line in by_row.values() if line.paper_mm is None]
+        assert extra == (["Hformer"] if table == "architecture" else [])
+        assert all(line.scored is line.entry is None for line in by_row.values())
 
 
 def test_two_recipes_under_one_name_are_refused(monkeypatch):
@@ -65,7 +73,7 @@ def test_two_recipes_under_one_name_are_refused(monkeypatch):
         recipe = load_recipe(name, preset)
         return recipe.model_copy(update={"seed": 7}) if name == "loss/rmse" else recipe
 
-    monkeypatch.setattr(reproduce_plan, "load_recipe", other_seed)
+    monkeypatch.setattr(plan, "load_recipe", other_seed)
     with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in seed \(42 and 7\)"):
         planned(["normalization", "loss"], "cpu")
 
@@ -111,12 +119,11 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
 
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
     """A line with these object errors, sample ``object_view`` to mm."""
-    place = replace(places("loss")[0], row=label, label=label)
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
     mean = float(np.mean(list(errors.values())))
     samples = {sample: (sample.rpartition("_")[0], error) for sample, error in errors.items()}
     scored = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
-    return Line(place, load_recipe("loss/rmse"), label, scored, entry, paper)
+    return Line(label, label, load_recipe("loss/rmse"), scored, entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -165,7 +172,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     ]
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_entry(entry))
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_result(entry.result))
         for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
@@ -176,14 +183,14 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     )
     lines[1] = replace(lines[1], entry=Entry(tmp_path / "x.json", oracle))
     assert not orderings(lines)[0].same_track
-    text = table_markdown("loss", lines, orderings(lines), "cpu", "fpp-bench reproduce loss", {})
+    text = table_markdown("loss", lines, "cpu", "fpp-bench reproduce loss", {})
     assert "of different tracks" in text
 
 
 def test_rows_that_were_not_measured_stay_empty():
     empty = replace(line("masked | L1", 18.0, {"a_A0": 1.0}), scored=None)
     text = table_markdown(
-        "loss", [empty], [], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
+        "loss", [empty], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
     )
     assert "Not measured here: masked &#124; L1. To fill: `fpp-bench reproduce loss --preset paper`" in text
     assert "masked &#124; L1: boom" in text

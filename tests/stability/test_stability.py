@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.stability.case import Case, Outcome, Verdict, family, judge, refusal, worst
-from fpp_ml_bench.baselines.stability.report import document, write_report
-from fpp_ml_bench.baselines.stability.run import GROUPS, all_cases, run_case, run_cases
+from fpp_ml_bench.baselines.stability import all_cases, document, run_cases, write_report
+from fpp_ml_bench.baselines.stability.cases import MODULES, Case, Group, Outcome, Verdict, judge, worst
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli import stability as command
 from fpp_ml_bench.errors import DecodeError, StabilityError
 from fpp_ml_bench.evaluation.score import error_stats
 
@@ -48,8 +48,10 @@ def test_no_case_of_losses_and_layers_fails():
     assert not failing(rows)
 
 
-def case(run, expects="number"):
-    return family("phase", "made up", run, {}, computes="x", reference="x", predicts="x", unit="1", expects=expects)[0]
+def case(run, expects="number", refuses=()):
+    group = Group("phase")
+    group.family("made up", "1", about="x; against x; bound: x", expects=expects, refuses=refuses)(run)
+    return group.cases[0]
 
 
 @pytest.mark.parametrize(
@@ -78,12 +80,20 @@ def test_the_worst_element_is_the_one_nearest_to_its_bound_and_nan_beats_them_al
     assert worst([1.0, 5.0], [1.0, 1.0], [False, True]) == Outcome(1.0, 1.0, flagged=0.5)
     assert np.isnan(worst([1.0, np.nan], 1.0).error)
     assert worst([np.nan, 1.0], 1.0, [True, True]).error is None
-    assert refusal(lambda: 1, DecodeError).error == 0.0
 
 
 def test_a_crash_is_a_finding_and_not_the_end():
-    row = run_case(case(lambda: 1 / 0))
-    assert row.verdict is Verdict.FAIL and "ZeroDivisionError" in row.against
+    row, of_another_kind = run_cases([case(lambda: 1 / 0), case(lambda: 1 / 0, "refusal", DecodeError)])
+    assert row.verdict is of_another_kind.verdict is Verdict.FAIL and "ZeroDivisionError" in row.against
+
+
+def test_a_refusal_that_the_case_names_is_flagged():
+    def refused():
+        raise DecodeError("too dim")
+
+    (row,) = run_cases([case(refused, "refusal", DecodeError)])
+    assert row.verdict is Verdict.FLAGGED and row.outcome == Outcome(None, flagged=1.0, note="too dim")
+    assert run_cases([case(refused, "number", DecodeError)])[0].against == "refused what can be computed: too dim"
 
 
 def naive_float32(errors):
@@ -93,7 +103,7 @@ def naive_float32(errors):
 
 
 def break_metrics(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.metrics_checks.stats_of", naive_float32)
+    monkeypatch.setattr("fpp_ml_bench.evaluation.score.stats_of", naive_float32)
     return cases_of("metrics", "mixed magnitudes")
 
 
@@ -106,7 +116,7 @@ def break_arctangent(monkeypatch):
 
 
 def break_interval(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.order_checks.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    monkeypatch.setattr("fpp_ml_bench.decoding.minus_atan2", lambda y, x: -np.arctan2(y, x))
     return cases_of("order", "interval of the phase")
 
 
@@ -116,7 +126,7 @@ def break_triangulation(monkeypatch):
         bottom = u - np.float32(device.cx) - np.float32(device.fx) * x
         return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
 
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.triangulation_checks.depth_from_coordinate", in_single)
+    monkeypatch.setattr("fpp_ml_bench.decoding.depth_from_coordinate", in_single)
     return [member for member in cases_of("triangulation", "baseline") if member.parameters["direction"] == "vertical"]
 
 
@@ -125,7 +135,7 @@ def break_normalisation(monkeypatch):
         share = (np.float32(depth) - np.float32(low)) / (np.float32(high) - np.float32(low))
         return np.where(depth > 0, share, 0)
 
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.normalisation_checks.normalise", in_single)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.scores.normalise", in_single)
     return cases_of("normalisation", "range from a file")
 
 
@@ -139,7 +149,7 @@ def break_instance_norm(monkeypatch):
             variance = (x * x).mean((2, 3), keepdim=True) - mean * mean  # may even be negative
             return (x - mean) / torch.sqrt(variance + self.eps)
 
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.networks_checks.InstanceNorm", OnePass)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.networks.InstanceNorm", OnePass)
     return cases_of("networks", "nearly constant input, instance norm")
 
 
@@ -167,7 +177,7 @@ def test_code_that_is_broken_on_purpose_fails(broken, monkeypatch):
 
 def test_every_group_has_cases_that_say_what_they_are():
     cases = all_cases()
-    assert {member.group for member in cases} == set(GROUPS)
+    assert {member.group for member in cases} == set(MODULES) == set(command._GROUPS)
     assert len({(member.group, member.name) for member in cases}) == len(cases)
     for member in cases:
         assert member.computes and member.reference and member.predicts and member.unit
@@ -203,6 +213,6 @@ def test_the_command(tmp_path, capsys, monkeypatch):
         main(["stability", "--group", "chance"])
     assert stopped.value.code == 2
     broken = break_interval(monkeypatch)
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.run.all_cases", lambda *_, **__: broken)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.all_cases", lambda *_, **__: broken)
     assert main(["stability", "--group", "order"]) == 1
     assert "FAIL order: interval of the phase" in capsys.readouterr().out

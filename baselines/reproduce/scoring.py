@@ -1,12 +1,14 @@
-"""Scores on every (view, frame) pair of a condition's test set, as in the paper's multi-frame table (Section 5.4).
+"""Predicting, timing and scoring a trained network for a row, and its scores on every frame.
 
-The paper averages over all pairs. Here each sample's score is the mean over its frames, and the headline the mean over
-samples: the same number, for every sample has the same frames, and the interval can then be taken over objects. The
-rules are the evaluator's own (`scored_pair`, `score_sample`).
+In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
+set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
+every sample has the same frames, and the interval can then be taken over objects. The rules are the evaluator's own
+(`scored_pair`, `score_sample`).
 """
 
+import shutil
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,15 +16,47 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.reproduce.plan import Folders
+from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.baselines.timing import time_method, write_timing
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
-from fpp_ml_bench.evaluation.result import Headline, Intervals, Sha256, read_json, write_json
+from fpp_ml_bench.evaluation.report import write_sheet
+from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_json, write_result
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
-from fpp_ml_bench.evaluation.score import intervals_over_objects, score_sample, scored_pair
+from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
+from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
+MAIN_KEY = "object_mae_mm"
+SPLIT, TARGET = "test", "depth"
+REPEATS = 20
 Scores = dict[str, float | None]
+
+
+def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
+    """Predict the test split, time the method, score against the decoded depth (as in the paper), draw the picture
+    beside the row.
+
+    Files of an earlier run under this name are replaced at the end; an interrupted run leaves nothing that is taken for
+    finished. Raises what predicting, timing and scoring raise.
+    """
+    name = row.stem
+    predictions = folders.predictions(name)
+    making = predictions.with_name(f"{name}.making")
+    shutil.rmtree(making, ignore_errors=True)
+    predict_split(opened, method, SPLIT, making)
+    write_timing(making / SUBMISSION_FILE, time_method(opened, method, SPLIT, repeats=REPEATS))
+    result = evaluate(making, opened, SPLIT, TARGET, mode=method.mode)
+    for folder in (folders.rows, folders.result(name).parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(predictions, ignore_errors=True)
+    making.rename(predictions)
+    write_result(result, folders.result(name))
+    write_sheet(result, opened, predictions, row.with_suffix(".png"))
+    return result
 
 
 class FrameMean(StrictModel):
@@ -61,17 +95,15 @@ def score_all_frames(
     opened: DatasetFolder,
     predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
     frames: Sequence[int],
-    units: Units,
-    mode: Mode,
-    recipe: str,
-    weights_sha256: str,
-    split: str = "test",
+    scoring: tuple[Units, Mode],
+    about: Mapping[str, str],
 ) -> AllFrames:
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) in ``units`` out) on every sample of ``split`` and frame.
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out) on every test sample and
+    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network.
 
     Raises PredictionError for a prediction that is not finite, and what `scored_pair` raises.
     """
-    samples = opened.samples(split)
+    samples = opened.samples(SPLIT)
     scores: dict[tuple[str, int], Scores] = {}
     for sample in samples:
         target_mm = opened.target_mm(sample)
@@ -79,34 +111,40 @@ def score_all_frames(
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            pair = scored_pair(values, target_mm, units, mode, sample)
-            metrics = score_sample(*pair).metrics()
+            metrics = score_sample(*scored_pair(values, target_mm, *scoring, sample)).metrics()
             scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
-    rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
+    rows = [_mean(scores[sample, frame] for frame in frames) for sample in samples]
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends: dict[str, list[float | None]] = {
-        key: [None, None] if interval is None else list(interval) for key, interval in _intervals(rows, objects).items()
+        key: [None, None] if interval is None else list(interval)
+        for key, interval in intervals_over_objects(rows, objects, HEADLINE).items()
     }
     return AllFrames(
         schema_version="1.0.0",
         protocol_version=PROTOCOL_VERSION,
-        recipe=recipe,
         fingerprint=opened.fingerprint,
-        weights_sha256=weights_sha256,
-        mode=mode,
+        mode=scoring[1],
         frames=list(frames),
         pairs=len(scores),
         metrics=Headline(**_mean(rows)),
         intervals=Intervals(**ends),
         per_frame=[
-            FrameMean(frame=frame, metrics=Headline(**_mean([scores[sample, frame] for sample in samples])))
+            FrameMean(frame=frame, metrics=Headline(**_mean(scores[sample, frame] for sample in samples)))
             for frame in frames
         ],
         per_sample=[
             SampleMean(sample=sample, object=name, metrics=Headline(**row))
             for sample, name, row in zip(samples, objects, rows, strict=True)
         ],
+        **about,
     )
+
+
+def _mean(rows: Iterable[Scores]) -> Scores:
+    """Plain mean of each headline score over the rows that have it."""
+    kept = list(rows)
+    values_by_key = {key: [value for row in kept if (value := row[key]) is not None] for key in HEADLINE}
+    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
 
 
 def write_all_frames(scores: AllFrames, path: Path) -> None:
@@ -130,13 +168,3 @@ def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> A
         return None
     key = (fingerprint, weights_sha256, PROTOCOL_VERSION)
     return scores if (scores.fingerprint, scores.weights_sha256, scores.protocol_version) == key else None
-
-
-def _mean(rows: Sequence[Scores]) -> Scores:
-    """Plain mean of each headline score over the rows that have it."""
-    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
-    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
-
-
-def _intervals(rows: Sequence[Scores], objects: Sequence[str]) -> dict[str, tuple[float, float] | None]:
-    return intervals_over_objects(rows, objects, HEADLINE)

@@ -1,0 +1,17 @@
+from .plan import MEAN as MEAN
+from .plan import PREDICTED as PREDICTED
+from .plan import RUNS as RUNS
+from .plan import Folders as Folders
+from .plan import Job as Job
+from .plan import Variant as Variant
+from .plan import planned as planned
+from .plan import variants as variants
+from .scoring import MAIN_KEY as MAIN_KEY
+from .scoring import AllFrames as AllFrames
+from .scoring import all_frames_that_hold as all_frames_that_hold
+from .work import Outcome as Outcome
+from .work import ReproduceSettings as ReproduceSettings
+from .work import current_weights as current_weights
+from .work import file_sha256 as file_sha256
+from .work import reproduce as reproduce
+from .work import state_of as state_of

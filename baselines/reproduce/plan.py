@@ -1,0 +1,187 @@
+"""The work for a table of the paper: which trainings fill which of its rows, the paths of their files, and the dataset,
+which is built where it is missing and is the same for every row of a run.
+
+Rows that resolve to one recipe (``normalization/individual``, ``loss/rmse`` and ``multi_frame/frame0``) are a single
+training and a single row of the leaderboard.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from fpp_ml_bench.baselines.training import Recipe, load_recipe, table_rows
+from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
+from fpp_ml_bench.errors import DatasetError, RecipeError
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders import render
+from fpp_ml_bench.loaders.storage import MANIFEST, DatasetFolder
+from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics import paper_rig
+
+Report = Callable[[str], object]
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A training, and the ``rows`` of the tables that its scores fill, by name (``loss/rmse``)."""
+
+    recipe: Recipe
+    rows: tuple[str, ...]
+
+    @property
+    def all_frames(self) -> bool:
+        """Whether the paper scores this training on more frames than the first (Section 5.4)."""
+        return any(row.startswith("multi_frame/") for row in self.rows)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to use a trained network: the end of its row file's name, and the depth range that turns its output into mm
+    (see `fpp_ml_bench.baselines.networks.network_method.NetworkMethod`)."""
+
+    suffix: str
+    depth_range: Literal["oracle", "predicted", "mean"] | None
+
+
+METRIC, ORACLE = Variant("", None), Variant("", "oracle")
+PREDICTED, MEAN = Variant("-range-predicted", "predicted"), Variant("-range-mean", "mean")
+
+
+def variants(recipe: Recipe) -> tuple[Variant, ...]:
+    """The rows that a training gives. Individual normalisation is told the test sample's range, as in the paper; its
+    metric twins are not. With the background removed the object's mask is given anyway, and there are no twins."""
+    if recipe.normalisation != "individual":
+        return (METRIC,)
+    return (ORACLE,) if recipe.background_removed else (ORACLE, PREDICTED, MEAN)
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Paths below ``runs`` (``runs/<preset>``); ``rows`` takes the row files."""
+
+    preset: str
+    runs: Path
+    rows: Path
+
+    @property
+    def dataset_record(self) -> Path:
+        """File that records the dataset of all trainings and scores in this folder."""
+        return self.runs / "dataset.json"
+
+    def training(self, recipe: Recipe) -> Path:
+        return self.runs / recipe.name
+
+    def weights(self, recipe: Recipe) -> Path:
+        """Best weights, with range heads where the normalisation needs them: the file to ship."""
+        return self.runs / "weights" / f"{recipe.name}.safetensors"
+
+    def row(self, recipe: Recipe, variant: Variant) -> Path:
+        return self.rows / f"{self.preset}-{recipe.name}{variant.suffix}.json"
+
+    def all_frames(self, recipe: Recipe) -> Path:
+        # Not in the folder of the rows: there every .json is a row.
+        return self.runs / "all-frames" / f"{self.preset}-{recipe.name}-all-frames.json"
+
+    def result(self, name: str) -> Path:
+        return self.runs / "results" / f"{name}.json"
+
+    def predictions(self, name: str) -> Path:
+        return self.runs / "predictions" / name
+
+    def table(self, table: str) -> Path:
+        return self.runs / f"{table}.md"
+
+
+def planned(tables: Sequence[str], preset: str) -> list[Job]:
+    """The trainings of ``tables``, each once, in the order of their first row.
+
+    Raises RecipeError for an unknown table, an unsound recipe, or two recipes that differ under one name.
+    """
+    jobs: dict[str, Job] = {}
+    for name in (f"{table}/{row}" for table in tables for row in table_rows(table)):
+        recipe = load_recipe(name, preset)
+        job = jobs.get(recipe.name, Job(recipe, ()))
+        if job.recipe.digest != recipe.digest:
+            raise RecipeError(
+                f"{job.rows[0]} and {name} differ in {differing(job.recipe.to_dict(), recipe.to_dict())}, "
+                f"but both are called {recipe.name}; give one of them a different name"
+            )
+        jobs[recipe.name] = Job(recipe, (*job.rows, name))
+    return list(jobs.values())
+
+
+def differing(first: dict, second: dict, words: str = "{} and {}") -> str:
+    """The settings in which two recipes differ, with both values."""
+    keys = [key for key in {**first, **second} if first.get(key) != second.get(key)]
+    return ", ".join(f"{key} ({words.format(first.get(key), second.get(key))})" for key in keys)
+
+
+def common_size(jobs: Iterable[Job]) -> int:
+    """Image width and height in px that all ``jobs`` train on. RecipeError where they differ."""
+    sizes = {job.recipe.size: job.recipe.name for job in jobs}
+    if len(sizes) != 1:
+        raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
+    return next(iter(sizes))
+
+
+def default_folder(preset: str, size: int) -> Path:
+    """``data/full`` for the benchmark's own size, else named after preset and size, like ``data/cpu224``."""
+    return Path("data") / ("full" if size == FULL_SIZE else f"{preset}{size}")
+
+
+def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
+    """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none.
+
+    Every table uses all 50 objects and 52 frames, so that all share a dataset and its fingerprint.
+
+    Raises DatasetError for a dataset of another image size than the preset's, without a frame that a row needs, or
+    another dataset than the trainings in the runs folder; BuildError where it can't be built.
+    """
+    size = common_size(jobs)
+    folder = default_folder(folders.preset, size) if folder is None else folder
+    if not (folder / MANIFEST).is_file():
+        report(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
+        render.build(folder, render.BuildSettings(rig=paper_rig(size), objects=OBJECTS), usable_cores())
+    opened = DatasetFolder(folder)
+    command = f"fpp-bench build DIR --preset full{'' if size == FULL_SIZE else f' --size {size}'}"
+    if opened.size != (size, size):
+        height, width = opened.size
+        raise DatasetError(
+            f"{folder}: expected images of {size} x {size} px, which preset {folders.preset} trains on, got {width} x "
+            f"{height}; give another --data, or none to have it built, or build it: {command}"
+        )
+    for job in jobs:
+        if job.recipe.data_config not in opened.configs:
+            raise DatasetError(
+                f"{folder}: {job.rows[0]} needs the frames of {job.recipe.data_config}, stored are those of "
+                f"{', '.join(opened.configs)}; build it with all frames: {command}"
+            )
+    _check_same_dataset(opened, folders)
+    return opened
+
+
+def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
+    """Record the dataset in the runs folder; refuse a dataset other than the recorded one."""
+    record = folders.dataset_record
+    content = {"fingerprint": opened.fingerprint, "size": list(opened.size), "folder": str(opened.path)}
+    try:
+        if not record.is_file():
+            folders.runs.mkdir(parents=True, exist_ok=True)
+            write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
+            return
+        recorded = json.loads(record.read_text(encoding="utf-8"))
+        fingerprint, recorded_folder = recorded["fingerprint"], recorded["folder"]
+    except OSError as error:
+        raise DatasetError(f"{record}: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError):
+        raise DatasetError(
+            f"{record}: damaged; give another --runs, or remove it if --data is the dataset that was used"
+        ) from None
+    if fingerprint != opened.fingerprint:
+        raise DatasetError(
+            f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
+            f"{str(fingerprint)[:8]} ({recorded_folder}); give that dataset as --data, or another --runs"
+        )

@@ -1,0 +1,312 @@
+"""Regenerating the paper's tables: train, predict, time, score, write rows and a Markdown table; skip what is done.
+
+No training is ever deleted: a finished training is used, a stopped one continued, one of another recipe refused.
+"""
+
+import json
+import shlex
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from textwrap import shorten
+from time import perf_counter
+from typing import Any, Protocol
+
+import torch
+
+from fpp_ml_bench.baselines.networks.model import Model, load
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod, Setting
+from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+from fpp_ml_bench.baselines.reproduce.plan import (
+    PREDICTED,
+    Folders,
+    Job,
+    Report,
+    differing,
+    open_dataset,
+    planned,
+    variants,
+)
+from fpp_ml_bench.baselines.reproduce.scoring import (
+    all_frames_that_hold,
+    score_all_frames,
+    score_method,
+    write_all_frames,
+)
+from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
+from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.files import exclusive, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+PAPER_PRESET = "paper"
+REASON_LENGTH = 400
+
+
+class Leaderboard(Protocol):
+    """Keeps the rows, and shows them beside the paper's."""
+
+    def row_that_holds(self, path: Path, opened: DatasetFolder, weights_sha256: str) -> object:
+        """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
+
+    def check_row_is_of(self, path: Path, opened: DatasetFolder) -> None:
+        """Raises SubmissionError where ``path`` is a row on other data."""
+
+    def write_measured(self, result: Result, path: Path) -> None:
+        """Write a row that was measured here. Raises SubmissionError."""
+
+    def table_page(self, table: str, settings: "ReproduceSettings", outcome: "Outcome") -> str:
+        """A table as Markdown."""
+
+
+@dataclass(frozen=True)
+class ReproduceSettings:
+    """Settings of a run. ``minutes`` limits the whole run; ``command`` continues it; ``anyway`` trains the paper's
+    preset without a GPU; ``only_missing`` keeps rows that are up to date; ``show``: the engine's progress on stderr;
+    ``report`` takes a line of progress."""
+
+    tables: Sequence[str]
+    folders: Folders
+    command: str
+    leaderboard: Leaderboard
+    data: Path | None = None
+    only_missing: bool = False
+    minutes: float | None = None
+    anyway: bool = False
+    show: bool = True
+    report: Report = print
+
+
+@dataclass
+class Outcome:
+    """``stopped``: the recipe at which the minutes ran out, None when all was done; ``failed``: recipe name to why."""
+
+    opened: DatasetFolder
+    jobs: list[Job]
+    tables: list[Path] = field(default_factory=list)
+    stopped: str | None = None
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def reproduce(settings: ReproduceSettings) -> Outcome:
+    """Do what the tables lack, and write them. After an interruption the same call continues.
+
+    A training that diverges, or whose predictions can't be scored, does not keep the others from running
+    (`Outcome.failed`).
+    Raises TrainingError for a training folder of another recipe, or the paper's preset without a GPU; DatasetError for
+    a dataset of another size or fingerprint; BuildError when another process works in the same folder; and what
+    predicting and scoring raise.
+    """
+    folders = settings.folders
+    jobs = planned(settings.tables, folders.preset)
+    check_run_folders(jobs, folders)
+    check_machine(jobs, folders, settings.anyway, settings.command)
+    with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
+        opened = open_dataset(settings.data, jobs, folders, settings.report)
+        outcome = Outcome(opened, jobs)
+        try:
+            _work(settings, outcome)
+        finally:
+            for table in settings.tables:
+                outcome.tables.append(_write_table(table, settings, outcome))
+    return outcome
+
+
+def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
+    """Every job in turn, until the minutes run out."""
+    jobs, folders = outcome.jobs, settings.folders
+    started = perf_counter()
+    training_seconds: list[float] = []
+    for number, job in enumerate(jobs, 1):
+        minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
+        trained = is_trained(folders.training(job.recipe))
+        if minutes_left is not None and minutes_left <= 0:
+            outcome.stopped = job.recipe.name
+            return
+        left = _time_left(training_seconds, jobs[number - 1 :], folders)
+        settings.report(f"[{number}/{len(jobs)}] {job.recipe.name} ({', '.join(job.rows)}){left}")
+        began = perf_counter()
+        try:
+            run = train(
+                job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=minutes_left, show=settings.show
+            )
+            if not run.finished:
+                outcome.stopped = job.recipe.name
+                return
+            _score(job, run, settings, outcome.opened)
+        except (TrainingError, PredictionError, WeightsError) as error:
+            # The other trainings, which take hours, may still succeed.
+            outcome.failed[job.recipe.name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
+            settings.report(f"  failed, its rows stay as they are: {error}")
+        if not trained:
+            training_seconds.append(perf_counter() - began)
+
+
+def _time_left(training_seconds: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
+    """Words on the time that is left, estimated from the mean of the trainings of this call."""
+    untrained = sum(not is_trained(folders.training(job.recipe)) for job in jobs)
+    if not training_seconds or not untrained:
+        return ""
+    minutes = untrained * sum(training_seconds) / len(training_seconds) / 60
+    return f", about {minutes:.0f} min left for {untrained} trainings"
+
+
+def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: DatasetFolder) -> None:
+    """Weights with range heads, rows, and scores on all frames of a training; up-to-date rows are kept with
+    ``only_missing``."""
+    folders, recipe = settings.folders, job.recipe
+    model = load(finished_weights(recipe, run, opened, folders, settings.only_missing))
+    if job.all_frames:
+        _score_all_frames(recipe, model, settings, opened)
+    seconds = round(run.seconds, 1)
+    about: dict[str, Setting] = {
+        "recipe_digest": recipe.digest, "epochs_trained": run.epochs, "training_seconds": seconds,
+    }  # fmt: skip
+    for variant in variants(recipe):
+        path = folders.row(recipe, variant)
+        if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
+            settings.report(f"  {path.stem}: holds, kept")
+            continue
+        with _restored_threads():
+            method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
+            settings.leaderboard.check_row_is_of(path, opened)
+            result = score_method(opened, method, path, folders)
+        settings.leaderboard.write_measured(result, path)
+        settings.report(f"  {path.stem}: object MAE {_mm(result.metrics.object_mae_mm)}, {result.track} track")
+
+
+def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
+    """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
+    path = settings.folders.all_frames(recipe)
+    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+        return
+    scores = score_all_frames(
+        opened,
+        lambda frame: model.predict_representation([frame])[0],
+        opened.sequence.config(recipe.data_config),
+        SCORING[recipe.normalisation],
+        {"recipe": recipe.name, "weights_sha256": model.sha256},
+    )
+    write_all_frames(scores, path)
+    settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} mm"
+
+
+@contextmanager
+def _restored_threads() -> Iterator[None]:
+    """A network's method sets torch's threads for the whole process; restore them for the next training."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
+    path = settings.folders.table(table)
+    text = settings.leaderboard.table_page(table, settings, outcome)
+    try:
+        write_atomically(path, text.encode("utf-8"))
+    except OSError as error:
+        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
+    return path
+
+
+def is_trained(out: Path) -> bool:
+    """Whether a training folder holds a finished training."""
+    return (out / DONE).is_file()
+
+
+def state_of(out: Path) -> str:
+    """``trained``, ``begun`` or ``missing``."""
+    return "trained" if is_trained(out) else "begun" if out.is_dir() and any(out.iterdir()) else "missing"
+
+
+def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
+    """Refuse, before hours of work, a training folder that was made by another recipe. Nothing is ever deleted.
+
+    Raises TrainingError, which names the folder, the settings that differ and the cure.
+    """
+    for job in jobs:
+        path = folders.training(job.recipe) / RECIPE
+        if not path.is_file():
+            continue
+        try:
+            differs = differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
+        if differs:
+            out = shlex.quote(str(path.parent))
+            raise TrainingError(
+                f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
+                f"mv {out} {out}-before, or give another --runs"
+            )
+
+
+def check_machine(jobs: Sequence[Job], folders: Folders, anyway: bool, command: str) -> None:
+    """Refuse the paper's preset without a GPU where something is left to train. TrainingError with the command."""
+    untrained = [job for job in jobs if not is_trained(folders.training(job.recipe))]
+    if folders.preset != PAPER_PRESET or anyway or not untrained or torch.cuda.is_available():
+        return
+    size = untrained[0].recipe.size
+    raise TrainingError(
+        f"preset {PAPER_PRESET} trains networks of full width on {size} x {size} px until the rate has reached its "
+        f"minimum, and PyTorch sees no CUDA GPU here, where that would take weeks; nothing was started, and no row "
+        f"will be estimated. On a machine with a GPU run, as often as its time allows:\n  {command}\n"
+        "or add --anyway to train on this processor all the same"
+    )
+
+
+def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, folders: Folders, keep: bool) -> Path:
+    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them.
+
+    ``keep``: a file that was made from the same weights is used as it is.
+    """
+    target, source = folders.weights(recipe), file_sha256(run.weights)
+    if keep and _made_from(target, source):
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if PREDICTED in variants(recipe):
+        save_with_heads(run.weights, opened.path, target)
+    else:
+        partial = target.with_suffix(".partial")
+        shutil.copyfile(run.weights, partial)
+        partial.replace(target)
+    content = {"made_from_sha256": source, "sha256": file_sha256(target)}
+    write_atomically(target.with_suffix(".json"), (json.dumps(content) + "\n").encode("utf-8"))
+    return target
+
+
+def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
+    """The file that `finished_weights` made from the finished training; None while there is none."""
+    out, target = folders.training(recipe), folders.weights(recipe)
+    if not is_trained(out) or not (out / WEIGHTS).is_file():
+        return None
+    try:
+        of_recipe = _stored(out / RECIPE)["recipe"] == recipe.to_dict()
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return target if of_recipe and _made_from(target, file_sha256(out / WEIGHTS)) else None
+
+
+def _made_from(target: Path, source: str) -> bool:
+    """Whether ``target`` is what its record says was made from weights of this hash."""
+    try:
+        return bool(_stored(target.with_suffix(".json")) == {"made_from_sha256": source, "sha256": file_sha256(target)})
+    except (OSError, ValueError):
+        return False
+
+
+def _stored(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, 64 hex digits."""
+    return sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,267 @@
+"""Stability cases: how they are declared, run and judged.
+
+A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a reliable reference:
+50-digit arithmetic, a closed form, or exact sums. The error is compared with a bound from theory: a condition number
+times the unit round-off, or the propagation of noise and quantisation. The bound comes from the derivation that the
+case states, never from the measured error.
+"""
+
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import partial
+from importlib import import_module
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fpp_ml_bench.errors import StabilityError
+
+Scalar = float | int | str
+Expects = Literal["number", "refusal", "either"]
+Refusals = type[Exception] | tuple[type[Exception], ...]
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
+"""Unit round-offs."""
+
+MODULES = {
+    "phase": "phase_order", "order": "phase_order", "triangulation": "triangulation_rig", "rig": "triangulation_rig",
+    "normalisation": "scores", "metrics": "scores", "networks": "networks", "scenes": "scenes",
+}  # fmt: skip
+"""Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
+
+# A crash of the code under test is a FAIL and does not end the run; numerical code raises these.
+_CRASHES = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+
+
+class Verdict(StrEnum):
+    """WITHIN: the error is within its bound. FLAGGED: correctly refused, by an exception or an invalid mask."""
+
+    WITHIN = "within"
+    FLAGGED = "flagged"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The measurement of a case at its worst element, which has the largest error / bound.
+
+    ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
+    that were refused; ``may_flag``: largest share that theory allows. ``condition``: the condition number behind the
+    bound, if any.
+    """
+
+    error: float | None
+    bound: float = 0.0
+    flagged: float = 0.0
+    may_flag: float = 0.0
+    note: str = ""
+    condition: float | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Error / bound; 0 where both are 0, None where nothing was computed."""
+        if self.error is None:
+            return None
+        if self.error == 0:
+            return 0.0
+        return self.error / self.bound if self.bound > 0 else math.inf
+
+
+def wrong(note: str = "") -> Outcome:
+    """The outcome of a result that no bound allows."""
+    return Outcome(math.inf, 0.0, note=note)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An ill-conditioned or extreme case.
+
+    ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts`` describe in a line each what is
+    computed, its reference, and how the bound is derived. ``expects``: a number, a refusal, or either; ``refuses``: the
+    exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and are left out of a quick run.
+    """
+
+    group: str
+    family: str
+    parameters: Mapping[str, Scalar]
+    computes: str
+    reference: str
+    predicts: str
+    unit: str
+    run: Callable[[], Outcome] = field(repr=False)
+    expects: Expects = "number"
+    refuses: Refusals = ()
+    heavy: bool = False
+
+    @property
+    def name(self) -> str:
+        """``family, parameter value, ...``"""
+        return ", ".join([self.family, *(f"{key} {parameter_text(value)}" for key, value in self.parameters.items())])
+
+
+def parameter_text(value: Scalar) -> str:
+    """A parameter as text: six digits where they are exact, else all digits."""
+    if not isinstance(value, float):
+        return str(value)
+    short = f"{value:.6g}"
+    return short if float(short) == value or value != value else repr(value)
+
+
+class Group:
+    """The cases of a group, in the order in which their families are declared."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.cases: list[Case] = []
+
+    def family(
+        self,
+        name: str,
+        unit: str,
+        /,
+        *,
+        about: str | None = None,
+        expects: Expects | Callable[..., Expects] = "number",
+        refuses: Refusals = (),
+        heavy: Callable[..., bool] = lambda **_: False,
+        **grid: Iterable[Scalar],
+    ) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
+        """Declare a function as a family: a case for each combination of the grid's values, which the function,
+        ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
+        against its reference; bound: how theory predicts it"."""
+
+        def declare(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
+            text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
+            computes, reference, predicts = re.split("; against |; bound: ", text)
+            for values in product(*grid.values()):
+                given = dict(zip(grid, values, strict=True))
+                expected = expects(**given) if callable(expects) else expects
+                case = Case(
+                    self.name, name, given, computes, reference, predicts, unit, partial(run, **given), expected
+                )
+                self.cases.append(replace(case, refuses=refuses, heavy=heavy(**given)))
+            return run
+
+        return declare
+
+
+def all_cases(groups: Iterable[str] = tuple(MODULES), quick: bool = False) -> list[Case]:
+    """The cases of ``groups``, without the heavy ones when ``quick``. Raises `StabilityError`."""
+    cases: list[Case] = []
+    for group in groups:
+        if group not in MODULES:
+            raise StabilityError(f"unknown group {group!r}; there are {', '.join(MODULES)}")
+        cases += getattr(import_module(f"{__package__}.{MODULES[group]}"), group.upper()).cases
+    return [case for case in cases if not (quick and case.heavy)]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case with its outcome and verdict; ``against`` is the reason where it failed.
+
+    ``cpu_seconds``: processor time of all threads, so that a busy machine does not show.
+    """
+
+    case: Case
+    outcome: Outcome
+    verdict: Verdict
+    against: str
+    cpu_seconds: float
+
+
+def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
+    """Run cases in order; ``done`` is called with each row. A crash of the code under test, even a refusal that the
+    case did not name, is a FAIL."""
+    rows = []
+    for case in cases:
+        started = time.process_time()
+        try:
+            with np.errstate(all="ignore"):
+                outcome = case.run()
+            verdict, against = judge(case, outcome)
+        except case.refuses as error:
+            outcome = Outcome(None, flagged=1.0, note=str(error))
+            verdict, against = judge(case, outcome)
+        except _CRASHES as error:
+            outcome = Outcome(None, note=f"{type(error).__name__}: {error}")
+            verdict, against = Verdict.FAIL, f"ended in {outcome.note}"
+        rows.append(Row(case, outcome, verdict, against, time.process_time() - started))
+        done(rows[-1])
+    return rows
+
+
+def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
+    """The verdict on a case, and the reason where it failed."""
+    if outcome.error is None:
+        if case.expects == "number":
+            return Verdict.FAIL, f"refused what can be computed: {outcome.note}"
+        return Verdict.FLAGGED, ""
+    if case.expects == "refusal":
+        return Verdict.FAIL, "gave a number where there is none"
+    if not math.isfinite(outcome.bound):
+        return Verdict.FAIL, "theory predicts no finite error, so the number is meaningless and should be refused"
+    if not outcome.error <= outcome.bound:  # NaN is not
+        return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
+    if outcome.flagged > outcome.may_flag:
+        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {outcome.may_flag:.2%}"
+    return Verdict.WITHIN, ""
+
+
+def worst(
+    errors: ArrayLike,
+    bounds: ArrayLike = 0.0,
+    flagged: ArrayLike = False,
+    may_flag: float = 0.0,
+    condition: float | None = None,
+    note: str = "",
+) -> Outcome:
+    """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
+    parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
+    error, bound, refused = (np.ravel(part) for part in parts)
+    share = float(refused.mean()) if refused.size else 0.0
+    unflagged = np.flatnonzero(~refused)
+    if not unflagged.size:
+        return Outcome(None, 0.0, 1.0, may_flag, note or "every element is masked", condition)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(error[unflagged] == 0, 0.0, error[unflagged] / bound[unflagged])
+    index = unflagged[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
+    return Outcome(float(error[index]), float(bound[index]), share, may_flag, note, condition)
+
+
+def masked(flagged: ArrayLike) -> Outcome:
+    """The outcome of elements that must all be masked."""
+    return worst(np.zeros(np.shape(flagged)), 0.0, flagged)
+
+
+def high_precision() -> Any:
+    """A separate mpmath context of 50 digits, so that the global precision does not change."""
+    import mpmath
+
+    context = mpmath.MPContext()
+    context.dps = 50
+    return context
+
+
+def difference(values: NDArray, exact: Iterable[Any]) -> Floats:
+    """``values`` (n,) minus high-precision numbers, subtracted before it is rounded."""
+    context = high_precision()
+    return np.array([float(context.mpf(float(a)) - b) for a, b in zip(values, exact, strict=True)])
+
+
+def rounded(values: Iterable[Any]) -> Floats:
+    """High-precision numbers rounded once to float64."""
+    return np.array([float(value) for value in values])
+
+
+def gamma(operations: float, unit: float = U64) -> float:
+    """Largest relative error of ``operations`` roundings in a row: n u / (1 - n u)  (Higham, Lemma 3.1)."""
+    return operations * unit / (1 - operations * unit)

@@ -1,0 +1,376 @@
+"""Losses of zero residual, empty mask and any magnitude; networks on constant input and in half precisions; gradients;
+the phase methods on images without an object; the training metric."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from fpp_ml_bench.baselines.method import method
+from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
+from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.networks.base import in_full_precision
+from fpp_ml_bench.baselines.networks.blocks import RECENTRED_FROM, InstanceNorm
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings, TorchCalibrationLayer
+from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
+from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
+from fpp_ml_bench.errors import FppBenchError, PredictionError
+from fpp_ml_bench.evaluation.score import DepthScores
+from fpp_ml_bench.optics import paper_rig
+
+NETWORKS = Group("networks")
+SMALL = {
+    "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
+    "hformer": {"width": 8}, "pix2pix": {"width": 4},
+}  # fmt: skip
+"""Widths of the networks here: small, with the paper's layers."""
+_SHAPE = (2, 1, 24, 32)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread, which is faster for images of 64 px."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def normal(shape: tuple[int, ...], seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Normal random numbers, seeded."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def uniform(shape: tuple[int, ...], seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Uniform random numbers in [0, 1), seeded."""
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def small_network(name: str) -> nn.Module:
+    """A network of `SMALL` width with random weights, seeded."""
+    torch.manual_seed(4)
+    return build(name, **SMALL[name])
+
+
+def _alpha(name: str) -> float | None:
+    return 0.7 if name.startswith("hybrid") else None
+
+
+def _scene(scale: float, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+    """A prediction and its target, 0 in the background."""
+    target = uniform(_SHAPE, 1) + 0.5
+    target[..., :9, :] = 0
+    prediction = target + 0.1 * normal(_SHAPE, 2)
+    return (scale * prediction).to(dtype), (scale * target).to(dtype)
+
+
+def _exact_loss(name: str, prediction: Tensor, target: Tensor) -> float:
+    """The loss by exactly rounded sums in float64."""
+    errors = (prediction.double() - target.double()).flatten().tolist()
+    inside = [error for error, depth in zip(errors, target.flatten().tolist(), strict=True) if depth > 0]
+
+    def part(values: list[float]) -> float:
+        if not values:
+            return 0.0
+        if name.endswith("rmse"):
+            return math.sqrt(math.fsum(value * value for value in values) / len(values) + EPSILON)
+        return math.fsum(map(abs, values)) / len(values)
+
+    alpha = _alpha(name)
+    if alpha is not None:
+        return alpha * part(inside) + (1 - alpha) * part(errors)
+    return part(inside) if name.startswith("masked") else part(errors)
+
+
+def _loss_and_gradient(name: str, prediction: Tensor, target: Tensor) -> tuple[float, Tensor]:
+    prediction = prediction.clone().requires_grad_()
+    loss = loss_function(name, _alpha(name))(prediction, target)
+    (gradient,) = torch.autograd.grad(loss, prediction)
+    return float(loss.detach()), gradient
+
+
+def _summed(value: float, exact: float, count: int) -> Outcome:
+    """A loss of ``count`` numbers: torch sums in vectors and pairs, log2(n) + 16 roundings, doubled by the square."""
+    return worst(value - exact, gamma(2 * (math.log2(count) + 16), U32) * exact)
+
+
+@NETWORKS.family("zero residual", "1", name=LOSSES)
+def zero_residual(name: str) -> Outcome:
+    """loss and gradient of a perfect prediction; against 1e-4 for RMSE, else 0; gradient exactly 0; bound: 4 u32: one
+    root of e = 1e-8"""
+    _, target = _scene(1.0)
+    loss, gradient = _loss_and_gradient(name, target, target)
+    if not torch.isfinite(gradient).all():
+        return wrong("a gradient that is not finite")
+    exact = math.sqrt(EPSILON) if name.endswith("rmse") else 0.0
+    return worst([loss - exact, float(gradient.abs().max())], [4 * U32 * exact, 0.0])
+
+
+@NETWORKS.family("empty mask", "1", name=LOSSES)
+def empty_mask(name: str) -> Outcome:
+    """loss and gradient without object pixels; against exactly rounded sums; 0 where masked; bound: 32 u32: torch's
+    pairwise sums"""
+    prediction, target = _scene(1.0)[0], torch.zeros(_SHAPE)
+    loss, gradient = _loss_and_gradient(name, prediction, target)
+    per_sample = sample_losses(name, _alpha(name), prediction, target)
+    if not (torch.isfinite(gradient).all() and torch.isfinite(per_sample).all()):
+        return wrong("a loss or gradient that is not finite")
+    exact = _exact_loss(name, prediction, target)
+    return worst(loss - exact, gamma(32, U32) * exact)
+
+
+@NETWORKS.family(
+    "loss magnitude", "1", expects=lambda name, scale: "either" if scale > 1e19 else "number",
+    name=("rmse", "hybrid_l1"), scale=(1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25),
+)  # fmt: skip
+def loss_magnitude(name: str, scale: float) -> Outcome:
+    """float32 loss of errors of this size; against exactly rounded sums in float64; bound: 2 (log2 n + 16) u32:
+    pairwise sums; beyond 1e19 the square is infinite, and training stops"""
+    prediction, target = _scene(scale)
+    value = float(loss_function(name, _alpha(name))(prediction, target))
+    if math.isinf(value):
+        return Outcome(None, flagged=1.0, note="an infinite loss, on which training stops")
+    return _summed(value, _exact_loss(name, prediction, target), prediction.numel())
+
+
+@NETWORKS.family(
+    "half-precision loss", "1",
+    expects=lambda name, dtype, scale: "either" if dtype == "float16" and scale > 3e4 else "number",
+    name=("rmse", "hybrid_l1"), dtype=("float16", "bfloat16"), scale=(1.0, 2e3, 3e4, 1e5),
+)  # fmt: skip
+def loss_half(name: str, dtype: str, scale: float) -> Outcome:
+    """loss of half-precision tensors in mm; against exactly rounded sums of the same input; bound: 2 (log2 n + 16) u32:
+    computed in float32; infinite input gives an infinite loss"""
+    prediction, target = _scene(scale, getattr(torch, dtype))
+    value = float(loss_function(name, _alpha(name))(prediction, target))
+    if torch.isfinite(prediction).all():
+        return _summed(value, _exact_loss(name, prediction, target), prediction.numel())
+    if math.isfinite(value):
+        return Outcome(value, 0.0)
+    return Outcome(None, flagged=1.0, note="infinite input gives an infinite loss")
+
+
+@NETWORKS.family(
+    "constant input, instance norm", "1", dtype=("float32", "float64"),
+    value=(0.0, 0.1, 1.0, 255.0, 1e4, 1e8, 1e-30),
+)  # fmt: skip
+def constant_input(value: float, dtype: str) -> Outcome:
+    """output and gradient of a map without variance; against the bias; bound: d / sqrt(d^2 + eps), d = (log2 n + 16) u
+    |value|, or that factor twice: the mean, centred again"""
+    kind = getattr(torch, dtype)
+    layer = InstanceNorm(3, affine=True).to(kind)
+    with torch.no_grad():
+        layer.bias.copy_(torch.tensor([0.5, -1.0, 2.0]))
+    x = torch.full((1, 3, 56, 56), value, dtype=kind, requires_grad=True)
+    out = layer(x)
+    (gradient,) = torch.autograd.grad((out * normal(tuple(out.shape), 3, kind)).sum(), x)
+    if not torch.isfinite(gradient).all():
+        return wrong("a gradient that is not finite")
+    unit = U32 if dtype == "float32" else U64
+    # The mean of n equal numbers has an error of at most (log2 n + 16) u value, which is divided by sqrt(eps).
+    relative = gamma(math.log2(56 * 56) + 16, unit)
+    off = relative * abs(value)
+    if off**2 > layer.eps * RECENTRED_FROM:
+        off = max(relative * off, math.sqrt(layer.eps * RECENTRED_FROM))  # centred twice, or just not
+    error = float((out - layer.bias.view(1, -1, 1, 1)).abs().max().detach())
+    return worst(error, off / math.sqrt(off**2 + layer.eps) + 4 * unit, condition=abs(value))
+
+
+@NETWORKS.family("nearly constant input, instance norm", "1", offset=(0.0, 1.0, 1e2, 1e4, 1e6))
+def nearly_constant(offset: float) -> Outcome:
+    """normalised map of amplitude 1 on this offset, float32; against float64 on the same input; bound: 2 (min(g
+    |offset|, 1e-3 + g^2 |offset|) + g |x| + g), g = (log2 n + 16) u32"""
+    x = (normal((1, 2, 48, 48), 4) + offset).float()  # where one-pass formulas for the variance cancel
+    output = InstanceNorm(2, affine=False)(x).double()
+    centred = x.double() - x.double().mean((2, 3), keepdim=True)
+    exact = centred / (centred.square().mean((2, 3), keepdim=True) + 1e-5).sqrt()
+    relative = gamma(math.log2(48 * 48) + 16, U32)
+    off = min(relative * abs(offset), math.sqrt(RECENTRED_FROM) + relative**2 * abs(offset))
+    bound = 2 * (off + relative * exact.abs()) + 2 * relative
+    return worst((output - exact).numpy(), bound.numpy(), condition=abs(offset))
+
+
+@NETWORKS.family("instance norm gradient", "1")
+def instance_norm_gradient() -> Outcome:
+    """closed-form gradient in float64; against torch's own instance norm in float64; bound: 12 u sum |seed|"""
+    layers = InstanceNorm(3, affine=True).double(), nn.InstanceNorm2d(3, affine=True).double()
+    x, seed = normal((2, 3, 12, 10), 6), normal((2, 3, 12, 10), 7)
+    gradients = []
+    for layer in layers:
+        with torch.no_grad():
+            for parameter in layer.parameters():
+                parameter.copy_(normal((3,), 5))
+        inner = x.clone().requires_grad_()
+        gradients.append(torch.autograd.grad((layer(inner) * seed).sum(), [inner, *layer.parameters()]))
+    errors = [float((a - b).abs().max()) for a, b in zip(*gradients, strict=True)]
+    return worst(errors, gamma(12) * np.float32(seed.abs().sum()))
+
+
+def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-3) -> Outcome:
+    """Autograd's derivative along a random direction against Richardson's extrapolated difference quotient."""
+    seed = normal(tuple(x.shape), 8, x.dtype)
+    seed = seed / seed.norm()
+    inner = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(inner), inner)
+    slope = float((gradient * seed).sum())
+    with torch.no_grad():
+        at_step, at_double, at_quadruple = (
+            float(function(x + h * seed) - function(x - h * seed)) / (2 * h) for h in (step, 2 * step, 4 * step)
+        )
+        value = abs(float(function(x)))
+    first, second = (4 * at_step - at_double) / 3, (4 * at_double - at_quadruple) / 3
+    rounding = 64 * U64 * max(value, 1e-300) * math.sqrt(x.numel()) / step
+    return worst(slope - first, abs(first - second) + abs(at_step - at_double) * 1e-3 + rounding)
+
+
+@NETWORKS.family("loss gradient", "1", name=LOSSES)
+def loss_gradient(name: str) -> Outcome:
+    """directional derivative in float64; against Richardson's extrapolated differences; bound: difference of two
+    extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding"""
+    prediction, target = _scene(1.0, torch.float64)
+    prediction = target + torch.sign(prediction - target) * (0.05 + (prediction - target).abs())  # away from |.|'s kink
+    loss = loss_function(name, _alpha(name))
+    return directional(lambda x: loss(x, target), prediction)
+
+
+@NETWORKS.family("calibration layer gradient", "mm/rad", direction=("horizontal", "vertical"))
+def layer_gradient(direction: str) -> Outcome:
+    """directional derivative of depth by phase; against Richardson's extrapolated differences; bound: difference of two
+    extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding"""
+    rig = paper_rig(16)
+    layer = TorchCalibrationLayer(rig, direction, torch.float64)  # type: ignore[arg-type]
+    total = torch.from_numpy(CalibrationLayer.of(rig, direction).absolute_phase(1800.0))  # type: ignore[arg-type]
+    order = torch.floor(total / (2 * math.pi) + 0.5)
+    return directional(lambda phase: layer(phase, order).sum(), total - 2 * math.pi * order)
+
+
+@NETWORKS.family("network gradient", "1", name=NAMES)
+@one_thread()
+def network_gradient(name: str) -> Outcome:
+    """directional derivative of the whole network, float64; against Richardson's extrapolated differences; bound:
+    difference of two extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding"""
+    network = small_network(name).double().eval()
+    seed = normal((1, 1, 64, 64), 10)
+    return directional(lambda image: (network(image) * seed).sum(), uniform((1, 1, 64, 64), 9), step=1e-7)
+
+
+@NETWORKS.family("network in float32", "1", name=NAMES)
+@one_thread()
+def network_single(name: str) -> Outcome:
+    """output in float32; against the same weights in float64; bound: 16 x what rounding each weight and pixel once
+    (2^-24) does: condition number x unit round-off"""
+    network = small_network(name).double().eval()
+    x = uniform((1, 1, 64, 64), 11)
+    with torch.no_grad():
+        exact = network(x)
+        spread = torch.zeros_like(exact)
+        weights = [parameter.clone() for parameter in network.parameters()]
+        for trial in range(3):
+            generator = torch.Generator().manual_seed(20 + trial)
+            inexact = []
+            for values in (*weights, x):
+                noise = torch.rand(values.shape, generator=generator, dtype=torch.float64) * 2 - 1
+                inexact.append(values * (1 + U32 * noise))
+            for parameter, weight in zip(network.parameters(), inexact[:-1], strict=True):
+                parameter.copy_(weight)
+            spread = torch.maximum(spread, (network(inexact[-1]) - exact).abs())
+        for parameter, weight in zip(network.parameters(), weights, strict=True):
+            parameter.copy_(weight)
+        single = network.float()(x.float()).double()
+    scale = float(spread.max())
+    # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and includes the weights' rounding.
+    return worst(float((single - exact).abs().max()), 16 * scale, condition=scale / U32 / float(exact.abs().max()))
+
+
+@NETWORKS.family("network on a constant image", "count", name=NAMES, value=(0.0, 0.5, 1.0))
+@one_thread()
+def network_constant(name: str, value: float) -> Outcome:
+    """numbers that are not finite in output and gradients, training mode; against none; bound: exact"""
+    network = small_network(name).train()
+    out = network(torch.full((2, 1, 64, 64), value))
+    loss_function("hybrid_l1", 0.7)(out, torch.zeros_like(out)).backward()
+    tensors = [out.detach(), *(p.grad for p in network.parameters() if p.grad is not None)]
+    return worst(float(sum(int((~torch.isfinite(tensor)).sum()) for tensor in tensors)))
+
+
+@NETWORKS.family("network in half precision", "mm", name=NAMES, dtype=("bfloat16", "float16"))
+@one_thread()
+def network_half(name: str, dtype: str) -> Outcome:
+    """depth of the last layer under autocast, 1800 mm; against float64 on the same features; bound: 10 u32 x 1810 mm:
+    the last layer runs in float32; bfloat16 alone would be 4 mm off"""
+    network = small_network(name).eval()
+    head = nn.Conv2d(8, 1, 1)
+    features = uniform((1, 8, 16, 16), 12, torch.float32).to(getattr(torch, dtype))
+    with torch.no_grad():
+        head.bias.fill_(1800.0)  # type: ignore[union-attr]
+        with torch.autocast("cpu", dtype=getattr(torch, dtype)):
+            out = network(uniform((1, 1, 64, 64), 13, torch.float32))
+            depth = in_full_precision(head, features)
+        exact = head.double()(features.double())
+    if out.dtype != torch.float32 or not bool(torch.isfinite(out).all()):
+        return wrong(f"the network gives {out.dtype}, or numbers that are not finite")
+    return worst((depth.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
+
+
+@NETWORKS.family(
+    "phase route", "mm", expects="either", refuses=FppBenchError, name=("phase", "phase-net"),
+    image=("black", "white", "constant", "noise", "checkerboard"),
+)  # fmt: skip
+@one_thread()
+def phase_output(name: str, image: str) -> Outcome:
+    """depth of an image without an object; against a depth in the working range and its slack of 15 mm, or a reason why
+    it is invalid; bound: exact: no other depth may count as measured"""
+    rig = paper_rig(480)
+    shape = (rig.camera.width, rig.camera.width)
+    levels = {"black": 0, "white": 255, "constant": 128}
+    if image == "noise":
+        grey = np.random.default_rng(1).uniform(0, 256, shape)
+    elif image == "checkerboard":
+        grey = 255.0 * (np.indices(shape).sum(axis=0) % 2)
+    else:
+        grey = np.full(shape, levels[image])
+    phase_method = method(name, rig)
+    frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
+    frames[phase_method.frames_used[0]] = grey.astype(np.uint8)
+    measurement = phase_method.measure(frames)  # type: ignore[attr-defined]
+    near, far = rig.working_range_mm
+    slack, depth = Settings().slack_mm * (1 + U32), measurement.depth_mm
+    legal = np.isfinite(depth) & ((depth == 0) | ((depth >= near - slack) & (depth <= far + slack)))
+    return worst(np.where(legal, 0.0, np.inf), 0.0, measurement.reason != Reason.MEASURED, 1.0)
+
+
+@NETWORKS.family("training metric", "relative", refuses=PredictionError, scale=(1.0, 1e-30, 1e30, 1e-160, 1e-300))
+def metric_scale(scale: float) -> Outcome:
+    """mean RMSE of 50 samples as a torchmetrics metric; against exactly rounded sums; bound: gamma of 460 roundings"""
+    metric = DepthScores()
+    target = torch.zeros((1, 20, 20), dtype=torch.float64)
+    target[:, 5:15, 5:15] = 4096 * scale
+    errors = scale * torch.randint(1, 999, (50, 20, 20), generator=torch.Generator().manual_seed(14)).double()
+    for error in errors:
+        metric.update(target + error[None], target)
+    roots = [
+        scale * math.sqrt(math.fsum((value / scale) ** 2 for value in sample.flatten().tolist()) / sample.numel())
+        for sample in (target + errors) - target
+    ]
+    exact_mm = math.fsum(roots) / len(roots)
+    error = float(metric.compute()["overall_rmse_mm"]) / exact_mm - 1
+    return worst(error, gamma(460) + 2 * 2.0**-1074 / max(exact_mm, 2.0**-1074))
+
+
+@NETWORKS.family(
+    "training metric, not a number", "mm", expects="refusal", refuses=PredictionError,
+    value=(float("nan"), float("inf"), 1e200),
+)  # fmt: skip
+def metric_refuses(value: float) -> Outcome:
+    """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
+    target = torch.full((1, 8, 8), 1800.0, dtype=torch.float64)
+    prediction = target.clone()
+    prediction[0, 1, 2] = value
+    DepthScores().update(prediction, target)
+    return Outcome(0.0)

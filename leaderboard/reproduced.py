@@ -1,0 +1,394 @@
+"""The paper's tables as reproduced: rows that were measured here, written and read as rows of the leaderboard and shown
+beside the numbers reported by the paper, and which of its orderings hold.
+
+An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
+where it has the opposite sign and leaves 0 out, and is *within noise* otherwise. The interval is that of
+`fpp-eval compare`: differences sample by sample, resampled over objects.
+"""
+
+import statistics
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from fpp_ml_bench.baselines import reproduce
+from fpp_ml_bench.baselines.reproduce import MAIN_KEY, MEAN, PREDICTED, Folders, Job, Variant
+from fpp_ml_bench.baselines.training import Recipe, table_rows
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION
+from fpp_ml_bench.evaluation.report import percent
+from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.leaderboard.columns import device
+from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
+from fpp_ml_bench.leaderboard.paper import paper_tables
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, PROVENANCES, Entry, read_entry, write_row
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+MEASURED_HERE = PROVENANCES[0]
+_NOT_IN_THE_PAPER = {"hformer": "Hformer"}
+_TRACKS_DIFFER = "*"
+
+
+def write_measured(result: Result, path: Path) -> None:
+    """Write a row that was measured here. Raises SubmissionError."""
+    write_row(Entry(path, result), MEASURED_HERE, path)
+
+
+def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> Entry | None:
+    """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
+    entry = _sound_row(path)
+    if entry is None:
+        return None
+    result = entry.result
+    same = (
+        result.dataset.fingerprint == opened.fingerprint
+        and result.submission.settings.get("weights_sha256") == weights_sha256
+        and result.protocol_version == PROTOCOL_VERSION
+    )
+    return entry if same else None
+
+
+def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
+    """Raises SubmissionError where ``path`` is a row on other data."""
+    entry = _sound_row(path)  # an unreadable one is replaced, nothing is lost
+    if entry is not None and entry.result.dataset.fingerprint != opened.fingerprint:
+        raise SubmissionError(
+            f"{path}: is a row on dataset {entry.result.dataset.fingerprint[:8]}, and {opened.path} is "
+            f"{opened.fingerprint[:8]}; give another --rows, or move the row away if it is out of date"
+        )
+
+
+def _sound_row(path: Path) -> Entry | None:
+    try:
+        return read_entry(path) if path.is_file() else None
+    except SubmissionError:
+        return None
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The six errors in mm by the keys of `HEADLINE`, the 95% interval of the object MAE, and each sample's own:
+    sample to (object, object MAE in mm)."""
+
+    errors_mm: dict[str, float | None]
+    interval_mm: tuple[float, float] | None
+    samples: dict[str, tuple[str, float | None]]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a table. ``scored`` and ``entry`` are None where nothing has been measured; ``twins`` maps a twin's
+    suffix to its row. ``paper_mm`` are the paper's errors by the keys of `HEADLINE`, None where it reports none."""
+
+    row: str
+    label: str
+    recipe: Recipe
+    scored: Scored | None
+    entry: Entry | None
+    paper_mm: dict[str, float] | None
+    twins: dict[str, Entry] = field(default_factory=dict)
+
+
+def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
+    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty.
+
+    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
+    the leaderboard: the first frame only, without a number of the paper.
+    """
+    reported = {row.row: row for row in paper_tables()[table].rows}
+    recipes = {name: job.recipe for job in jobs for name in job.rows}
+    lines = []
+    for row in table_rows(table):
+        recipe = recipes[f"{table}/{row}"]
+        label, paper_mm = (
+            (reported[row].label, reported[row].errors_mm)
+            if row in reported
+            else (_NOT_IN_THE_PAPER.get(row, row), None)
+        )
+        weights = reproduce.current_weights(recipe, folders)
+        if weights is None:
+            lines.append(Line(row, label, recipe, None, None, paper_mm))
+            continue
+        sha256 = reproduce.file_sha256(weights)
+        main, *twin_variants = reproduce.variants(recipe)
+        entry = row_that_holds(folders.row(recipe, main), opened, sha256)
+        twins = {
+            twin.suffix: found
+            for twin in twin_variants
+            if (found := row_that_holds(folders.row(recipe, twin), opened, sha256)) is not None
+        }
+        first = None if entry is None else scored_result(entry.result)
+        if table != "multi_frame" or len(opened.sequence.config(recipe.data_config)) == 1:
+            lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
+            continue
+        all_frames = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+        every = None if all_frames is None else scored_frames(all_frames)
+        lines.append(Line(row, label, recipe, every, entry, paper_mm))
+        lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
+    return lines
+
+
+def scored_result(result: Result) -> Scored:
+    """Scores of a row's result."""
+    samples = {row.sample: (row.object, row.object_mae_mm) for row in result.per_sample}
+    return Scored(_headline(result.metrics), result.intervals.of(MAIN_KEY), samples)
+
+
+def scored_frames(scores: reproduce.AllFrames) -> Scored:
+    """Scores over all frames."""
+    samples = {row.sample: (row.object, row.metrics.object_mae_mm) for row in scores.per_sample}
+    return Scored(_headline(scores.metrics), scores.intervals.of(MAIN_KEY), samples)
+
+
+def _headline(metrics: object) -> dict[str, float | None]:
+    return {key: getattr(metrics, key) for key in HEADLINE}
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``.
+
+    ``gap_mm`` is worse minus better here, the mean over samples, ``interval_mm`` its 95% interval (None with fewer than
+    two objects). ``same_track`` is False where the two rows were told different things about the test samples.
+    """
+
+    better: str
+    worse: str
+    paper_gap_mm: float
+    gap_mm: float
+    interval_mm: tuple[float, float] | None
+    same_track: bool
+
+    @property
+    def verdict(self) -> Literal["holds", "within noise", "reversed"]:
+        if self.interval_mm is None or self.interval_mm[0] <= 0 <= self.interval_mm[1]:
+            return "within noise"
+        return "holds" if self.interval_mm[0] > 0 else "reversed"
+
+
+def orderings(lines: Sequence[Line]) -> list[Ordering]:
+    """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
+    compared = [
+        (line.paper_mm[MAIN_KEY], line.scored.samples, line)
+        for line in lines
+        if line.scored is not None and line.paper_mm is not None
+    ]
+    judged = []
+    for (better_mm, best, better), (worse_mm, worst, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
+        pairs = [(sample, best[sample][1], worst[sample][1]) for sample in best if sample in worst]
+        differences = {sample: b - a for sample, a, b in pairs if a is not None and b is not None}
+        if worse_mm == better_mm or not differences:
+            continue
+        gaps, objects = list(differences.values()), [best[sample][0] for sample in differences]
+        tracks = {line.entry.result.track for line in (better, worse) if line.entry is not None}
+        gap, interval = statistics.fmean(gaps), object_interval(gaps, objects)
+        judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, gap, interval, len(tracks) == 1))
+    return judged
+
+
+@dataclass(frozen=True)
+class Column:
+    """``text`` makes the cell of a line; ``short`` is the title in a terminal, None where the column is left out."""
+
+    title: str
+    short: str | None
+    text: Callable[[Line], str]
+    right: bool = True
+
+
+def columns(preset: str) -> tuple[Column, ...]:
+    """The table's columns."""
+    measured, paper = f"{MEASURED_HERE}, {preset} preset", BY_THE_PAPER
+    twin = f"object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
+    return (
+        Column("Row", "Row", lambda line: line.label, right=False),
+        Column("Track", None, lambda line: "-" if line.entry is None else line.entry.result.track, right=False),
+        Column(f"Object MAE / RMSE, {measured}", "Object, here", lambda line: _here(line, "object")),
+        Column(f"95% interval of the object MAE, {MEASURED_HERE}", "95% of MAE", _interval),
+        Column(f"Object MAE / RMSE, {paper}", "Object, paper", lambda line: _pair(line.paper_mm, "object")),
+        Column(f"Overall MAE / RMSE, {measured}", "Overall, here", lambda line: _here(line, "overall")),
+        Column(f"Overall MAE / RMSE, {paper}", "Overall, paper", lambda line: _pair(line.paper_mm, "overall")),
+        Column(f"Background MAE / RMSE, {measured}", None, lambda line: _here(line, "background")),
+        Column(f"Background MAE / RMSE, {paper}", None, lambda line: _pair(line.paper_mm, "background")),
+        Column(f"Range predicted: {twin}", "Range predicted", lambda line: _twin(line, PREDICTED)),
+        Column(f"Range of the training mean: {twin}", None, lambda line: _twin(line, MEAN)),
+        Column("Parameters", None, _parameters),
+        Column("Epochs", "Epochs", lambda line: _setting(line, "epochs_trained")),
+        Column("Training, s", "s", lambda line: _setting(line, "training_seconds")),
+        Column("Latency, ms", "ms", _latency),
+    )
+
+
+def table_page(table: str, settings: reproduce.ReproduceSettings, outcome: reproduce.Outcome) -> str:
+    """The page of a table as Markdown, from the rows that there are."""
+    lines = table_lines(table, outcome.jobs, settings.folders, outcome.opened)
+    return table_markdown(table, lines, settings.folders.preset, settings.command, outcome.failed)
+
+
+def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
+    """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name to its error."""
+    shown = columns(preset)
+    rows = [[markdown_text(column.text(line)) for column in shown] for line in lines]
+    parts = [
+        f"# {markdown_text(paper_tables()[table].title)}",
+        "",
+        f"Made by `{command}`. Errors in mm, mean over samples.",
+        *_about(lines),
+        "",
+        *markdown_rows([column.title for column in shown], [column.right for column in shown], rows),
+        "",
+        *_missing(lines, command, failed),
+        *_twins_explained(lines),
+        *_orderings(orderings(lines)),
+    ]
+    return "\n".join(parts).rstrip("\n") + "\n"
+
+
+def table_rich(table: str, lines: Sequence[Line], preset: str) -> "Table":
+    """The table for a terminal, with the columns that fit."""
+    from rich.table import Table
+    from rich.text import Text
+
+    terminal_columns = [column for column in columns(preset) if column.short is not None]
+    rich_table = Table(
+        title=Text(
+            f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset; "
+            f"paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
+        ),
+        title_justify="left",
+    )
+    for column in terminal_columns:
+        rich_table.add_column(Text(column.short or ""), justify="right" if column.right else "left", overflow="fold")
+    for line in lines:
+        rich_table.add_row(*(Text(column.text(line)) for column in terminal_columns))
+    return rich_table
+
+
+def orderings_sentence(judged: Sequence[Ordering]) -> str:
+    """How many of the paper's orderings hold, in a sentence."""
+    if not judged:
+        return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
+    count = Counter(ordering.verdict for ordering in judged)
+    return (
+        f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here: {count['holds']} "
+        f"hold, {count['within noise']} within noise (the 95% interval of the paired difference holds 0), "
+        f"{count['reversed']} reversed."
+    )
+
+
+def _about(lines: Sequence[Line]) -> list[str]:
+    entry = next((line.entry for line in lines if line.entry is not None), None)
+    if entry is None:
+        return []
+    data = entry.result.dataset
+    height, width = data.size
+    objects = len({row.object for row in entry.result.per_sample})
+    return [
+        "",
+        f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} ({data.fingerprint[:8]}), "
+        f"{data.samples} samples of {objects} objects, {width} x {height} px, against decoded depth; times on "
+        f"{markdown_text(device(entry))}. {BY_THE_PAPER.capitalize()}: its own data at 960 x 960 px, its authors' "
+        "code; the two are shown beside each other, not ranked together. Rows of the oracle range track were given the "
+        "test samples' depth range, here as in the paper, and score the background in units of that range.",
+    ]
+
+
+def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
+    empty = list(dict.fromkeys(line.row for line in lines if line.scored is None))
+    if not empty:
+        return []
+    reasons = [
+        f"- {markdown_text(line.label)}: {markdown_text(failed[line.recipe.name])}"
+        for line in lines
+        if line.scored is None and line.recipe.name in failed
+    ]
+    return [f"Not measured here: {markdown_text(', '.join(empty))}. To fill: `{command}`", *reasons, ""]
+
+
+def _twins_explained(lines: Sequence[Line]) -> list[str]:
+    parts = []
+    if any(line.twins for line in lines):
+        parts += [
+            "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought "
+            "to mm with a range predicted by a small head from the image, or with the mean range of the training "
+            "samples. The difference between their object MAE and the row's own is what the oracle gave: the range, "
+            "and also the mask, because a twin must find the object itself, and an object pixel that it misses costs "
+            "its whole depth.",
+            "",
+        ]
+    if any(line.recipe.background_removed for line in lines):
+        parts += ["With the background removed the input shows the test sample's object mask; no twins there.", ""]
+    return parts
+
+
+def _orderings(judged: Sequence[Ordering]) -> list[str]:
+    parts = ["## The paper's orderings", "", orderings_sentence(judged), ""]
+    if not judged:
+        return parts
+    rows = []
+    for ordering in judged:
+        worse = markdown_text(ordering.worse) + ("" if ordering.same_track else f" \\{_TRACKS_DIFFER}")
+        gaps = f"{ordering.paper_gap_mm:+.2f}", f"{ordering.gap_mm:+.2f}"
+        interval = "-" if ordering.interval_mm is None else " to ".join(f"{end:+.2f}" for end in ordering.interval_mm)
+        rows.append([markdown_text(ordering.better), worse, *gaps, interval, ordering.verdict])
+    titles = (
+        "Better in the paper", "Worse in the paper", f"Worse minus better, mm, {BY_THE_PAPER}",
+        f"Worse minus better, mm, {MEASURED_HERE}", "95% interval", "Here",
+    )  # fmt: skip
+    parts += [*markdown_rows(titles, (False, False, True, True, True, False), rows), ""]
+    parts += ["Differences sample by sample; intervals by bootstrap over objects."]
+    if not all(ordering.same_track for ordering in judged):
+        told = "one of the two was given the test sample's range, which is part of the difference."
+        parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {told}"]
+    return parts
+
+
+def _mm(value: float | None) -> str:
+    """Millimetres with the paper's two decimals."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _here(line: Line, pixels: str) -> str:
+    return _pair(None if line.scored is None else line.scored.errors_mm, pixels)
+
+
+def _pair(errors_mm: Mapping[str, float | None] | None, pixels: str) -> str:
+    """MAE and RMSE."""
+    return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
+
+
+def _interval(line: Line) -> str:
+    if line.scored is None or line.scored.interval_mm is None:
+        return "-"
+    return " - ".join(map(_mm, line.scored.interval_mm))
+
+
+def _twin(line: Line, variant: Variant) -> str:
+    """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
+    entry = line.twins.get(variant.suffix)
+    if entry is None:
+        return "-"
+    errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
+    return " / ".join([*errors, percent(entry.value("object_missing_share"))])
+
+
+def _setting(line: Line, key: str) -> str:
+    value = None if line.entry is None else line.entry.result.submission.settings.get(key)
+    return f"{value:,.0f}" if isinstance(value, int | float) else "-"
+
+
+def _parameters(line: Line) -> str:
+    timing = None if line.entry is None else line.entry.result.timing
+    return "-" if timing is None else f"{timing.parameters:,}"
+
+
+def _latency(line: Line) -> str:
+    latency = None if line.entry is None else line.entry.latency_ms
+    return "-" if latency is None else f"{latency:.3g}"
