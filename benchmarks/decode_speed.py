@@ -35,8 +35,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import SWITCH, numba_enabled
 from fpp_ml_bench.decoding import decode_stack, depth_from_both, depth_from_coordinate
+from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
 
 ALBEDO, AMBIENT, NOISE = 0.45, 4.0, 1.0
@@ -97,8 +97,8 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
     rows = []
     variants = [("numba", 1), ("numba", os.cpu_count() or 1)] if numba_enabled() else []
     for kind, threads in [*variants, ("NumPy", 1)]:
-        previous = os.environ.get(SWITCH)
-        os.environ[SWITCH] = "1" if kind == "numba" else "0"
+        previous = os.environ.get(NUMBA_SWITCH)
+        os.environ[NUMBA_SWITCH] = "1" if kind == "numba" else "0"
         for direction in ("both", "vertical"):
 
             def call(direction: Any = direction, threads: int = threads) -> Any:
@@ -110,9 +110,9 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
             name = f"ours, {kind}, {direction}"
             error = depth - scene.depth_mm
             rows.append(Row(name, "depth", len(decoded.frames_used), threads, seconds, exact - scene.u, error))
-        os.environ.pop(SWITCH)
+        os.environ.pop(NUMBA_SWITCH)
         if previous is not None:
-            os.environ[SWITCH] = previous
+            os.environ[NUMBA_SWITCH] = previous
     return rows
 
 

@@ -1,4 +1,4 @@
-"""The three pixel sets on which every score is reported, and the depth edges that split the object set.
+"""The pixel sets on which scores are reported, the depth edges that split the object set, and normalised depth.
 
 Ground-truth statistics, training masks and the evaluator share the rule (paper Section 5.3.2): a pixel belongs to the
 object where the target depth is above 0 mm, else to the background.
@@ -17,16 +17,14 @@ from fpp_ml_bench.skipping import skipping_enabled
 DEPTH_EDGE_JUMP_MM = 10.0
 """A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
 At 1.8 m a pixel covers 0.79 mm, so 10 mm per pixel is a surface tilted by 85 degrees from the image plane."""
+Normalisation = Literal["raw", "global", "individual"]
+NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
+_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Pixels of the object: target depth above 0. ``depth_mm`` (H, W) in mm, 0 = background; bool (H, W)."""
     return depth_mm > 0
-
-
-def background_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels of the background: all pixels outside the object, so that the two sets always make up the image."""
-    return ~object_mask(depth_mm)
 
 
 def edge_jump_mm(size_px: int) -> float:
@@ -43,13 +41,11 @@ def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) ->
     jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
     inside = object_mask(depth_mm)
     edge = np.zeros(depth_mm.shape, dtype=bool)
-    for axis in (0, 1):
-        before = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
-        after = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
-        step = np.abs(depth_mm[after] - depth_mm[before]) > jump
-        step = (step & inside[before] & inside[after]) | (inside[before] != inside[after])
-        edge[before] |= step
-        edge[after] |= step
+    for depth, within, marked in ((depth_mm, inside, edge), (depth_mm.T, inside.T, edge.T)):
+        step = np.abs(depth[1:] - depth[:-1]) > jump
+        step = (step & within[:-1] & within[1:]) | (within[:-1] != within[1:])
+        marked[:-1] |= step
+        marked[1:] |= step
     return edge
 
 
@@ -87,9 +83,9 @@ def object_near_edges(
     if not rows.size:
         return near_edge
     # Every edge touches the object, so the object's box and one pixel around it hold all of them.
-    box = (slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(columns[0] - 1, 0), columns[-1] + 2))
+    box = np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
     if not skipping_enabled():
-        box = (slice(None), slice(None))
+        box = np.s_[:, :]
     edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
     for band, band_px in zip(near_edge, bands_px, strict=True):
         if band_px > 0:
@@ -113,12 +109,6 @@ def _dilate(edge: NDArray[np.bool_], band_px: int, band: NDArray[np.bool_]) -> N
         if dy <= reach:
             band[: height - dy] |= run[dy:]
             band[dy:] |= run[: height - dy]
-
-
-Normalisation = Literal["raw", "global", "individual"]
-NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
-
-_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def _check(name: str) -> None:
@@ -145,9 +135,10 @@ def normalise(
         np.divide(depth_mm, np.float32(MM_PER_M), out=result, casting="same_kind")
     else:
         span = _span(depth_min_mm, depth_max_mm)
+        single = abs(depth_min_mm) <= _LARGEST and float(np.float32(depth_min_mm)) == float(depth_min_mm)
         if span == 0:
             result[...] = 0
-        elif depth_mm.dtype.itemsize <= 4 and _is_single(depth_min_mm) and _SMALLEST <= span <= _LARGEST:
+        elif single and depth_mm.dtype.itemsize <= 4 and _SMALLEST <= span <= _LARGEST:
             np.subtract(depth_mm, np.float32(depth_min_mm), out=result, casting="same_kind")
             result /= np.float32(span)
             result *= object_mask(depth_mm)
@@ -170,11 +161,6 @@ def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth
     if name == "global":
         return depth * MM_PER_M
     return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
-
-
-def _is_single(value: float) -> bool:
-    """Whether float32 holds ``value`` exactly."""
-    return abs(value) <= _LARGEST and float(np.float32(value)) == float(value)
 
 
 def _span(depth_min_mm: float, depth_max_mm: float) -> float:

@@ -1,5 +1,12 @@
-"""Describes the machine on which times are measured. Imports neither NumPy nor torch."""
+"""This machine and this process: its hardware, threads and memory, and whether numba compiles the kernels.
 
+Imports neither NumPy nor torch. Compiled kernels live in modules of their own that are imported only when
+`numba_enabled` says so, each beside a NumPy function that gives the same numbers; ray casting has no such function and
+is always compiled. The environment variable ``FPP_BENCH_NUMBA=0`` selects NumPy; so does a machine on which numba can't
+be imported.
+"""
+
+import ctypes
 import gc
 import os
 import platform
@@ -7,10 +14,18 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar
 
-_GIB = 1024.0**3
+Function = TypeVar("Function", bound=Callable[..., object])
+
+NUMBA_SWITCH = "FPP_BENCH_NUMBA"
+THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Parameters of mallopt(3)."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +50,7 @@ def describe_hardware() -> Hardware:
     return Hardware(
         cpu=_cpu_model(),
         cores=usable_cores(),
-        memory_gib=round(_usable_memory_bytes() / _GIB, 1),
+        memory_gib=round(_usable_memory_bytes() / 1024.0**3, 1),
         gpu=_gpu_names(),
         platform=f"{platform.system()} {platform.release()} {platform.machine()}",
     )
@@ -92,41 +107,61 @@ def _gpu_names() -> str | None:
     )
 
 
-THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
-
 def limit_threads(threads: int) -> None:
     """Limit linear algebra to ``threads``; works only before NumPy is loaded."""
     os.environ.update(dict.fromkeys(THREAD_COUNTS, str(max(threads, 1))))
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Parameters of mallopt(3)."""
-_KEPT_BYTES = 1 << 30
+def keep_freed_memory() -> None:
+    """Have glibc keep what is freed, up to 2 GiB, instead of returning each large array to the system.
 
-
-def keep_freed_memory(kept_bytes: int = _KEPT_BYTES) -> None:
-    """Have glibc's allocator keep up to ``kept_bytes`` of freed memory. Linux only.
-
-    By default it returns every freed array of an image's size to the system and requests new memory for the next one;
-    the page faults take longer than the arithmetic, and 10-20% of a small network's training step.
+    Every image and every training step asks for the same sizes again, and the page faults of new memory take longer
+    than the arithmetic. Linux only.
     """
-    if not sys.platform.startswith("linux"):
-        return
-    import ctypes
-
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
-        mallopt(_TRIM_THRESHOLD, kept_bytes)
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if set_option is not None:
+        set_option(_MMAP_THRESHOLD, 1 << 30)
+        set_option(_TRIM_THRESHOLD, (1 << 31) - 1)
 
 
 def prepare_process() -> None:
     """Keep freed memory, look for no pydantic plugins, and collect no cyclic garbage.
 
-    - pydantic searches the metadata of every installed package for plugins, and this package uses none.
-    - The garbage collector visits every imported object again and again; scoring leaves no reference cycles.
+    pydantic searches the metadata of every installed package for plugins, and this package uses none. The garbage
+    collector visits every imported object again and again; scoring leaves no reference cycles.
     """
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.disable()
     keep_freed_memory()
+
+
+@cache
+def _numba() -> Any:
+    """The numba package, or None."""
+    try:
+        import numba
+    except ImportError:  # numba also raises it for a NumPy version that it does not support
+        return None
+    return numba
+
+
+def numba_enabled() -> bool:
+    """Whether compiled kernels are to be used; reads ``FPP_BENCH_NUMBA`` on every call."""
+    return os.environ.get(NUMBA_SWITCH, "1") != "0" and _numba() is not None
+
+
+def njit(function: Function) -> Function:
+    """Compile ``function`` to run without the GIL; the machine code is kept on disk for the next process.
+
+    No ``fastmath``, and no multiplication is fused with an addition: the order of every sum stays as written, so the
+    same input gives the same bytes on every processor and for any number of threads. Without numba the function is
+    returned as it is (correct and very slow).
+    """
+    if _numba() is None:
+        return function
+    compiled: Any
+    try:
+        compiled = _numba().njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:  # neither the package folder nor the user's cache folder can be written
+        compiled = _numba().njit(nogil=True, error_model="numpy")(function)
+    return compiled

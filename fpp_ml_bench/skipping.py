@@ -28,9 +28,8 @@ def skipping(enabled: bool) -> Iterator[None]:
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop(SWITCH, None)
-        else:
+        os.environ.pop(SWITCH, None)
+        if before is not None:
             os.environ[SWITCH] = before
 
 
@@ -69,14 +68,12 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        lines = [{**asdict(line), "share": round(line.share, 6)} for line in self.lines]
-        seconds_saved = [line.seconds_saved for line in self.lines if line.seconds_saved is not None]
         return {
             "command": self.command,
             "subject": self.subject,
             "skipping": self.skipping,
-            "left_out": lines,
-            "seconds_saved": sum(seconds_saved),
+            "left_out": [{**asdict(line), "share": round(line.share, 6)} for line in self.lines],
+            "seconds_saved": sum(line.seconds_saved for line in self.lines if line.seconds_saved is not None),
             "bytes_saved": sum(line.bytes_saved or 0 for line in self.lines),
         }
 
@@ -86,27 +83,15 @@ def explained(command: str, subject: str, lines: list[LeftOut]) -> Explanation:
     return Explanation(command, subject, tuple(line for line in lines if line.left_out), skipping_enabled())
 
 
-def seconds_on_and_off(work: Callable[[], object]) -> tuple[float, float]:
-    """Processor seconds of ``work`` with skipping on and off: the shortest of `REPEATS` calls each, alternating."""
-    seconds: dict[bool, list[float]] = {True: [], False: []}
-    for number in range(REPEATS + 1):
-        for enabled, measured in seconds.items():
-            with skipping(enabled):
-                started = process_time()
-                work()
-                if number:
-                    measured.append(process_time() - started)
-    return min(seconds[True]), min(seconds[False])
+def _timed(work: Callable[[], object]) -> float:
+    started = process_time()
+    work()
+    return process_time() - started
 
 
 def seconds_of(work: Callable[[], object]) -> float:
     """Processor seconds of ``work``: the shortest of `REPEATS` calls."""
-    seconds = []
-    for _ in range(REPEATS):
-        started = process_time()
-        work()
-        seconds.append(process_time() - started)
-    return min(seconds)
+    return min(_timed(work) for _ in range(REPEATS))
 
 
 def saved_by(work: Callable[[], object], left_out_here: int, left_out: int) -> float | None:
@@ -114,5 +99,9 @@ def saved_by(work: Callable[[], object], left_out_here: int, left_out: int) -> f
     ``left_out_here`` of them. Below 0 where skipping costs more than it saves; None where ``left_out_here`` is 0."""
     if not left_out_here:
         return None
-    on, off = seconds_on_and_off(work)
+    seconds: dict[bool, list[float]] = {True: [], False: []}
+    for enabled in (True, False) * (REPEATS + 1):
+        with skipping(enabled):
+            seconds[enabled].append(_timed(work))
+    on, off = (min(measured[1:]) for measured in seconds.values())  # the first call of each warms up
     return (off - on) * left_out / left_out_here

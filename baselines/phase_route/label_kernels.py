@@ -1,4 +1,4 @@
-"""The message passing of `labels`, compiled; imported only where `fpp_ml_bench.compiled` compiles.
+"""The message passing of `labels`, compiled; imported only where `fpp_ml_bench.machine` compiles.
 
 A ``field`` is what `labels.least_energy` makes of its arguments: costs and phases (H, W, K), the links along x and y,
 and the limit of a jump. Messages are stored at the node that receives them: 0 from the left, 1 from above, 2 from the
@@ -7,7 +7,7 @@ right, 3 from below.
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
+from fpp_ml_bench.machine import njit
 
 
 @njit

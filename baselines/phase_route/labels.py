@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image
-from fpp_ml_bench.compiled import numba_enabled
+from fpp_ml_bench.machine import numba_enabled
 
 Field = tuple[Image, Image, Image, Image, np.float32]
 

@@ -19,9 +19,9 @@ from fpp_ml_bench.baselines.stability.cases import (
     masked,
     worst,
 )
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError, RigError
+from fpp_ml_bench.machine import numba_enabled
 
 PHASE, ORDER = Group("phase"), Group("order")
 MEAN, MODULATION = 127.5, 100.0

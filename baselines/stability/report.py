@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines.stability.cases import Row, Verdict, parameter_text
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.evaluation.report import data_uri, page, render
 from fpp_ml_bench.evaluation.result import environment
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.machine import numba_enabled
 
 PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
 SCHEMA_VERSION = "1.0.0"

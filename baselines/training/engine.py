@@ -46,7 +46,6 @@ CHECK_EVERY = 16
 """Steps between two checks of the losses: reading a loss makes a GPU wait."""
 DIVERGED = 1e6
 """Multiple of the first loss from which on a training counts as diverged."""
-_LARGEST_INT = (1 << 31) - 1
 
 
 class Training(ABC):
@@ -285,7 +284,7 @@ def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     # A process may train in fp32 after bf16, or on a GPU after the processor, but accelerate's shared state allows only
     # one precision and device.
     AcceleratorState._reset_state(cpu)
-    keep_freed_memory(_LARGEST_INT)
+    keep_freed_memory()
     on_gpu = torch.cuda.is_available()
     before = torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.benchmark
     torch.use_deterministic_algorithms(not on_gpu)

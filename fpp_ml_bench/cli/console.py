@@ -4,12 +4,12 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import Manifest
+from fpp_ml_bench.loaders import storage
+
+WIDTH_IN_PIPES = 140
 
 
 @contextmanager
@@ -18,7 +18,6 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
 
     Shows the rate of ``unit``, of which a step counts ``per_step`` (52 images a sample), and the time left.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
@@ -50,15 +49,10 @@ def millimetres(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def say_benchmark(manifest: "Manifest") -> None:
+def say_benchmark(manifest: "storage.Manifest") -> None:
     """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
-    from fpp_ml_bench.loaders.storage import benchmark_sentence
-
-    as_expected, sentence = benchmark_sentence(manifest)
+    as_expected, sentence = storage.benchmark_sentence(manifest)
     print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
-
-
-WIDTH_IN_PIPES = 140
 
 
 def output_width() -> int:

@@ -1,7 +1,7 @@
 """Decoding a block of pixels: the stages, each compiled or in NumPy, then a depth or a reason for every pixel.
 
-`fpp_ml_bench.decoding` cuts the image into blocks that fit the processor's cache and calls `decode_direction` and
-`depth_and_reason` here.
+`fpp_ml_bench.decoding.decode` cuts the image into blocks that fit the processor's cache and calls `decode_direction`,
+`within_reach` and `depth_and_reason` here.
 """
 
 from collections.abc import Mapping
@@ -11,12 +11,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding.phase import choose_steps, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.decoding.phase import choose_steps, compiled_kernels, minus_atan2, phase_weights, weighted_sums
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, rotated_ray
 from fpp_ml_bench.optics import (
     AMBIGUOUS_FRACTION,
+    AXES,
     INCONSISTENT_RAD,
     Direction,
     Maps,
@@ -37,6 +37,8 @@ of mrad."""
 MAX_DISAGREEMENT_PX = 1.5
 """Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps
 gives a sigma of 0.5 px; a fringe order that is wrong by 1 shifts an 18 px fringe by more than 10 px."""
+SLACK_PX = 1e-3
+"""Allowance for rounding: coordinates and residuals are exact to about 1e-9 px."""
 
 
 class Reason(IntEnum):
@@ -55,6 +57,9 @@ class Reason(IntEnum):
     DIRECTIONS_DISAGREE = 6
     OUTSIDE_RANGE = 7
     NOT_ASKED = 8
+
+
+_STAGE_REASONS = (Reason.LOW_MODULATION, Reason.SATURATED, Reason.INCONSISTENT_ORDER, Reason.OUTSIDE_PATTERN)
 
 
 @dataclass(frozen=True)
@@ -128,98 +133,56 @@ class Coordinates:
         )
 
 
-_STAGE_REASONS = (
-    Reason.LOW_MODULATION,
-    Reason.SATURATED,
-    Reason.INCONSISTENT_ORDER,
-    Reason.OUTSIDE_PATTERN,
-)
+def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
+    """The rig as the kernels take it: R, t, and the projector's focal lengths and principal point."""
+    return rig.R, rig.t, rig.projector.focal, rig.projector.centre
+
+
+def range_m(rig: Rig) -> tuple[float, float]:
+    """The near and far end of the working range in m."""
+    near_mm, far_mm = rig.working_range_mm
+    return near_mm / MM_PER_M, far_mm / MM_PER_M
 
 
 def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Projector coordinate of a block from its grey levels, uint8 (frames of the plan, n)."""
-    if numba_enabled():
-        from fpp_ml_bench.decoding.kernels import decode_block
-
-        count = grey.shape[1]
-        coordinates = Coordinates(np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
-        thresholds = (
-            float(limits.min_modulation),
-            float(plan.max_clipped_steps),
-            float(limits.ambiguous_fraction),
-            INCONSISTENT_RAD,
-        )
-        codes = tuple(float(code) for code in _STAGE_REASONS)
-        decode_block(
-            grey, plan.weights, len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px), thresholds,
-            codes, coordinates.coordinate_px, coordinates.modulation, coordinates.phase, coordinates.reason,
-        )  # fmt: skip
-        return coordinates
-    steps = len(plan.sinusoids)
+    steps, count = len(plan.sinusoids), grey.shape[1]
+    if kernels := compiled_kernels():
+        results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
+        thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
+        code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
+        reasons = tuple(float(reason) for reason in _STAGE_REASONS)
+        kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
+        return Coordinates(*results)
     mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
     modulation = np.sqrt(cosine * cosine + sine * sine)
     phase = minus_atan2(sine, cosine)
     cells, trusted = decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
     absolute, consistent = absolute_phase(phase, cells, plan.centres_rad)
     coordinate = absolute * (plan.pitch_px / (2 * np.pi))
-    clipped = (grey[:steps] == GREY_LEVELS).sum(axis=0)
     faults = (
         modulation < limits.min_modulation,
-        clipped > plan.max_clipped_steps,
+        (grey[:steps] == GREY_LEVELS).sum(axis=0) > plan.max_clipped_steps,
         ~(trusted & consistent),
         (coordinate < -0.5) | (coordinate > plan.length_px - 0.5),
     )
-    reason = np.zeros(grey.shape[1], dtype=np.uint8)
-    for code, fault in reversed(list(zip(_STAGE_REASONS, faults, strict=True))):
-        reason[fault] = code
+    reason = np.select(faults, [np.uint8(code) for code in _STAGE_REASONS], np.uint8(0))
     return Coordinates(coordinate, modulation, phase, reason)
 
 
-def _depth_from_coordinate(rays: Maps, coordinates: Coordinates, plan: DirectionPlan, rig: Rig) -> NDArray[np.float64]:
-    if rig.projector.is_distorted or not numba_enabled():
-        return depth_from_coordinate(rays, coordinates.coordinate_px, rig, plan.direction)
-    from fpp_ml_bench.decoding.kernels import depth_from_coordinate_kernel
-
-    device, depth_mm = rig.projector, np.empty(len(coordinates.reason))
-    axis = 0 if plan.direction == "vertical" else 1
-    focal, centre = (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
-    depth_from_coordinate_kernel(*rays, coordinates.coordinate_px, rig.R, rig.t, axis, focal, centre, depth_mm)
-    return depth_mm
-
-
-def _depth_from_both(
-    rays: Maps, coordinates: dict[Direction, Coordinates], rig: Rig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    u, v = coordinates["vertical"], coordinates["horizontal"]
-    # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
-    weight_u, weight_v = u.modulation / rig.pitch("vertical"), v.modulation / rig.pitch("horizontal")
-    if rig.projector.is_distorted or not numba_enabled():
-        squared = weight_u * weight_u, weight_v * weight_v
-        return depth_from_both(rays, u.coordinate_px, v.coordinate_px, rig, *squared)
-    from fpp_ml_bench.decoding.kernels import depth_from_both_kernel
-
-    device, depth_mm, disagreement = rig.projector, np.empty(len(u.reason)), np.empty(len(u.reason))
-    focal, centre = (device.fx, device.fy), (device.cx, device.cy)
-    depth_from_both_kernel(
-        *rays, u.coordinate_px, v.coordinate_px, weight_u, weight_v, rig.R, rig.t, focal, centre, depth_mm, disagreement
-    )
-    return depth_mm, disagreement
-
-
 def depth_and_reason(
-    coordinates: dict[Direction, Coordinates], rays: Maps, plans: list[DirectionPlan], rig: Rig, limits: Limits
+    measured: dict[Direction, Coordinates], rays: Maps, rig: Rig, limits: Limits
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm, float32 (n,), 0 = none, and reason, uint8 (n,), of a block, from the coordinates by direction."""
-    first = coordinates[plans[0].direction]
-    if len(plans) == 1:
-        reason = first.reason.copy()
-        depth_mm = _depth_from_coordinate(rays, first, plans[0], rig)
+    """Depth in mm, float32 (n,), 0 = none, and reason, uint8 (n,), of a block, from one direction or both."""
+    reasons = [coordinates.reason for coordinates in measured.values()]
+    if len(reasons) == 1:
+        reason = reasons[0].copy()
+        depth_mm = _depth_from_one(measured, rays, rig)
     else:
-        second = coordinates[plans[1].direction]
-        lower, upper = np.minimum(first.reason, second.reason), np.maximum(first.reason, second.reason)
-        reason = np.where(lower == 0, upper, lower)
-        depth_mm, disagreement = _depth_from_both(rays, coordinates, rig)
-        reason[(reason == 0) & (disagreement > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
+        lower = np.minimum(*reasons)
+        reason = np.where(lower == 0, np.maximum(*reasons), lower)
+        depth_mm, disagreement_px = _depth_from_both(measured, rays, rig)
+        reason[(reason == 0) & (disagreement_px > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
     near, far = rig.working_range_mm
     missing = np.isnan(depth_mm)
     with np.errstate(invalid="ignore"):
@@ -229,49 +192,54 @@ def depth_and_reason(
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
 
 
-SLACK_PX = 1e-3
-"""Allowance for rounding: coordinates and residuals are exact to about 1e-9 px."""
+def _depth_from_one(measured: dict[Direction, Coordinates], rays: Maps, rig: Rig) -> NDArray[np.float64]:
+    ((direction, coordinates),) = measured.items()
+    kernels = compiled_kernels()
+    if kernels is None or rig.projector.is_distorted:
+        return depth_from_coordinate(rays, coordinates.coordinate_px, rig, direction)
+    depth_mm = np.empty(len(coordinates.reason))
+    kernels.depth_from_coordinate(rays, coordinates.coordinate_px, AXES.index(direction), geometry(rig), depth_mm)
+    return depth_mm
 
 
-def reach_is_bounded(rig: Rig) -> bool:
-    """Whether `within_reach` can rule pixels out: the bound holds for projectors without distortion."""
-    return not rig.projector.is_distorted
+def _depth_from_both(
+    measured: dict[Direction, Coordinates], rays: Maps, rig: Rig
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    u, v = (measured[direction] for direction in AXES)
+    # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
+    weights = u.modulation / rig.pitch("vertical"), v.modulation / rig.pitch("horizontal")
+    kernels = compiled_kernels()
+    if kernels is None or rig.projector.is_distorted:
+        return depth_from_both(rays, u.coordinate_px, v.coordinate_px, rig, *(weight * weight for weight in weights))
+    results = np.empty(len(u.reason)), np.empty(len(u.reason))
+    kernels.depth_from_both(rays, (u.coordinate_px, v.coordinate_px), weights, geometry(rig), results)
+    return results
 
 
 def within_reach(
-    coordinate_px: NDArray[np.float64], rays: Maps, plan: DirectionPlan, rig: Rig, limits: Limits
+    coordinate_px: NDArray[np.float64], rays: Maps, direction: Direction, rig: Rig, limits: Limits
 ) -> NDArray[np.bool_]:
-    """Pixels that may still get a depth from both directions; bool (n,).
+    """Pixels that may still get a depth from both directions; bool (n,). For projectors without distortion only.
 
-    ``coordinate_px`` (n,) of the direction of ``plan``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that
-    can't be ruled out are True, those with NaN rays too.
+    ``coordinate_px`` (n,) of ``direction``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that can't be
+    ruled out are True, those with NaN rays too.
     """
-    axis = 0 if plan.direction == "vertical" else 1
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    if numba_enabled():
-        from fpp_ml_bench.decoding.kernels import reach
-
-        device, reached = rig.projector, np.empty(len(coordinate_px), dtype=np.bool_)
-        reach(
-            *rays, coordinate_px, rig.R, rig.t, axis, (device.fx, device.fy), (device.cx, device.cy), (near_m, far_m),
-            float(limits.max_disagreement_px), SLACK_PX, reached,
-        )  # fmt: skip
+    axis = AXES.index(direction)
+    if kernels := compiled_kernels():
+        reached = np.empty(len(coordinate_px), dtype=np.bool_)
+        allowance = float(limits.max_disagreement_px), SLACK_PX
+        kernels.reach(rays, coordinate_px, axis, geometry(rig), range_m(rig), allowance, reached)
         return reached
+    _, t, focals, centres = geometry(rig)
     rotated = [rotated_ray(rays, rig, i) for i in range(3)]
     with np.errstate(all="ignore"):
-        projections = [_projected(rotated, depth_m, rig) for depth_m in (near_m, far_m)]
-        along, across = (projections[1][i] - projections[0][i] for i in (axis, 1 - axis))
+        near_z, far_z = (depth * rotated[2] + t[2] for depth in range_m(rig))
+        near_px, far_px = (
+            [focals[i] * (depth * rotated[i] + t[i]) / forward + centres[i] for i in range(2)]
+            for depth, forward in zip(range_m(rig), (near_z, far_z), strict=True)
+        )
+        along, across = (far_px[i] - near_px[i] for i in (axis, 1 - axis))
         margin = limits.max_disagreement_px * np.sqrt(along * along + across * across) / np.abs(across) + SLACK_PX
-        low = np.minimum(projections[0][axis], projections[1][axis]) - margin
-        high = np.maximum(projections[0][axis], projections[1][axis]) + margin
-        ahead = (near_m * rotated[2] + rig.t[2] > 0) & (far_m * rotated[2] + rig.t[2] > 0)
-        return ~(((coordinate_px < low) | (coordinate_px > high)) & ahead)
-
-
-def _projected(rotated: list[NDArray[np.float64]], depth_m: float, rig: Rig) -> list[NDArray[np.float64]]:
-    """Projector px (u, v) of the rays' points at depth ``depth_m``."""
-    device, forward = rig.projector, depth_m * rotated[2] + rig.t[2]
-    return [
-        focal * (depth_m * rotated[i] + rig.t[i]) / forward + centre
-        for i, (focal, centre) in enumerate(((device.fx, device.cx), (device.fy, device.cy)))
-    ]
+        low = np.minimum(near_px[axis], far_px[axis]) - margin
+        high = np.maximum(near_px[axis], far_px[axis]) + margin
+        return ~(((coordinate_px < low) | (coordinate_px > high)) & (near_z > 0) & (far_z > 0))

@@ -21,13 +21,12 @@ from fpp_ml_bench.decoding.blocks import (
     decode_direction,
     depth_and_reason,
     plan_direction,
-    reach_is_bounded,
     within_reach,
 )
+from fpp_ml_bench.decoding.checks import check_frames, check_limits, flat_frames, mask_indices
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
-from fpp_ml_bench.decoding.frame_check import check_frames
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig
 from fpp_ml_bench.skipping import skipping_enabled
 
 BLOCK_PX = 1 << 15
@@ -37,8 +36,7 @@ MOST_PICKED_SHARE = 0.6
 block in order is faster."""
 SAMPLING = 32
 """Every 32nd pixel of a block is tested to see whether reading by index can be faster."""
-Pixels = slice | NDArray[np.intp]
-"""Pixels of a block: a slice of the flat image, or flat indices."""
+Directions = Literal["horizontal", "vertical", "both"]
 
 
 @dataclass(frozen=True)
@@ -50,148 +48,8 @@ class Measured:
     modulation: NDArray[np.float32]
     phase: NDArray[np.float64]
 
-
-class DecodedImage:
-    """Results of the whole image as flat arrays, filled block by block; no pixel belongs to two blocks."""
-
-    def __init__(
-        self,
-        frames: dict[int, NDArray],
-        rig: Rig,
-        plans: list[DirectionPlan],
-        limits: Limits,
-        mask_indices: NDArray[np.intp] | None,
-        details: bool,
-        depth_alone: bool,
-        joint: JointCode | None,
-    ) -> None:
-        size = rig.camera.height * rig.camera.width
-        self.frames, self.rig, self.plans, self.limits, self.mask_indices = frames, rig, plans, limits, mask_indices
-        self.depth_alone, self.joint = depth_alone, joint
-        self.pixel_count = size if mask_indices is None else len(mask_indices)
-        self.depth_mm = np.zeros(size, dtype=np.float32)
-        self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
-        self.rays = tuple(axis.reshape(-1) for axis in rig.camera.rays())
-        self.details: dict[Direction, Coordinates] = {}
-        if details:
-            for plan in plans:
-                u, b, phi = (np.full(size, np.nan) for _ in range(3))
-                self.details[plan.direction] = Coordinates(u, b, phi, reason=np.zeros(size, dtype=np.uint8))
-
-    def decode_from(self, start: int) -> int:
-        """Decode a block; returns the number of its pixels that were read in every direction."""
-        stop = min(start + BLOCK_PX, self.pixel_count)
-        pixels = slice(start, stop) if self.mask_indices is None else self.mask_indices[start:stop]
-        first_direction = self.plans[0].direction
-        coordinates = {first_direction: self._coordinates(self.plans[0], pixels, stop - start)}
-        if self.depth_alone:
-            first = coordinates[first_direction]
-            selected = self._within_reach(first, pixels)
-            if selected is not None:
-                no_depth = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
-                pixels, coordinates = self._reduced(start, pixels, coordinates, selected, no_depth)
-        count = len(coordinates[first_direction].reason)
-        for plan in self.plans[1:]:
-            coordinates[plan.direction] = self._coordinates(plan, pixels, count)
-        if self.joint:
-            pixels, coordinates = self._with_orders(start, pixels, coordinates, self.joint)
-        rays = self.rays[0][pixels], self.rays[1][pixels]
-        self.depth_mm[pixels], self.reason[pixels] = depth_and_reason(
-            coordinates, rays, self.plans, self.rig, self.limits
-        )
-        for direction, details in self.details.items():
-            measured = coordinates[direction]
-            details.coordinate_px[pixels] = np.where(measured.reason == 0, measured.coordinate_px, np.nan)
-            details.modulation[pixels], details.phase[pixels] = measured.modulation, measured.phase
-        return count
-
-    def _with_orders(
-        self, start: int, pixels: Pixels, coordinates: dict[Direction, Coordinates], joint: JointCode
-    ) -> tuple[Pixels, dict[Direction, Coordinates]]:
-        """The block with the fringe orders that both phases give together, reduced to the pixels that have orders."""
-        rays = self.rays[0][pixels], self.rays[1][pixels]
-        orders, distance_px = nearest_pair(coordinates, rays, self.rig, joint.tolerance_px)
-        # NOT_ASKED, the highest code, marks pixels without a reason here.
-        reasons = (np.where(c.reason == 0, Reason.NOT_ASKED, c.reason) for c in coordinates.values())
-        lowest = np.minimum(*reasons)
-        unclear = (lowest == Reason.NOT_ASKED) & ~(distance_px <= joint.tolerance_px)
-        reason = np.where(unclear, Reason.DIRECTIONS_DISAGREE, lowest)
-        selected = None if self.details else self._indices_if_few(reason == Reason.NOT_ASKED)
-        if selected is not None:
-            pixels, coordinates = self._reduced(start, pixels, coordinates, selected, reason)
-            orders = {direction: order[selected] for direction, order in orders.items()}
-        else:
-            for measured in coordinates.values():
-                measured.reason[unclear] = Reason.DIRECTIONS_DISAGREE
-        return pixels, {
-            direction: with_order(measured, orders[direction], self.rig, direction)
-            for direction, measured in coordinates.items()
-        }
-
-    def _within_reach(self, first: Coordinates, pixels: Pixels) -> NDArray[np.intp] | None:
-        """Indices into the block of the pixels that can still get a depth after the first direction, if they are few.
-
-        A sample of the block is tested first: where the object fills the block, skipping costs no more than that test.
-        """
-        rays = self.rays[0][pixels], self.rays[1][pixels]
-
-        def undecided(part: slice) -> NDArray[np.bool_]:
-            coordinate, x, y = (np.ascontiguousarray(values[part]) for values in (first.coordinate_px, *rays))
-            reached = within_reach(coordinate, (x, y), self.plans[0], self.rig, self.limits)
-            return reached & (first.reason[part] == 0)
-
-        if self._indices_if_few(undecided(slice(None, None, SAMPLING))) is None:
-            return None
-        return self._indices_if_few(undecided(slice(None)))
-
-    @staticmethod
-    def _indices_if_few(mask: NDArray[np.bool_]) -> NDArray[np.intp] | None:
-        """Indices of the True entries of ``mask`` (n,), if they are few enough to be picked out."""
-        indices = np.flatnonzero(mask)
-        return indices if len(indices) <= MOST_PICKED_SHARE * len(mask) else None
-
-    def _reduced(
-        self,
-        start: int,
-        pixels: Pixels,
-        coordinates: dict[Direction, Coordinates],
-        selected: NDArray[np.intp],
-        reason: NDArray[np.uint8],
-    ) -> tuple[Pixels, dict[Direction, Coordinates]]:
-        """The block with only the ``selected`` pixels; ``reason`` (n,) of the block is stored for all others."""
-        self.reason[pixels] = reason
-        remaining = selected + start if isinstance(pixels, slice) else pixels[selected]
-        return remaining, {direction: measured.at(selected) for direction, measured in coordinates.items()}
-
-    def _coordinates(self, plan: DirectionPlan, pixels: Pixels, count: int) -> Coordinates:
-        """Coordinates of a direction at ``count`` pixels; gathers the grey levels of its frames first."""
-        levels = np.empty((len(plan.rows), count), dtype=np.uint8)
-        for row, index in zip(levels, plan.rows, strict=True):
-            if index in plan.constant_levels:
-                row[:] = plan.constant_levels[index]
-            elif isinstance(pixels, slice):
-                row[:] = self.frames[index][pixels]
-            else:
-                # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
-                self.frames[index].take(pixels, out=row, mode="clip")
-        decode = decode_wrapped if self.joint else decode_direction
-        return decode(levels, plan, self.limits)
-
-    def clear_outside(self, mask: NDArray[np.bool_]) -> None:
-        """Remove the results outside ``mask`` bool (H * W,)."""
-        self.depth_mm[~mask], self.reason[~mask] = 0.0, Reason.NOT_ASKED
-
-    def measured(self, direction: Direction, shape: tuple[int, int]) -> Measured:
-        """Details of ``direction`` as images of ``shape`` (H, W)."""
-        details = self.details[direction]
-        return Measured(
-            details.coordinate_px.reshape(shape),
-            details.modulation.astype(np.float32).reshape(shape),
-            details.phase.reshape(shape),
-        )
-
-
-Directions = Literal["horizontal", "vertical", "both"]
+    def reshaped(self, shape: tuple[int, int]) -> "Measured":
+        return Measured(self.coordinate_px.reshape(shape), self.modulation.reshape(shape), self.phase.reshape(shape))
 
 
 @dataclass(frozen=True)
@@ -209,46 +67,135 @@ class Decoded:
     """Pixels at which the second direction's frames were read; `decode_stack` with ``reasons=False`` may skip some."""
 
 
-def _used_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
-    """The frames at the indices ``used``, checked and flattened to (H * W,)."""
-    expected = (rig.camera.height, rig.camera.width)
-    if len(frames) != len(rig.sequence):
-        raise DecodeError(
-            f"expected the {len(rig.sequence)} frames of the rig's sequence, got {len(frames)}; "
-            "put None in the place of a frame that was not captured"
+@dataclass(frozen=True)
+class _Job:
+    """What is decoded and how; the same for every block."""
+
+    frames: dict[int, NDArray[np.uint8]]
+    rig: Rig
+    plans: list[DirectionPlan]
+    limits: Limits
+    joint: JointCode | None
+    pixels: NDArray[np.intp] | None
+    """Flat indices of the pixels to decode; None: all."""
+    details: bool
+    depth_alone: bool
+    """Whether the second direction may be left out where the first shows that there is no depth."""
+
+
+@dataclass
+class _Block:
+    """Some of the image's pixels, a slice of the flat image or flat indices, and what was measured there so far."""
+
+    pixels: slice | NDArray[np.intp]
+    measured: dict[Direction, Coordinates] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return self.pixels.stop - self.pixels.start if isinstance(self.pixels, slice) else len(self.pixels)
+
+    def keep(self, selected: NDArray[np.intp]) -> None:
+        """Reduce the block to its pixels at ``selected``."""
+        pixels = self.pixels
+        self.pixels = selected + pixels.start if isinstance(pixels, slice) else pixels[selected]
+        self.measured = {direction: measured.at(selected) for direction, measured in self.measured.items()}
+
+
+def _indices_if_few(mask: NDArray[np.bool_]) -> NDArray[np.intp] | None:
+    """Indices of the True entries of ``mask`` (n,), if they are few enough to be picked out."""
+    indices = np.flatnonzero(mask)
+    return indices if len(indices) <= MOST_PICKED_SHARE * len(mask) else None
+
+
+class _Image:
+    """Results of the whole image as flat arrays, filled block by block; no pixel belongs to two blocks."""
+
+    def __init__(self, job: _Job) -> None:
+        size = job.rig.camera.height * job.rig.camera.width
+        self.job = job
+        self.pixel_count = size if job.pixels is None else len(job.pixels)
+        self.depth_mm = np.zeros(size, dtype=np.float32)
+        self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
+        self.rays = tuple(axis.reshape(-1) for axis in job.rig.camera.rays())
+        self.details: dict[Direction, Measured] = {}
+        for plan in job.plans if job.details else []:
+            u, b, phase = np.full(size, np.nan), np.full(size, np.nan, dtype=np.float32), np.full(size, np.nan)
+            self.details[plan.direction] = Measured(u, b, phase)
+
+    def decode_from(self, start: int) -> int:
+        """Decode a block; returns the number of its pixels that were read in every direction."""
+        job, stop = self.job, min(start + BLOCK_PX, self.pixel_count)
+        block = _Block(slice(start, stop) if job.pixels is None else job.pixels[start:stop])
+        self._measure(block, job.plans[0])
+        if job.depth_alone:
+            self._keep_within_reach(block)
+        count = len(block)
+        for plan in job.plans[1:]:
+            self._measure(block, plan)
+        if job.joint:
+            self._find_orders(block, job.joint)
+        pixels = block.pixels
+        self.depth_mm[pixels], self.reason[pixels] = depth_and_reason(
+            block.measured, self._rays(block), job.rig, job.limits
         )
-    flat, described = {}, rig.sequence.frames
-    for index in used:
-        frame, title = frames[index], f"frame {described[index].title}"
-        if frame is None:
-            raise DecodeError(f"{title}: expected an image, got None; this decoding needs the frame, capture it")
-        image = np.asarray(frame)
-        if image.dtype != np.uint8:
-            raise DecodeError(f"{title}: expected uint8 grey levels, got dtype {image.dtype}")
-        if image.shape != expected:
-            raise DecodeError(
-                f"{title}: expected shape (H, W) = {expected} of the rig's camera, got {image.shape}; "
-                "use rig.scaled(width) for a resized image"
-            )
-        flat[index] = image.reshape(-1)
-    return flat
+        for direction, details in self.details.items():
+            measured = block.measured[direction]
+            details.coordinate_px[pixels] = np.where(measured.reason == 0, measured.coordinate_px, np.nan)
+            details.modulation[pixels], details.phase[pixels] = measured.modulation, measured.phase
+        return count
 
+    def _rays(self, block: _Block) -> Maps:
+        return self.rays[0][block.pixels], self.rays[1][block.pixels]
 
-def _checked_mask(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.intp] | None:
-    if mask is None:
-        return None
-    if np.asarray(mask).dtype != np.bool_ or np.shape(mask) != shape:
-        raise DecodeError(f"mask: expected bool {shape}, got {np.asarray(mask).dtype} {np.shape(mask)}")
-    return np.flatnonzero(mask)
+    def _measure(self, block: _Block, plan: DirectionPlan) -> None:
+        """Measure a direction at the block's pixels; gathers the grey levels of its frames first."""
+        levels = np.empty((len(plan.rows), len(block)), dtype=np.uint8)
+        for row, index in zip(levels, plan.rows, strict=True):
+            if index in plan.constant_levels:
+                row[:] = plan.constant_levels[index]
+            elif isinstance(block.pixels, slice):
+                row[:] = self.job.frames[index][block.pixels]
+            else:
+                # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
+                self.job.frames[index].take(block.pixels, out=row, mode="clip")
+        decode = decode_wrapped if self.job.joint else decode_direction
+        block.measured[plan.direction] = decode(levels, plan, self.job.limits)
 
+    def _keep_within_reach(self, block: _Block) -> None:
+        """Reduce the block to the pixels that can still get a depth after the first direction, if they are few.
 
-def _checked_limits(limits: Limits) -> None:
-    for name in ("min_modulation", "max_disagreement_px", "ambiguous_fraction"):
-        value = getattr(limits, name)
-        if not (np.isfinite(value) and value > 0):
-            raise DecodeError(f"{name}: expected a positive finite number, got {value!r}")
-    if limits.max_clipped_steps is not None and limits.max_clipped_steps < 0:
-        raise DecodeError(f"max_clipped_steps: expected 0 or more, got {limits.max_clipped_steps!r}")
+        A sample of the block is tested first: where the object fills the block, skipping costs no more than that test.
+        """
+        ((direction, first),) = block.measured.items()
+        values = first.coordinate_px, *self._rays(block)
+
+        def undecided(part: slice) -> NDArray[np.bool_]:
+            coordinate, x, y = (np.ascontiguousarray(value[part]) for value in values)
+            reached = within_reach(coordinate, (x, y), direction, self.job.rig, self.job.limits)
+            return reached & (first.reason[part] == 0)
+
+        if _indices_if_few(undecided(slice(None, None, SAMPLING))) is None:
+            return
+        if (selected := _indices_if_few(undecided(slice(None)))) is not None:
+            self.reason[block.pixels] = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
+            block.keep(selected)
+
+    def _find_orders(self, block: _Block, joint: JointCode) -> None:
+        """The fringe orders that both phases give together; reduces the block to the pixels that have orders."""
+        orders, distance_px = nearest_pair(block.measured, self._rays(block), self.job.rig, joint)
+        # NOT_ASKED, the highest code, marks pixels without a reason here.
+        lowest = np.minimum(*(np.where(m.reason == 0, Reason.NOT_ASKED, m.reason) for m in block.measured.values()))
+        unclear = (lowest == Reason.NOT_ASKED) & ~(distance_px <= joint.tolerance_px)
+        reason = np.where(unclear, Reason.DIRECTIONS_DISAGREE, lowest)
+        selected = None if self.details else _indices_if_few(reason == Reason.NOT_ASKED)
+        if selected is not None:
+            self.reason[block.pixels] = reason
+            block.keep(selected)
+            orders = {direction: order[selected] for direction, order in orders.items()}
+        else:
+            for measured in block.measured.values():
+                measured.reason[unclear] = Reason.DIRECTIONS_DISAGREE
+        for direction, order in orders.items():
+            block.measured[direction] = with_order(block.measured[direction], order, self.job.rig, direction)
 
 
 def decode_stack(
@@ -290,14 +237,14 @@ def decode_stack(
 
     Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this also removes the background
     plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose capture
-    failed (`fpp_ml_bench.decoding.frame_check`).
+    failed (`fpp_ml_bench.decoding.checks`).
     """
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
     limits = limits or Limits()
-    _checked_limits(limits)
+    check_limits(limits)
     step_count = rig.sequence.steps if steps is None else steps
     directions: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
     plans = [plan_direction(rig, name, step_count, limits) for name in directions]
@@ -305,37 +252,32 @@ def decode_stack(
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
-    flat = _used_frames(frames, used, rig)
+    flat = flat_frames(frames, used, rig)
     shape = (rig.camera.height, rig.camera.width)
-    mask_indices = _checked_mask(mask, shape)
+    pixels = mask_indices(mask, shape)
     for plan in plans:
-        check_frames(flat, plan, mask_indices, rig.sequence)
-    depth_alone = not reasons and not details and len(plans) == 2 and reach_is_bounded(rig) and skipping_enabled()
+        check_frames(flat, plan, pixels, rig.sequence)
     # With a mask of most of the image, decoding whole blocks and clearing the rest is faster than reading by index.
-    dense = (
-        mask_indices is not None
-        and not details
-        and len(mask_indices) > MOST_PICKED_SHARE * shape[0] * shape[1]
-        and skipping_enabled()
-    )
-    image = DecodedImage(
-        flat, rig, plans, limits, None if dense else mask_indices, details, depth_alone and joint is None, joint
-    )
-    starts, second_px = range(0, image.pixel_count, BLOCK_PX), 0
+    dense = pixels is not None and not details and len(pixels) > MOST_PICKED_SHARE * shape[0] * shape[1]
+    dense = dense and skipping_enabled()
+    depth_alone = len(plans) == 2 and joint is None and not (reasons or details or rig.projector.is_distorted)
+    depth_alone = depth_alone and skipping_enabled()
+    image = _Image(_Job(flat, rig, plans, limits, joint, None if dense else pixels, details, depth_alone))
+    starts = range(0, image.pixel_count, BLOCK_PX)
     if threads == 1 or len(starts) < 2:
-        for start in starts:
-            second_px += image.decode_from(start)
+        second_px = sum(map(image.decode_from, starts))
     else:
         with ThreadPoolExecutor(threads) as pool:
             second_px = sum(pool.map(image.decode_from, starts))
-    if dense and mask is not None:
-        image.clear_outside(np.asarray(mask).reshape(-1))
+    if dense:
+        outside = ~np.asarray(mask).reshape(-1)
+        image.depth_mm[outside], image.reason[outside] = 0.0, Reason.NOT_ASKED
     counts = np.bincount(image.reason, minlength=len(Reason))
     return Decoded(
         depth_mm=image.depth_mm.reshape(shape),
         reason=image.reason.reshape(shape),
         counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
         frames_used=used,
-        details={name: image.measured(name, shape) for name in directions} if details else {},
+        details={name: measured.reshaped(shape) for name, measured in image.details.items()},
         second_px=second_px if len(plans) == 2 else 0,
     )

@@ -9,20 +9,18 @@ Gray code tells all periods of the pattern apart. There are two ways to capture 
   cells.
 - With both directions, no bit may be needed (`orders_from_phases`): the two fringes' periods along the ray differ, and
   together they are unambiguous over their beat, as in two-frequency unwrapping. The (u, v) of the right pair of orders
-  lies on the pixel's epipolar line; that of a wrong pair is several px away.
-
-Own derivation.
+  lies on the pixel's epipolar line; that of a wrong pair is several px away. Own derivation.
 """
 
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
-from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.blocks import (
     MAX_DISAGREEMENT_PX,
     Coordinates,
@@ -30,50 +28,41 @@ from fpp_ml_bench.decoding.blocks import (
     Limits,
     Reason,
     decode_direction,
+    geometry,
+    range_m,
 )
+from fpp_ml_bench.decoding.phase import compiled_kernels
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
+from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
 
 _GRID = 33
 """Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""
 CODE_MARGIN_CELLS = 1
-AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
-"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
 LEAST_TOLERANCE_PX = 1.0
 """Distance in projector px that noise may move a pixel off its epipolar line. The decoder's worst case (3 steps, least
 modulation) has a sigma of 0.5 px, usual pixels have 0.02 px."""
 
 
-@dataclass(frozen=True)
-class Reach:
-    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane."""
-
-    near_px: dict[Direction, np.ndarray]
-    far_px: dict[Direction, np.ndarray]
-    background_px: dict[Direction, np.ndarray]
-
-
-def reach_of(rig: Rig) -> Reach:
-    """Projector coordinates of the camera's rays at the ends of the working range and on the background plane; NaN
-    outside the projector's view."""
+def reach_of(rig: Rig) -> NDArray[np.float64]:
+    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane,
+    (3, 2 `AXES`, n); NaN outside the projector's view."""
     rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
     columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
     x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
+    return np.array([_projected((x, y), depth_m, rig) for depth_m in (*range_m(rig), rig.background_m)])
 
-    def projected(depth_m: float) -> dict[Direction, np.ndarray]:
-        u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
-        return {"vertical": u, "horizontal": v}
 
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    return Reach(projected(near_m), projected(far_m), projected(rig.background_m))
+def _projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
+    """Projector px (u, v) of the rays' points at ``depth_m``."""
+    x, y = rays
+    return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
 
 
 @lru_cache(maxsize=16)
 def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
     """Gray bits of a direction (0 = most significant frame) that change within the camera's view. All other bits are
     the same on every cell in view, in the working range and on the background."""
-    reach, bits = reach_of(rig), rig.sequence.bits(direction)
-    in_view = np.concatenate([ends[direction] for ends in (reach.near_px, reach.far_px, reach.background_px)])
+    in_view, bits = reach_of(rig)[:, AXES.index(direction)], rig.sequence.bits(direction)
     in_view = in_view[np.isfinite(in_view)]
     last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
     if not in_view.size:
@@ -120,33 +109,29 @@ def orders_from_phases(rig: Rig) -> JointCode:
     """
     if rig.projector.is_distorted:
         return JointCode(0.0, 0.0)
-    reach = reach_of(rig)
-    near, far, background = (
-        np.stack([ends["vertical"], ends["horizontal"]]) for ends in (reach.near_px, reach.far_px, reach.background_px)
-    )
+    near, far, background = reach_of(rig)
     line = far - near
     usable = np.isfinite(line).all(axis=0) & np.isfinite(background).all(axis=0) & (np.hypot(*line) > 0)
     if not usable.any():
         return JointCode(0.0, 0.0)
     near, far, background, line = near[:, usable], far[:, usable], background[:, usable], line[:, usable]
     e = line / np.hypot(*line)
-    pitch = np.array([[rig.pitch("vertical")], [rig.pitch("horizontal")]])
+    pitch = np.array([[rig.pitch(direction)] for direction in AXES])
     span = (np.abs(line) + 2 * MAX_DISAGREEMENT_PX) / pitch
     low = (np.minimum(near, far) - MAX_DISAGREEMENT_PX - background) / pitch
     high = (np.maximum(near, far) + MAX_DISAGREEMENT_PX - background) / pitch
     most_orders = int(np.ceil(max(span.max(), np.abs(low).max(), np.abs(high).max())))
-    gaps = {"range": math.inf, "background": math.inf}
-    for i in range(-most_orders, most_orders + 1):
-        for j in range(-most_orders, most_orders + 1):
-            distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
-            inside = (abs(i) <= span[0]) & (abs(j) <= span[1]) & ((i, j) != (0, 0))
-            on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
-            for name, possible in (("range", inside), ("background", on_background)):
-                if possible.any():
-                    gaps[name] = min(gaps[name], float(distance_px[possible].min()))
+    range_gap = background_gap = math.inf
+    for i, j in product(range(-most_orders, most_orders + 1), repeat=2):
+        distance_px = np.abs(i * pitch[0] * e[1] - j * pitch[1] * e[0])
+        if (i, j) != (0, 0):
+            inside = (abs(i) <= span[0]) & (abs(j) <= span[1])
+            range_gap = distance_px.min(where=inside, initial=range_gap)
+        on_background = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
+        background_gap = distance_px.min(where=on_background, initial=background_gap)
     periods = (np.abs(line) / pitch).max(axis=1)
     driver = AXES[int(periods[1] > periods[0])]
-    return JointCode(gaps["range"], gaps["background"], driver, float(periods.max()))
+    return JointCode(float(range_gap), float(background_gap), driver, float(periods.max()))
 
 
 def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
@@ -185,8 +170,8 @@ def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPl
 def _constant_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
     """Grey level of each Gray frame that is the same on every cell in view, by frame index."""
     needed = gray_bits_in_view(rig, plan.direction)
-    reach = reach_of(rig).near_px[plan.direction]
-    in_view = reach[np.isfinite(reach)]
+    in_view = reach_of(rig)[0, AXES.index(plan.direction)]
+    in_view = in_view[np.isfinite(in_view)]
     if not in_view.size:
         return {}
     last = plan.length_px - 1
@@ -200,38 +185,31 @@ def _constant_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
 def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Phase and modulation of a block without Gray frames; reasons that depend on a fringe order are cleared."""
     coordinates = decode_direction(grey, plan, limits)
-    order_faults = (coordinates.reason == Reason.INCONSISTENT_ORDER) | (coordinates.reason == Reason.OUTSIDE_PATTERN)
-    coordinates.reason[order_faults] = 0
+    reason = coordinates.reason
+    reason[(reason == Reason.INCONSISTENT_ORDER) | (reason == Reason.OUTSIDE_PATTERN)] = 0
     return coordinates
 
 
 def nearest_pair(
-    coordinates: dict[Direction, Coordinates], rays: Maps, rig: Rig, tolerance_px: float
+    measured: dict[Direction, Coordinates], rays: Maps, rig: Rig, joint: JointCode
 ) -> tuple[dict[Direction, NDArray[np.float64]], NDArray[np.float64]]:
     """The pair of fringe orders that lies nearest to the epipolar line, for every pixel.
 
     Returns the orders of each direction, whole numbers as float64 (n,), and the pair's distance from the line in
     projector px, inf where no order lies in the range.
     """
-    joint = orders_from_phases(rig)
-    a, b = (0, 1) if joint.driver == "vertical" else (1, 0)
-    first, second = coordinates[AXES[a]].phase, coordinates[AXES[b]].phase
+    a = AXES.index(joint.driver)
+    b, tolerance_px = 1 - a, joint.tolerance_px
+    first, second = measured[AXES[a]].phase, measured[AXES[b]].phase
     pitches = rig.pitch(AXES[a]), rig.pitch(AXES[b])
-    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
     tries = math.ceil(joint.most_periods + 2 * tolerance_px / pitches[0]) + 1
-    order_a, order_b = np.zeros(first.shape), np.zeros(first.shape)
-    nearest = np.full(first.shape, np.inf)
-    if numba_enabled():
-        from fpp_ml_bench.decoding.kernels import joint_orders
-
-        device = rig.projector
-        joint_orders(
-            *rays, first, second, rig.R, rig.t, a, (device.fx, device.fy), (device.cx, device.cy), (near_m, far_m),
-            pitches, tolerance_px, tries, order_a, order_b, nearest,
-        )  # fmt: skip
-        return {AXES[a]: order_a, AXES[b]: order_b}, nearest
-    x, y = rays
-    near, far = (rig.project(np.stack([x * z, y * z, np.full_like(x, z)], axis=-1)) for z in (near_m, far_m))
+    order_a, order_b, nearest = np.zeros(first.shape), np.zeros(first.shape), np.full(first.shape, np.inf)
+    orders = {AXES[a]: order_a, AXES[b]: order_b}
+    if kernels := compiled_kernels():
+        results, search = (order_a, order_b, nearest), (tolerance_px, tries)
+        kernels.joint_orders(rays, (first, second), a, geometry(rig), range_m(rig), pitches, search, results)
+        return orders, nearest
+    near, far = (_projected(rays, depth_m, rig) for depth_m in range_m(rig))
     with np.errstate(all="ignore"):
         line = far[0] - near[0], far[1] - near[1]
         slope, share = line[b] / line[a], np.abs(line[a]) / np.hypot(*line)
@@ -244,12 +222,9 @@ def nearest_pair(
             second_order = np.floor(predicted / pitches[1] - second / (2 * np.pi) + 0.5)
             distance_px = np.abs((second + 2 * np.pi * second_order) * (pitches[1] / (2 * np.pi)) - predicted) * share
             better = (distance_px < nearest) & (position_px <= high)
-            nearest[better], order_a[better], order_b[better] = (
-                distance_px[better],
-                first_order[better],
-                second_order[better],
-            )
-    return {AXES[a]: order_a, AXES[b]: order_b}, nearest
+            for result, value in ((nearest, distance_px), (order_a, first_order), (order_b, second_order)):
+                result[better] = value[better]
+    return orders, nearest
 
 
 def with_order(coordinates: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:

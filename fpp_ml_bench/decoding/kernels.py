@@ -1,16 +1,19 @@
 """Compiled kernels of the decoder: the sums of `phase`, `gray_code` and `triangulation` in the same order, fused.
 
-Import only where `fpp_ml_bench.compiled.numba_enabled`. Pixels are processed in tiles that stay in the first-level
+Import only where `fpp_ml_bench.machine.numba_enabled`. Pixels are processed in tiles that stay in the first-level
 cache, frame by frame within a tile, so that the compiler can use vector instructions and each grey level is read once.
 The loops have no branches for the same reason. The NumPy functions are the reference; tests compare the two.
+
+``rays`` are the pixels' normalised (x, y), (n,) each; ``geometry`` is R, t and the projector's (fx, fy) and (cx, cy);
+results are filled in.
 """
 
 import math
 
 import numpy as np
 
-from fpp_ml_bench.compiled import njit
 from fpp_ml_bench.decoding.triangulation import GAUSS_NEWTON_STEPS, LEAST_PARALLAX
+from fpp_ml_bench.machine import njit
 from fpp_ml_bench.portable import ATAN_BOTTOM as BOTTOM
 from fpp_ml_bench.portable import ATAN_TOP as TOP
 from fpp_ml_bench.portable import TAN_EIGHTH
@@ -45,7 +48,7 @@ def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def minus_atan2_kernel(sine, cosine, phase):  # type: ignore[no-untyped-def]
+def minus_atan2_all(sine, cosine, phase):  # type: ignore[no-untyped-def]
     """`phase.minus_atan2`: fills ``phase``; all flat float64 of one length."""
     for i in range(phase.size):
         phase[i] = _minus_atan2(sine[i], cosine[i])
@@ -53,14 +56,17 @@ def minus_atan2_kernel(sine, cosine, phase):  # type: ignore[no-untyped-def]
 
 @njit
 def decode_block(  # type: ignore[no-untyped-def]
-    frames, weights, bits, centres, pitch, length, limits, codes, coordinate, modulation, phase, reason
+    frames, weights, code, limits, codes, results
 ):
     """A direction of a block of n pixels: phase, cell, order and projector coordinate.
 
-    ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``limits`` = least modulation, most
-    clipped steps, ambiguous fraction, inconsistent rad; ``codes`` = low modulation, saturated, inconsistent, outside.
-    Fills ``coordinate`` px, ``modulation`` and ``phase`` (float64) and ``reason`` (uint8, 0 = decoded), each (n,).
+    ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``code`` = number of Gray bits, cell
+    centres in rad, pitch and length in px; ``limits`` = least modulation, most clipped steps, ambiguous fraction,
+    inconsistent rad; ``codes`` = low modulation, saturated, inconsistent, outside; ``results`` = coordinate px,
+    modulation and phase (float64) and reason (uint8, 0 = decoded), each (n,).
     """
+    bits, centres, pitch, length = code
+    coordinate, modulation, phase, reason = results
     steps, total = weights.shape[1], frames.shape[1]
     mean, cosine, sine = np.empty(TILE), np.empty(TILE), np.empty(TILE)
     clipped, centre, faulty = np.empty(TILE, np.int32), np.empty(TILE), np.empty(TILE)
@@ -113,39 +119,54 @@ def decode_block(  # type: ignore[no-untyped-def]
             faulty[i] += 1.0 if abs(absolute - centre[i]) > limits[3] else 0.0
         for i in range(n):
             w = coordinate[start + i]
-            code = codes[3] if (w < -0.5) | (w > length - 0.5) else 0.0
-            code = codes[2] if faulty[i] > 0.0 else code
-            code = codes[1] if clipped[i] > limits[1] else code
-            code = code if modulation[start + i] >= limits[0] else codes[0]
-            reason[start + i] = np.uint8(np.int32(code))
+            fault = codes[3] if (w < -0.5) | (w > length - 0.5) else 0.0
+            fault = codes[2] if faulty[i] > 0.0 else fault
+            fault = codes[1] if clipped[i] > limits[1] else fault
+            fault = fault if modulation[start + i] >= limits[0] else codes[0]
+            reason[start + i] = np.uint8(np.int32(fault))
 
 
 @njit
-def depth_from_coordinate_kernel(x, y, coordinate, rotation, translation, axis, focal, centre, depth_mm):  # type: ignore[no-untyped-def]
-    """`triangulation.depth_from_coordinate` for an undistorted projector; all arrays (n,), ``depth_mm`` is filled."""
-    r0, r1, r2 = rotation[axis, 0], rotation[axis, 1], rotation[axis, 2]
-    s0, s1, s2 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    t, tz = translation[axis], translation[2]
+def _rotated(rotation, axis, x, y):  # type: ignore[no-untyped-def]
+    return rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2]
+
+
+@njit
+def _depth(z, forward, tz):  # type: ignore[no-untyped-def]
+    """Depth in mm where ``z`` (m) is finite and in front of both devices, else NaN."""
+    return z * 1000.0 if (z > 0.0) & (z < np.inf) & (forward * z + tz > 0.0) else np.nan
+
+
+@njit
+def depth_from_coordinate(rays, coordinate, axis, geometry, depth_mm):  # type: ignore[no-untyped-def]
+    """`triangulation.depth_from_coordinate` for an undistorted projector; all arrays (n,)."""
+    (x, y), (rotation, translation, focals, centres) = rays, geometry
+    t, tz, focal, centre = translation[axis], translation[2], focals[axis], centres[axis]
     for i in range(len(x)):
         ideal = (coordinate[i] - centre) / focal
-        forward = s0 * x[i] + s1 * y[i] + s2
-        along, across = r0 * x[i] + r1 * y[i] + r2, ideal * forward
-        z = (ideal * tz - t) / (along - across)
-        good = (z > 0.0) & (z < np.inf) & (forward * z + tz > 0.0)
+        forward = _rotated(rotation, 2, x[i], y[i])
+        along, across = _rotated(rotation, axis, x[i], y[i]), ideal * forward
+        depth = _depth((ideal * tz - t) / (along - across), forward, tz)
         size = abs(along) + (abs(coordinate[i]) + abs(centre)) / focal * abs(forward)
-        good &= abs(along - across) > LEAST_PARALLAX * size
-        depth_mm[i] = z * 1000.0 if good else np.nan
+        depth_mm[i] = depth if abs(along - across) > LEAST_PARALLAX * size else np.nan
 
 
 @njit
-def depth_from_both_kernel(  # type: ignore[no-untyped-def]
-    x, y, u, v, weight_u, weight_v, rotation, translation, focal, centre, depth_mm, disagreement
-):
-    """`triangulation.depth_from_both` for an undistorted projector; ``focal`` and ``centre`` are pairs.
+def _residual(c, d, q, tz, w):  # type: ignore[no-untyped-def]
+    """Residual in px of one coordinate, and its slope; see `triangulation.depth_from_both`."""
+    r = (c - d * w) / q
+    return r, (d + r * tz) / q
 
-    ``weight_u`` and ``weight_v`` are B / P here and squared inside. Fills ``depth_mm`` and ``disagreement`` (px).
+
+@njit
+def depth_from_both(rays, coordinates, weights, geometry, results):  # type: ignore[no-untyped-def]
+    """`triangulation.depth_from_both` for an undistorted projector; ``results`` = depth in mm, disagreement in px.
+
+    ``weights`` are B / P here and squared inside.
     """
-    (fx, fy), (cx, cy) = focal, centre
+    (x, y), (u, v), (weight_u, weight_v) = rays, coordinates, weights
+    rotation, translation, (fx, fy), (cx, cy) = geometry
+    depth_mm, disagreement = results
     tx, ty, tz = translation[0], translation[1], translation[2]
     cu, du, cv, dv = np.empty(TILE), np.empty(TILE), np.empty(TILE), np.empty(TILE)
     forward, inverse = np.empty(TILE), np.empty(TILE)
@@ -153,46 +174,40 @@ def depth_from_both_kernel(  # type: ignore[no-untyped-def]
         n = min(TILE, len(x) - start)
         for i in range(n):
             j = start + i
-            a0 = rotation[0, 0] * x[j] + rotation[0, 1] * y[j] + rotation[0, 2]
-            a1 = rotation[1, 0] * x[j] + rotation[1, 1] * y[j] + rotation[1, 2]
-            forward[i] = rotation[2, 0] * x[j] + rotation[2, 1] * y[j] + rotation[2, 2]
+            forward[i] = _rotated(rotation, 2, x[j], y[j])
             px, py = (u[j] - cx) / fx, (v[j] - cy) / fy
             wu, wv = weight_u[j] * weight_u[j], weight_v[j] * weight_v[j]
-            cu[i], du[i] = fx * (a0 - px * forward[i]), fx * (px * tz - tx)
-            cv[i], dv[i] = fy * (a1 - py * forward[i]), fy * (py * tz - ty)
+            cu[i], du[i] = fx * (_rotated(rotation, 0, x[j], y[j]) - px * forward[i]), fx * (px * tz - tx)
+            cv[i], dv[i] = fy * (_rotated(rotation, 1, x[j], y[j]) - py * forward[i]), fy * (py * tz - ty)
             inverse[i] = (wu * cu[i] * du[i] + wv * cv[i] * dv[i]) / (wu * du[i] * du[i] + wv * dv[i] * dv[i])
         if tz != 0.0:
             for _ in range(GAUSS_NEWTON_STEPS):
                 for i in range(n):
                     wu, wv = weight_u[start + i] * weight_u[start + i], weight_v[start + i] * weight_v[start + i]
                     q = forward[i] + tz * inverse[i]
-                    ru, rv = (cu[i] - du[i] * inverse[i]) / q, (cv[i] - dv[i] * inverse[i]) / q
-                    gu, gv = (du[i] + ru * tz) / q, (dv[i] + rv * tz) / q
+                    ru, gu = _residual(cu[i], du[i], q, tz, inverse[i])
+                    rv, gv = _residual(cv[i], dv[i], q, tz, inverse[i])
                     inverse[i] += (wu * ru * gu + wv * rv * gv) / (wu * gu * gu + wv * gv * gv)
         for i in range(n):
             q = forward[i] + tz * inverse[i]
-            ru, rv = (cu[i] - du[i] * inverse[i]) / q, (cv[i] - dv[i] * inverse[i]) / q
-            gu, gv = (du[i] + ru * tz) / q, (dv[i] + rv * tz) / q
+            ru, gu = _residual(cu[i], du[i], q, tz, inverse[i])
+            rv, gv = _residual(cv[i], dv[i], q, tz, inverse[i])
             disagreement[start + i] = abs(ru * gv - rv * gu) / math.sqrt(gu * gu + gv * gv)
-            z = 1.0 / inverse[i]
-            good = (z > 0.0) & (z < np.inf) & (forward[i] * z + tz > 0.0)
-            depth_mm[start + i] = z * 1000.0 if good else np.nan
+            depth_mm[start + i] = _depth(1.0 / inverse[i], forward[i], tz)
 
 
 @njit
-def reach(  # type: ignore[no-untyped-def]
-    x, y, coordinate, rotation, translation, axis, focal, centre, depths, disagreement, slack, reached
-):
-    """`decode_reach.within_reach`: fills ``reached`` bool (n,). ``focal``, ``centre`` and ``depths`` (m) are pairs."""
-    other_axis = 1 - axis
-    f, c = focal[axis], centre[axis]
-    g = focal[other_axis]
-    tx, ty, tz = translation[axis], translation[other_axis], translation[2]
-    near, far = depths
+def reach(rays, coordinate, axis, geometry, depths, allowance, reached):  # type: ignore[no-untyped-def]
+    """`blocks.within_reach`: fills ``reached`` bool (n,). ``depths`` = near, far (m); ``allowance`` = disagreement,
+    slack (px)."""
+    (x, y), (near, far), (disagreement, slack) = rays, depths, allowance
+    rotation, translation, focal, centre = geometry
+    other = 1 - axis
+    f, c, g = focal[axis], centre[axis], focal[other]
+    tx, ty, tz = translation[axis], translation[other], translation[2]
     for i in range(len(x)):
-        a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
-        b = rotation[other_axis, 0] * x[i] + rotation[other_axis, 1] * y[i] + rotation[other_axis, 2]
-        forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
+        a, b = _rotated(rotation, axis, x[i], y[i]), _rotated(rotation, other, x[i], y[i])
+        forward = _rotated(rotation, 2, x[i], y[i])
         first, last = near * forward + tz, far * forward + tz
         begin, end = f * (near * a + tx) / first + c, f * (far * a + tx) / last + c
         along, across = end - begin, g * (far * b + ty) / last - g * (near * b + ty) / first
@@ -202,22 +217,23 @@ def reach(  # type: ignore[no-untyped-def]
 
 
 @njit
-def joint_orders(  # type: ignore[no-untyped-def]
-    x, y, first, second, rotation, translation, axis, focal, centre, depths, pitches, tolerance, tries,
-    order_first, order_second, nearest,
-):  # fmt: skip
-    """`decode_fewest.nearest_pair`: fills the orders and ``nearest`` (px), float64 (n,). ``first`` and ``second``:
-    wrapped phases of axis ``axis`` and of the other axis; ``pitches`` (px) in that order; ``depths``: near, far (m)."""
-    other_axis = 1 - axis
-    ta, tb, tz = translation[axis], translation[other_axis], translation[2]
-    fa, fb, ca, cb = focal[axis], focal[other_axis], centre[axis], centre[other_axis]
-    near, far = depths
+def joint_orders(rays, phases, axis, geometry, depths, pitches, search, results):  # type: ignore[no-untyped-def]
+    """`fewest.nearest_pair`: ``results`` = both orders and the pair's distance (px), float64 (n,).
+
+    ``phases``: the wrapped phases of axis ``axis`` and of the other axis; ``pitches`` (px) in that order; ``depths`` =
+    near, far (m); ``search`` = tolerance (px), number of orders to try.
+    """
+    (x, y), (first, second), (near, far), (tolerance, tries) = rays, phases, depths, search
+    rotation, translation, focal, centre = geometry
+    order_first, order_second, nearest = results
+    other = 1 - axis
+    ta, tb, tz = translation[axis], translation[other], translation[2]
+    fa, fb, ca, cb = focal[axis], focal[other], centre[axis], centre[other]
     pa, pb = pitches
     inverse_a, inverse_b, per_rad_a, per_rad_b = 1.0 / pa, 1.0 / pb, pa / _TAU, pb / _TAU
     for i in range(len(x)):
-        a = rotation[axis, 0] * x[i] + rotation[axis, 1] * y[i] + rotation[axis, 2]
-        b = rotation[other_axis, 0] * x[i] + rotation[other_axis, 1] * y[i] + rotation[other_axis, 2]
-        forward = rotation[2, 0] * x[i] + rotation[2, 1] * y[i] + rotation[2, 2]
+        a, b = _rotated(rotation, axis, x[i], y[i]), _rotated(rotation, other, x[i], y[i])
+        forward = _rotated(rotation, 2, x[i], y[i])
         q, r = near * forward + tz, far * forward + tz
         nearest[i], order_first[i], order_second[i] = np.inf, 0.0, 0.0
         if not ((q > 0.0) & (r > 0.0)):

@@ -7,14 +7,14 @@ cos delta_n and (2/N) sin delta_n, and ``phi = -atan2(S, C)`` is the paper's Eq.
 """
 
 from collections.abc import Iterable
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from fpp_ml_bench.compiled import numba_enabled
-from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
 
 
@@ -24,6 +24,15 @@ class Phase(NamedTuple):
     phase: NDArray[np.floating]
     modulation: NDArray[np.floating]
     mean: NDArray[np.floating]
+
+
+def compiled_kernels() -> ModuleType | None:
+    """The decoder's compiled kernels, or None where NumPy is to be used."""
+    if not numba_enabled():
+        return None
+    from fpp_ml_bench.decoding import kernels
+
+    return kernels
 
 
 def choose_steps(steps: int, count: int) -> tuple[int, ...]:
@@ -58,18 +67,6 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
     return np.ascontiguousarray(np.linalg.pinv(model))
 
 
-def _checked(frames: Iterable[ArrayLike]) -> list[NDArray]:
-    images = [np.asarray(frame) for frame in frames]
-    if len(images) < 3:
-        raise DecodeError(f"a phase needs at least 3 frames, got {len(images)}")
-    for i, image in enumerate(images):
-        if image.ndim != 2 or image.shape != images[0].shape:
-            raise DecodeError(f"frame {i}: expected shape (H, W) = {images[0].shape} like frame 0, got {image.shape}")
-        if image.dtype.kind not in "uif":
-            raise DecodeError(f"frame {i}: expected integer or real grey levels, got dtype {image.dtype}")
-    return images
-
-
 def wrapped_phase(
     frames: Iterable[ArrayLike], shifts_rad: ArrayLike | None = None, dtype: DTypeLike = np.float64
 ) -> Phase:
@@ -81,7 +78,14 @@ def wrapped_phase(
     """
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise DecodeError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
-    images = _checked(frames)
+    images = [np.asarray(frame) for frame in frames]
+    if len(images) < 3:
+        raise DecodeError(f"a phase needs at least 3 frames, got {len(images)}")
+    for i, image in enumerate(images):
+        if image.ndim != 2 or image.shape != images[0].shape:
+            raise DecodeError(f"frame {i}: expected shape (H, W) = {images[0].shape} like frame 0, got {image.shape}")
+        if image.dtype.kind not in "uif":
+            raise DecodeError(f"frame {i}: expected integer or real grey levels, got dtype {image.dtype}")
     if shifts_rad is None:
         shifts_rad = 2 * np.pi * np.arange(len(images)) / len(images)
     weights = phase_weights(shifts_rad)
@@ -100,11 +104,10 @@ def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> li
     sums: list[NDArray[np.float64]] = []
     for image, column in zip(images, weights.T, strict=True):
         grey = image.astype(np.float64)
-        if not sums:
-            sums = [weight * grey for weight in column]
-        else:
-            for total, weight in zip(sums, column, strict=True):
-                total += weight * grey
+        terms = [weight * grey for weight in column]
+        for total, term in zip(sums, terms, strict=False):
+            total += term
+        sums = sums or terms
     return sums
 
 
@@ -113,21 +116,10 @@ def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArr
 
     +pi is mapped to -pi.
     """
-    if numba_enabled():
-        from fpp_ml_bench.decoding.kernels import minus_atan2_kernel
-
+    if kernels := compiled_kernels():
         phase = np.empty(np.shape(sine))
-        minus_atan2_kernel(np.ravel(sine), np.ravel(cosine), phase.ravel())
+        kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())
         return phase
     phase = -arctangent2(sine, cosine)
     phase[phase >= np.pi] = -np.pi
     return phase
-
-
-def clipped_steps(frames: Iterable[ArrayLike], level: int = GREY_LEVELS) -> NDArray[np.uint16]:
-    """In how many of the frames each pixel stands exactly at ``level`` (255: saturated, 0: black), uint16 (H, W)."""
-    images = _checked(frames)
-    count = np.zeros(images[0].shape, dtype=np.uint16)
-    for image in images:
-        count += image == level
-    return count

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig, distort
+from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, distort
 
 GAUSS_NEWTON_STEPS = 3
 """The algebraic start is exact for a projector beside the camera (t_2 = 0) and close otherwise. Each step squares the
@@ -36,12 +36,6 @@ class DepthFromBoth(NamedTuple):
     disagreement_px: NDArray[np.float64]
 
 
-def _axis(direction: Direction) -> int:
-    if direction not in DIRECTIONS:
-        raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
-    return 0 if direction == "vertical" else 1
-
-
 def rotated_ray(rays: Maps, rig: Rig, axis: int) -> NDArray[np.float64]:
     """Component ``axis`` of R (x, y, 1)."""
     x, y = rays
@@ -49,7 +43,7 @@ def rotated_ray(rays: Maps, rig: Rig, axis: int) -> NDArray[np.float64]:
 
 
 def _depth_in_front(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.float64]:
-    """Depth in mm where it is finite and in front of both devices, else NaN."""
+    """Depth in mm where ``depth_m`` is finite and in front of both devices, else NaN."""
     good = (depth_m > 0) & (depth_m < np.inf) & (forward * depth_m + rig.t[2] > 0)
     return np.where(good, depth_m * MM_PER_M, np.nan)
 
@@ -62,7 +56,7 @@ def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> N
     percent for real lenses). Coordinates that do not settle to `FIXED_POINT_TOLERANCE` in `FIXED_POINT_STEPS` are NaN.
     """
     device = rig.projector
-    measured = (coordinate - (device.cx, device.cy)[axis]) / (device.fx, device.fy)[axis]
+    measured = (coordinate - device.centre[axis]) / device.focal[axis]
     rotated = [rotated_ray(rays, rig, i) for i in range(3)]
     ideal, change = measured, np.full(np.shape(measured), np.inf)
     for _ in range(FIXED_POINT_STEPS):
@@ -83,30 +77,26 @@ def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direct
     ``direction`` "vertical", v_p for "horizontal", in px, same shape. No depth: NaN input, ray and projector plane
     parallel, intersection behind either device, or a projector distortion that can't be inverted.
     """
-    axis = _axis(direction)
-    device = rig.projector
+    if direction not in DIRECTIONS:
+        raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
+    axis, device = AXES.index(direction), rig.projector
+    centre, focal = device.centre[axis], device.focal[axis]
     coordinate = np.asarray(coordinate_px, dtype=np.float64)
     with np.errstate(all="ignore"):
         if device.is_distorted:
             ideal = _ideal_coordinate(rays, coordinate, rig, axis)
         else:
-            ideal = (coordinate - (device.cx, device.cy)[axis]) / (device.fx, device.fy)[axis]
+            ideal = (coordinate - centre) / focal
         forward = rotated_ray(rays, rig, 2)
         along, across = rotated_ray(rays, rig, axis), ideal * forward
         depth = (ideal * rig.t[2] - rig.t[axis]) / (along - across)
-        centre, focal = (device.cx, device.cy)[axis], (device.fx, device.fy)[axis]
         size = np.abs(along) + (np.abs(coordinate) + abs(centre)) / focal * np.abs(forward)
         parallel = np.abs(along - across) <= LEAST_PARALLAX * size
         return np.where(parallel, np.nan, _depth_in_front(depth, forward, rig))
 
 
 def depth_from_both(
-    rays: Maps,
-    u_px: ArrayLike,
-    v_px: ArrayLike,
-    rig: Rig,
-    weight_u: ArrayLike = 1.0,
-    weight_v: ArrayLike = 1.0,
+    rays: Maps, u_px: ArrayLike, v_px: ArrayLike, rig: Rig, weight_u: ArrayLike = 1.0, weight_v: ArrayLike = 1.0
 ) -> DepthFromBoth:
     """Depth in mm from both projector coordinates by weighted least squares in projector px, float64; NaN = no depth.
 
@@ -123,19 +113,21 @@ def depth_from_both(
         px, py = device.normalised(u, v)
         weight_u, weight_v = np.asarray(weight_u, dtype=np.float64), np.asarray(weight_v, dtype=np.float64)
         forward = rotated_ray(rays, rig, 2)
-        # f (c - d w) / (forward + t_2 w) is the residual in px; c and d are fixed by the measurement.
+        # f (c - d w) / (forward + t_2 w) is the residual in px; c and d, with f in them, are fixed by the measurement.
         cu, du = device.fx * (rotated_ray(rays, rig, 0) - px * forward), device.fx * (px * tz - tx)
         cv, dv = device.fy * (rotated_ray(rays, rig, 1) - py * forward), device.fy * (py * tz - ty)
+
+        def residuals_and_slopes(w: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+            q = forward + tz * w
+            ru, rv = (cu - du * w) / q, (cv - dv * w) / q
+            return ru, rv, (du + ru * tz) / q, (dv + rv * tz) / q
+
         w = (weight_u * cu * du + weight_v * cv * dv) / (weight_u * du * du + weight_v * dv * dv)
         if tz != 0.0:
             for _ in range(GAUSS_NEWTON_STEPS):
-                q = forward + tz * w
-                ru, rv = (cu - du * w) / q, (cv - dv * w) / q
-                gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
+                ru, rv, gu, gv = residuals_and_slopes(w)
                 w = w + (weight_u * ru * gu + weight_v * rv * gv) / (weight_u * gu * gu + weight_v * gv * gv)
-        q = forward + tz * w
-        ru, rv = (cu - du * w) / q, (cv - dv * w) / q
-        gu, gv = (du + ru * tz) / q, (dv + rv * tz) / q
+        ru, rv, gu, gv = residuals_and_slopes(w)
         disagreement = np.abs(ru * gv - rv * gu) / np.sqrt(gu * gu + gv * gv)
         return DepthFromBoth(_depth_in_front(1.0 / w, forward, rig), disagreement)
 
@@ -167,9 +159,8 @@ def depth_noise_mm(
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma_phase = np.sqrt(2.0 / steps) * np.asarray(noise) / np.asarray(modulation)
         for name in DIRECTIONS if direction == "both" else (direction,):
-            axis = 0 if name == "vertical" else 1
-            focal = (rig.projector.fx, rig.projector.fy)[axis]
-            slope = focal * (rotated_ray(normalised, rig, axis) * rig.t[2] - rig.t[axis] * forward)
+            axis = AXES.index(name)
+            slope = rig.projector.focal[axis] * (rotated_ray(normalised, rig, axis) * rig.t[2] - rig.t[axis] * forward)
             slope = slope / (forward * z + rig.t[2]) ** 2
             sigma_px = rig.pitch(name) * sigma_phase / (2 * np.pi)  # type: ignore[arg-type]
             precision = precision + (slope / sigma_px) ** 2

@@ -15,14 +15,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.gray_code import binary_to_gray, cell_of
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import Frame
 from fpp_ml_bench.portable import cosine_of_turns
-
-
-def _frame(rig: Rig, index: int) -> Frame:
-    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
-        raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
-    return rig.sequence.frames[index]
 
 
 def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
@@ -31,7 +24,9 @@ def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
     Horizontal fringes and code vary along the rows (L = height), vertical ones along the columns (L = width); black and
     white are constant, (1,). Raises `RigError` for an index outside the sequence.
     """
-    frame = _frame(rig, index)
+    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
+        raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
+    frame = rig.sequence.frames[index]
     if frame.direction is None:
         return np.array([0 if frame.kind == "black" else GREY_LEVELS], dtype=np.uint8)
     position = np.arange(rig.pattern_length(frame.direction))

@@ -3,22 +3,37 @@
 Conventions: OpenCV's. The camera frame has x right, y down, z forward; a point goes from the camera's frame to the
 projector's by ``X_p = R X_c + t`` in metres; pixel centres lie at integer coordinates, so that an image W px wide spans
 -0.5 to W - 0.5. The default rig is the paper's (Section 2.2 and Table 1).
+
+A rig file is YAML or JSON; reading is strict, and writing and reading again gives an equal rig::
+
+    camera:    {width: 960, height: 960, fx: 2285.8, fy: 2285.8, cx: 479.5, cy: 479.5, distortion: [k1, k2, p1, p2, k3]}
+    projector: {width: 912, height: 1140, fx: 1824.0, fy: 1824.0, cx: 455.5, cy: 569.5, distortion: [0, 0, 0, 0, 0]}
+    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]     # 3 x 3, or a rotation vector of three numbers (rad)
+    translation_m: [0.125, -0.1, 0.0]               # X_projector = rotation X_camera + translation_m
+    pitch_px: {horizontal: 18, vertical: 18}        # projector px per period of each direction's fringes
+    sequence: {steps: 18, bits_horizontal: 7, bits_vertical: 7}
+    working_range_mm: [1500, 2100]
+    standoff_m: 1.8
+    background_m: 3.2
 """
 
+import json
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.gray_code import bits_needed, cell_count
-from fpp_ml_bench.optics.pinhole import Maps, number, numbers
-from fpp_ml_bench.optics.pinhole import Pinhole as Pinhole
-from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
+from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers
+from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
 
 ROTATION_TOLERANCE = 1e-6
 """Largest accepted |R R^T - I|: what seven printed digits of a calibration leave."""
@@ -60,10 +75,10 @@ class Rig:
             raise RigError(f"rotation: expected three rows of three numbers, got {len(rows)} rows")
         translation = numbers(self.translation_m, 3, "translation_m")
         near_far = numbers(self.working_range_mm, 2, "working_range_mm")
-        settings = {"rotation": rows, "translation_m": translation, "working_range_mm": near_far}
+        settings: dict[str, Any] = {"rotation": rows, "translation_m": translation, "working_range_mm": near_far}
         for name in ("pitch_horizontal_px", "pitch_vertical_px", "standoff_m", "background_m"):
-            settings[name] = number(getattr(self, name), name, positive=True)  # type: ignore[assignment]
-        settings["R"], settings["t"] = np.array(rows), np.array(translation)  # type: ignore[assignment]
+            settings[name] = number(getattr(self, name), name, positive=True)
+        settings["R"], settings["t"] = np.array(rows), np.array(translation)
         for name, value in settings.items():
             object.__setattr__(self, name, value)
         self.R.setflags(write=False)
@@ -135,15 +150,23 @@ class Rig:
         return self.projector.project(np.stack(turned, axis=-1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and mappings, as stored with a dataset; see `fpp_ml_bench.optics.rig_file`."""
-        from fpp_ml_bench.optics.rig_file import rig_to_dict
-
-        return rig_to_dict(self)
+        """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an equal rig back."""
+        return {
+            "camera": self.camera.to_dict(),
+            "projector": self.projector.to_dict(),
+            "rotation": [list(row) for row in self.rotation],
+            "translation_m": list(self.translation_m),
+            "pitch_px": {direction: self.pitch(direction) for direction in DIRECTIONS},
+            "sequence": asdict(self.sequence),
+            "working_range_mm": list(self.working_range_mm),
+            "standoff_m": self.standoff_m,
+            "background_m": self.background_m,
+        }
 
     def _central_coordinate(self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0) -> NDArray:
         """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths (K,)."""
         centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
-        axis = 0 if direction == "vertical" else 1
+        axis = AXES.index(direction)
         pixel = [c + (shift_px if i == axis else 0.0) for i, c in enumerate(centre)]
         x, y = self.camera.normalised(*pixel)
         depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))
@@ -189,3 +212,112 @@ def paper_rig(size: int = FULL_SIZE) -> Rig:
     projector = Pinhole(912, 1140, 1824.0, 1824.0, 911 / 2, 1139 / 2)
     rig = Rig(camera, projector, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.125, -0.1, 0.0))
     return rig if size == FULL_SIZE else rig.scaled(size)
+
+
+def rotation_matrix(vector: tuple[float, ...]) -> NDArray[np.float64]:
+    """Rotation matrix float64 (3, 3) of a rotation vector in rad (Rodrigues' formula)."""
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # np.sinc is sin(pi x) / (pi x): both factors stay exact as the angle goes to zero.
+    half = np.sinc(angle / (2 * math.pi))
+    return np.eye(3) + np.sinc(angle / math.pi) * cross + 0.5 * half * half * (cross @ cross)
+
+
+_RIG_KEYS = (
+    "camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm", "standoff_m",
+    "background_m",
+)  # fmt: skip
+
+
+def _mapping(value: object, keys: Iterable[str], name: str) -> Mapping[str, Any]:
+    prefix, expected = f"{name}: " if name else "", ", ".join(keys)
+    if not isinstance(value, Mapping):
+        raise RigError(f"{prefix}expected a mapping with the keys {expected}, got {value!r}")
+    problems = [f"unknown key {key}" for key in value if key not in keys]
+    problems += [f"missing key {key}" for key in keys if key not in value]
+    if problems:
+        raise RigError(f"{prefix}{', '.join(problems)}; expected exactly {expected}")
+    return value
+
+
+def _pinhole(value: object, name: str) -> Pinhole:
+    entries = _mapping(value, [entry.name for entry in fields(Pinhole)], name)
+    try:
+        return Pinhole(**entries)
+    except RigError as error:
+        raise RigError(f"{name}.{error}") from error
+
+
+def _sequence(value: object) -> Sequence:
+    entries = _mapping(value, [entry.name for entry in fields(Sequence)], "sequence")
+    for key, entry in entries.items():
+        if isinstance(entry, bool) or not isinstance(entry, int):
+            raise RigError(f"sequence.{key}: expected a whole number, got {entry!r}")
+    try:
+        return Sequence(**entries)
+    except ValueError as error:
+        raise RigError(f"sequence: {error}") from error
+
+
+def _rotation(value: object) -> Any:
+    if isinstance(value, list | tuple) and len(value) == 3 and not any(isinstance(v, list | tuple) for v in value):
+        return rotation_matrix(numbers(value, 3, "rotation")).tolist()
+    return value
+
+
+def rig_from_dict(data: object) -> Rig:
+    """The rig that a mapping in the form of this module's docstring describes.
+
+    Raises `RigError` naming the key for anything unknown, missing, of the wrong type, or impossible as a rig.
+    """
+    entries = dict(_mapping(data, _RIG_KEYS, ""))
+    pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
+    for device in ("camera", "projector"):
+        entries[device] = _pinhole(entries[device], device)
+    entries |= {"rotation": _rotation(entries["rotation"]), "sequence": _sequence(entries["sequence"])}
+    return Rig(**entries, pitch_horizontal_px=pitch["horizontal"], pitch_vertical_px=pitch["vertical"])
+
+
+def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    mapping: dict[Any, Any] = {}
+    for key, value in pairs:
+        if key in mapping:
+            raise RigError(f"key {key} is given twice in the same mapping; keep one entry")
+        mapping[key] = value
+    return mapping
+
+
+def _is_json(path: Path) -> bool:
+    if path.suffix.lower() not in (".yaml", ".yml", ".json"):
+        raise RigError(f"{path}: expected a rig file ending in .yaml, .yml or .json")
+    return path.suffix.lower() == ".json"
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
+    file = Path(path)
+    as_json = _is_json(file)
+    try:
+        text = file.read_text(encoding="utf-8")
+        if not text.strip():
+            raise RigError(f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
+        return rig_from_dict(json.loads(text, object_pairs_hook=_unique_keys) if as_json else strict_yaml(text))
+    except RigError as error:
+        raise RigError(f"{file}: {error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise RigError(f"{file}: can't be read as text: {error}") from error
+    except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
+        problem = str(error) or "nested too deeply"
+        raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error
+
+
+def save_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig as YAML or JSON (by the suffix); `load_rig` gives an equal rig back, to the last bit."""
+    file = Path(path)
+    data = rig.to_dict()
+    text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RigError(f"{file}: can't be written: {error.strerror or error}") from error

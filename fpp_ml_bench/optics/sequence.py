@@ -14,6 +14,8 @@ Direction = Literal["horizontal", "vertical"]
 Kind = Literal["sinusoid", "gray", "black", "white"]
 
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
+AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
+"""The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
 CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 
@@ -34,13 +36,9 @@ class Frame:
     @property
     def title(self) -> str:
         """Description for captions and messages."""
-        if self.kind == "sinusoid":
-            return f"{self.index}: {self.direction} sinusoid, step {self.step}"
-        return (
-            f"{self.index}: {self.direction} Gray bit {self.step}"
-            if self.kind == "gray"
-            else f"{self.index}: {self.kind}"
-        )
+        part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}",
+                "gray": f"{self.direction} Gray bit {self.step}"}.get(self.kind, self.kind)  # fmt: skip
+        return f"{self.index}: {part}"
 
 
 @dataclass(frozen=True)
@@ -71,11 +69,9 @@ class Sequence:
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
-        described: list[tuple[Kind, Direction | None, int]] = []
-        for direction in DIRECTIONS:
-            described += [("sinusoid", direction, n) for n in range(self.steps)]
-        for direction in DIRECTIONS:
-            described += [("gray", direction, bit) for bit in range(self.bits(direction))]
+        described: list[tuple[Kind, Direction | None, int]]
+        described = [("sinusoid", direction, n) for direction in DIRECTIONS for n in range(self.steps)]
+        described += [("gray", direction, bit) for direction in DIRECTIONS for bit in range(self.bits(direction))]
         described += [("black", None, 0), ("white", None, 0)]
         return tuple(Frame(i, *d) for i, d in enumerate(described))
 

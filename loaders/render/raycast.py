@@ -4,7 +4,7 @@ The camera's rays go through a depth buffer over the pixels' own rays, lens dist
 box tree. All of it is compiled and float64. Which triangle a ray meets is decided by the signs of three edge functions,
 ``d . (a x b)`` for the edge from a to b as seen from the ray's origin. Two triangles that share an edge compute exactly
 opposite values for it, so no ray passes between them. There is no fastmath and no fused multiply-add, so every
-processor gives the same answer (see `fpp_ml_bench.compiled`).
+processor gives the same answer (see `fpp_ml_bench.machine`).
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.compiled import njit
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics import Pinhole
 
 SLACK = 1e-9

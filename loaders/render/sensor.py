@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from fpp_ml_bench.compiled import njit, numba_enabled
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
+from fpp_ml_bench.machine import njit, numba_enabled
 from fpp_ml_bench.optics import Rig, pattern_profiles
 
 TABLE_BITS = 12

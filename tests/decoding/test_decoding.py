@@ -4,53 +4,18 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from captures import LENSES, PAPER, TURNED, capture, tilted
 
-from fpp_ml_bench.compiled import SWITCH, numba_enabled
+from fpp_ml_bench.baselines.stability import coded_rig, plane_stack
 from fpp_ml_bench.decoding.blocks import Limits, Reason
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.decoding.phase import phase_weights
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import Pinhole, Rig, Sequence, paper_rig, pattern_image, rotation_matrix
+from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 
 MODULATION = 0.45 * 127.5
-
-
-def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):
-    """Frames of a surface at ``depth_m`` (H, W): pattern lookup by OpenCV, light, noise and 8 bits."""
-    x, y = rig.camera.rays()
-    u, v = (
-        coordinates.astype(np.float32)
-        for coordinates in rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1))
-    )
-    rng = np.random.default_rng(seed)
-    frames = []
-    for index in range(len(rig.sequence)):
-        pattern = cv2.remap(pattern_image(rig, index).astype(np.float32), u, v, cv2.INTER_LINEAR)
-        image = ambient + albedo * pattern + noise * rng.standard_normal(pattern.shape)
-        frames.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
-    return frames
-
-
-def tilted(rig):
-    x, y = rig.camera.rays()
-    return 1.8 / (1.0 - 0.4 * x + 0.25 * y)
-
-
-PAPER = paper_rig(200)
-TURNED = Rig(
-    camera=Pinhole(180, 160, 420.0, 415.0, 91.0, 77.0, (-0.15, 0.06, 0.001, -0.001, 0.0)),
-    projector=Pinhole(900, 1100, 1800.0, 1790.0, 455.0, 540.0),
-    rotation=rotation_matrix((-0.03, 0.04, 0.05)),
-    translation_m=(0.15, -0.12, 0.03),
-    pitch_horizontal_px=17.3,
-    pitch_vertical_px=20.0,
-    sequence=Sequence(9, 8, 7),
-)
-LENSES = replace(TURNED, projector=replace(TURNED.projector, distortion=(0.05, -0.03, 0.001, -0.001, 0.0)))
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
 NEEDS_NUMBA = pytest.mark.skipif(not numba_enabled(), reason="numba is not in use")
 
@@ -108,7 +73,7 @@ def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
     for frame in frames[::3]:
         frame[:20] = np.random.default_rng(1).integers(0, 256, frame[:20].shape, dtype=np.uint8)  # no signal at all
     compiled = decode_stack(frames, rig, direction, details=True)
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(NUMBA_SWITCH, "0")
     plain = decode_stack(frames, rig, direction, details=True)
     assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
     assert len(np.unique(plain.reason)) >= 3
@@ -138,7 +103,7 @@ def test_the_compiled_arctangent_is_numpys_on_every_side():
 
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_mask_threads_and_layout_change_no_bit(switch, monkeypatch):
-    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv(NUMBA_SWITCH, switch)
     frames = capture(PAPER, tilted(PAPER))
     full = decode_stack(frames, PAPER, details=True)
     mask = np.random.default_rng(3).random(frames[0].shape) < 0.3
@@ -164,7 +129,7 @@ def reasons(frames, rig=PAPER, direction="both", **arguments):
 
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_every_reason_is_given_where_it_holds(switch, monkeypatch):
-    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv(NUMBA_SWITCH, switch)
     depth = tilted(PAPER)
     frames = capture(PAPER, depth, noise=0.3)
     inside = np.s_[80:120, 80:120]
@@ -266,7 +231,7 @@ def test_without_numba_the_decoder_still_works():
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import numpy as np\n"
-        "from fpp_ml_bench.compiled import numba_enabled, njit\n"
+        "from fpp_ml_bench.machine import numba_enabled, njit\n"
         "from fpp_ml_bench.decoding.decode import decode_stack\n"
         "from fpp_ml_bench.optics.rig import paper_rig\n"
         "assert not numba_enabled() and njit(len) is len\n"
@@ -276,7 +241,43 @@ def test_without_numba_the_decoder_still_works():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_weights_of_the_chosen_subset_are_the_least_squares_solution():
-    shifts = 2 * np.pi * np.array([0, 4, 7, 11, 14]) / 18
-    model = np.stack([np.ones(5), np.cos(shifts), np.sin(shifts)], axis=1)
-    np.testing.assert_allclose(phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14)
+@pytest.mark.parametrize("steps", [4, 5, 6, 9, 18])
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_a_black_frame_is_refused_by_name(steps, direction):
+    rig = coded_rig(steps=steps)
+    frames, _ = plane_stack(rig)
+    dead = rig.sequence.sinusoids(direction)[2]
+    frames[dead] = np.zeros_like(frames[dead])
+    with pytest.raises(DecodeError, match=rf"frame {dead}: {direction} sinusoid, step 2.*capture failed"):
+        decode_stack(frames, rig, direction="both")
+
+
+def test_a_dimmed_frame_is_refused_unless_it_is_not_used():
+    rig = coded_rig()
+    frames, _ = plane_stack(rig)
+    frames[1] = frames[1] // 2
+    with pytest.raises(DecodeError, match="frame 1: horizontal sinusoid, step 1"):
+        decode_stack(frames, rig)
+    assert (decode_stack(frames, rig, steps=9).depth_mm > 0).mean() > 0.9
+    assert (decode_stack(frames, rig, direction="vertical").depth_mm > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("steps", [4, 5, 6, 18])
+@pytest.mark.parametrize("pitch", [18.0, 900.0])
+@pytest.mark.parametrize("bend", ["gamma", "clipped", "dark", "flat", "black", "random"])
+def test_no_correct_capture_is_refused(steps, pitch, bend):
+    rig = coded_rig(pitch, steps)
+    frames, _ = plane_stack(rig, mean=100.0, modulation=90.0)
+    change = {
+        "gamma": lambda grey: 255 * (grey / 255.0) ** 2.2,
+        "clipped": lambda grey: np.minimum(2.5 * grey, 255.0),
+        "dark": lambda grey: grey / 20.0,
+        "flat": lambda grey: np.full(grey.shape, 90.0),
+        "black": lambda grey: np.zeros(grey.shape),
+        "random": lambda grey: np.random.default_rng(3).integers(0, 256, grey.shape),
+    }[bend]
+    stack = [None if grey is None else np.rint(change(grey)).astype(np.uint8) for grey in frames]
+    decode_stack(stack, rig)
+    few = np.zeros((32, 32), dtype=bool)
+    few[3:12, 4:12] = True  # 72 pixels: a small patch of phase
+    decode_stack(stack, rig, mask=few)

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE
-from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.compiled import SWITCH as COMPILED
 from fpp_ml_bench.decoding.blocks import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, gray_bits_in_view, orders_from_phases
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import DIRECTIONS, paper_rig
 
 COARSE = replace(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from skimage.restoration import unwrap_phase
 
 from fpp_ml_bench.decoding.blocks import CLIPPED_STEPS_DIVISOR
-from fpp_ml_bench.decoding.phase import choose_steps, clipped_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.decoding.phase import choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import DecodeError
 
 
@@ -110,12 +110,6 @@ def test_a_ramp_unwraps_to_itself():
     np.testing.assert_allclose(unwrapped - unwrapped[0, 0], ramp - ramp[0, 0], atol=1e-9)
 
 
-def test_clipped_steps_counts_both_ends():
-    frames = np.array([[[255, 0]], [[255, 1]], [[254, 0]]], dtype=np.uint8)
-    assert clipped_steps(frames).tolist() == [[2, 0]]
-    assert clipped_steps(frames, level=0).tolist() == [[0, 2]]
-
-
 @pytest.mark.parametrize("steps", [9, 12, 18, 27])
 def test_the_clipping_that_the_decoder_allows_moves_the_phase_by_under_five_mrad(steps):
     """What `CLIPPED_STEPS_DIVISOR` promises, by exhaustion over phase and clipping level."""
@@ -146,3 +140,9 @@ def test_the_clipping_that_the_decoder_allows_moves_the_phase_by_under_five_mrad
 def test_frames_that_hold_no_phase_are_refused(frames, arguments, message):
     with pytest.raises(DecodeError, match=message):
         wrapped_phase(frames, **arguments)
+
+
+def test_weights_of_the_chosen_subset_are_the_least_squares_solution():
+    shifts = 2 * np.pi * np.array([0, 4, 7, 11, 14]) / 18
+    model = np.stack([np.ones(5), np.cos(shifts), np.sin(shifts)], axis=1)
+    np.testing.assert_allclose(phase_weights(shifts), np.linalg.lstsq(model, np.eye(5), rcond=None)[0], atol=1e-14)

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics.lens import distort, fold_radius_squared, undistort
-from fpp_ml_bench.optics.rig import Pinhole, Rig, paper_rig
-from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, rig_to_dict, rotation_matrix, save_rig
+from fpp_ml_bench.optics.pinhole import distort, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig import Pinhole, Rig, load_rig, paper_rig, rig_from_dict, rotation_matrix, save_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 DISTORTION = (-0.21, 0.11, 0.0013, -0.0021, -0.02)
@@ -58,7 +57,7 @@ def test_sampling_below_four_px_a_period_is_refused_with_a_pitch_that_does(size,
         rig.check_sampling()
     pitch = float(str(caught.value).split("pitch of at least ")[1].split(" px")[0])
     assert 18 < pitch < 20
-    data = rig_to_dict(rig)
+    data = rig.to_dict()
     data["pitch_px"] = {"horizontal": pitch, "vertical": pitch}
     rig_from_dict(data).check_sampling()
 
@@ -118,14 +117,14 @@ def test_files_round_trip_to_the_last_bit(tmp_path, suffix):
 
 
 def test_a_rotation_vector_is_taken(tmp_path):
-    data = rig_to_dict(paper_rig())
+    data = paper_rig().to_dict()
     data["rotation"] = [0.0, 0.1, 0.0]
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data))
     np.testing.assert_allclose(load_rig(tmp_path / "rig.yaml").R[0], [np.cos(0.1), 0, np.sin(0.1)], atol=1e-15)
 
 
 def _changed(path: str, value: object) -> dict:
-    data = json.loads(json.dumps(rig_to_dict(paper_rig())))
+    data = json.loads(json.dumps(paper_rig().to_dict()))
     *parents, last_key = path.split(".")
     entry = data
     for key in parents:

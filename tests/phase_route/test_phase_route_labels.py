@@ -8,7 +8,7 @@ import pytest
 
 from fpp_ml_bench.baselines.phase_route import label_kernels
 from fpp_ml_bench.baselines.phase_route.labels import least_energy
-from fpp_ml_bench.compiled import SWITCH
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 
 
 def problem(shape: tuple[int, int], count: int, seed: int) -> tuple[np.ndarray, ...]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from fpp_ml_bench.compiled import SWITCH
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.loaders.render.illumination import background_plane, in_pattern, light_surface, projector_centre_m
@@ -14,6 +13,7 @@ from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, Lighting, SolidMesh
 from fpp_ml_bench.loaders.render.sensor import Exposure, Noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics import paper_rig
 
 RIG = paper_rig(176)

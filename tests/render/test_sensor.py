@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fpp_ml_bench.compiled import SWITCH
 from fpp_ml_bench.loaders.render.illumination import LitPixels, PatternLookup
 from fpp_ml_bench.loaders.render.scene import uniform
 from fpp_ml_bench.loaders.render.sensor import (
@@ -21,6 +20,7 @@ from fpp_ml_bench.loaders.render.sensor import (
     standard_normal,
     stream_keys,
 )
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics import paper_rig, pattern_image
 
 SIZE = 960

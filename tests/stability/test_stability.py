@@ -159,7 +159,7 @@ def break_guard(monkeypatch):
 
 
 def break_lens(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.optics.lens._radial_start", lambda x, y, _: (x.copy(), y.copy()))
+    monkeypatch.setattr("fpp_ml_bench.optics.pinhole._radial_start", lambda x, y, _: (x.copy(), y.copy()))
     missed = {"k1": 0.6, "k2": 0.9, "k3": -0.3}
     return [member for member in cases_of("rig", "lens inverse, several terms") if member.parameters == missed]
 

@@ -1,20 +1,22 @@
-"""Detects a sinusoid frame whose capture failed (dead, dimmed or flashed), from the frames' mean grey levels.
+"""What can't be decoded is refused: frames, masks and limits that don't fit, and sinusoids whose capture failed.
 
 Every pixel follows ``A + C cos delta_n + S sin delta_n``, and so does the mean over any set of pixels. With seven or
 more steps, a mean that contradicts the other means is therefore detected in any scene; the three or more redundant
-equations tell a wrong frame from a scene that violates the model (gamma on a few pixels). With four to six steps only a
-black frame can be detected, by comparison with the frame half a period later. Three steps have no redundancy. Without
-this check a wrong frame would go unnoticed and cause a phase error of up to (2/N) (A + B) / B.
+equations tell a wrong frame (dead, dimmed or flashed) from a scene that violates the model (gamma on a few pixels).
+With four to six steps only a black frame can be detected, by comparison with the frame half a period later. Three steps
+have no redundancy. Without this check a wrong frame would go unnoticed and cause a phase error of up to
+(2/N) (A + B) / B.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding.blocks import DirectionPlan
+from fpp_ml_bench.decoding.blocks import DirectionPlan, Limits
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics import Sequence as FrameSequence
 
 SAMPLED_PX = 4096
 LEAST_PX = 64
@@ -31,23 +33,68 @@ OPPOSITE_SPAN_GREY = 40
 degrees off that for five steps) then spans at most a fifth of the modulation."""
 
 
+def check_limits(limits: Limits) -> None:
+    """Raise `DecodeError` for a limit that is no limit."""
+    for name in ("min_modulation", "max_disagreement_px", "ambiguous_fraction"):
+        value = getattr(limits, name)
+        if not (np.isfinite(value) and value > 0):
+            raise DecodeError(f"{name}: expected a positive finite number, got {value!r}")
+    if limits.max_clipped_steps is not None and limits.max_clipped_steps < 0:
+        raise DecodeError(f"max_clipped_steps: expected 0 or more, got {limits.max_clipped_steps!r}")
+
+
+def flat_frames(
+    frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig
+) -> dict[int, NDArray[np.uint8]]:
+    """The frames at the indices ``used``, checked and flattened to (H * W,)."""
+    expected = (rig.camera.height, rig.camera.width)
+    if len(frames) != len(rig.sequence):
+        raise DecodeError(
+            f"expected the {len(rig.sequence)} frames of the rig's sequence, got {len(frames)}; "
+            "put None in the place of a frame that was not captured"
+        )
+    flat = {}
+    for index in used:
+        frame, title = frames[index], f"frame {rig.sequence.frames[index].title}"
+        if frame is None:
+            raise DecodeError(f"{title}: expected an image, got None; this decoding needs the frame, capture it")
+        image = np.asarray(frame)
+        if image.dtype != np.uint8:
+            raise DecodeError(f"{title}: expected uint8 grey levels, got dtype {image.dtype}")
+        if image.shape != expected:
+            raise DecodeError(
+                f"{title}: expected shape (H, W) = {expected} of the rig's camera, got {image.shape}; "
+                "use rig.scaled(width) for a resized image"
+            )
+        flat[index] = image.reshape(-1)
+    return flat
+
+
+def mask_indices(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.intp] | None:
+    """Flat indices of the pixels in ``mask``; None without a mask."""
+    if mask is None:
+        return None
+    if np.asarray(mask).dtype != np.bool_ or np.shape(mask) != shape:
+        raise DecodeError(f"mask: expected bool {shape}, got {np.asarray(mask).dtype} {np.shape(mask)}")
+    return np.flatnonzero(mask)
+
+
 def check_frames(
     flat: Mapping[int, NDArray[np.uint8]],
     plan: DirectionPlan,
-    mask_indices: NDArray[np.intp] | None,
-    sequence: Sequence,
+    indices: NDArray[np.intp] | None,
+    sequence: FrameSequence,
 ) -> None:
     """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others.
 
-    ``flat`` frames by index, uint8 (pixels,); ``mask_indices`` flat indices of the pixels to decode (None: all). Tests
-    at most `SAMPLED_PX` of them, evenly spread.
+    ``flat`` frames by index, uint8 (pixels,); ``indices`` of the pixels to decode (None: all). Tests at most
+    `SAMPLED_PX` of them, evenly spread.
     """
-    first = flat[plan.sinusoids[0]]
-    pixel_count = len(first) if mask_indices is None else len(mask_indices)
+    pixel_count = len(flat[plan.sinusoids[0]]) if indices is None else len(indices)
     if pixel_count < LEAST_PX or len(plan.sinusoids) < 4:
         return
     step = -(-pixel_count // SAMPLED_PX)
-    sampled = slice(None, None, step) if mask_indices is None else mask_indices[::step]
+    sampled = slice(None, None, step) if indices is None else indices[::step]
     levels = [flat[index][sampled] for index in plan.sinusoids]
     if len(levels) >= LEAST_STEPS_FOR_MEANS:
         shifts = 2 * np.pi * np.array([sequence.frames[index].step for index in plan.sinusoids]) / sequence.steps
@@ -88,6 +135,6 @@ def _black_frame(levels: list[NDArray[np.uint8]]) -> tuple[int, str] | None:
     """
     for position, level in enumerate(levels):
         opposite = levels[(position + len(levels) // 2) % len(levels)]
-        if not level.any() and int(opposite.max()) - int(opposite.min()) >= OPPOSITE_SPAN_GREY:
+        if not level.any() and np.ptp(opposite) >= OPPOSITE_SPAN_GREY:
             return position, "it is black all over while the other steps vary"
     return None

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE, file_bytes, tiny_settings
-from test_decoding import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.compiled import SWITCH as COMPILED
 from fpp_ml_bench.decoding import Limits, Reason, decode_stack
 from fpp_ml_bench.loaders.render import Backdrop, Exposure, Lighting, PixelRays, SolidMesh, TracedObject, build, place
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 

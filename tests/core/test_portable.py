@@ -4,8 +4,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from fpp_ml_bench.compiled import SWITCH
 from fpp_ml_bench.decoding import minus_atan2
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.portable import arctangent2, cosine_of_turns, power, sine_of_turns
 
 mpmath.mp.dps = 50
