@@ -1,11 +1,19 @@
-"""Groups of the leaderboard: what results must share to be ranked together, how a group and its data are called, and
-what its methods assumed or were told."""
+"""Groups of the leaderboard: what results must share to be ranked together, what its methods assumed or were told, and
+how a group, its data and its rows are called.
 
+Short names are for tables and pictures; a row's own page has the long name and every setting. Rows of this package's
+methods get a name from their method and settings. Every other submission keeps its own name, cut at a word.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark_of
+from fpp_ml_bench.optics import CONFIGS
 
 LEGACY_FINGERPRINTS = frozenset(
     {
@@ -32,6 +40,16 @@ _BRIGHTNESS = (
 )
 _ASSUMED = {"phase": _BRIGHTNESS, "phase-net": _BRIGHTNESS}
 """By method: in a few words for a table, and as a sentence. It holds unless the setting ``shading`` is off."""
+
+
+LONGEST_NAME = 36
+"""Characters of a short name."""
+
+_DIRECTIONS = ("horizontal", "vertical", "both")
+_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD"}
+_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
+_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
+"""By the setting ``depth_range``. That the range was told is the group's track."""
 
 
 @dataclass(frozen=True, order=True)
@@ -117,3 +135,108 @@ def assumption_sentences(result: Result) -> str:
 def _of(result: Result) -> tuple[str, str]:
     submission = result.submission
     return _ASSUMED.get(submission.method, ("", "")) if submission.settings.get("shading") is True else ("", "")
+
+
+def short_names(submissions: Sequence[Submission]) -> list[str]:
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name.
+
+    Where two would get the same, the later by its own name has a number behind it.
+    """
+    derived = {submission.name: _from_settings(submission) for submission in submissions}
+    chosen: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in sorted(derived, key=lambda name: (derived[name] is None, name)):
+        short, number = derived[name] or cut_at_word(printable(name)), 1
+        candidate = short
+        while candidate in taken:
+            number += 1
+            suffix = f" ({number})"
+            candidate = cut_at_word(short, LONGEST_NAME - len(suffix)) + suffix
+        taken.add(candidate)
+        chosen[name] = candidate
+    return [chosen[submission.name] for submission in submissions]
+
+
+def cut_at_word(text: str, longest: int = LONGEST_NAME) -> str:
+    """``text``, or as many of its words as fit into ``longest`` characters with an ellipsis behind them."""
+    if len(text) <= longest:
+        return text
+    words = text[:longest].rpartition(" ")[0].rstrip(" ,;:-+(")
+    return (words or text[: longest - 1]) + "…"
+
+
+def _from_settings(submission: Submission) -> str | None:
+    """A name made of the method's settings; None for a submission that is not one of this package's methods."""
+    try:
+        if submission.method == "classical" and submission.name.startswith("Classical "):
+            name = _classical(submission)
+        elif submission.method == "phase" and submission.name.startswith("Phase route, "):
+            name = _phase(submission)
+        elif submission.method == "phase-net" and submission.name.startswith("Phase route, "):
+            name = _phase_net(submission)
+        else:
+            name = _network(submission)
+    except (KeyError, TypeError, ValueError):  # settings that the package's methods do not write
+        return None
+    return name if len(name) <= LONGEST_NAME else None
+
+
+def _direction(submission: Submission) -> str:
+    return _DIRECTIONS[_DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
+
+
+def _classical(submission: Submission) -> str:
+    steps, direction = _whole(submission.settings["steps"]), _direction(submission)
+    if not submission.settings.get("fewest"):
+        return f"Classical {steps}+Gray, {direction}"
+    gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
+    return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
+
+
+def _phase(submission: Submission) -> str:
+    settings, direction = submission.settings, _direction(submission)
+    if "error_mm" in settings:
+        name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
+    else:
+        name = f"Phase, {_whole(settings['frames'])} {direction}"
+    shading, standoff = bool(settings["shading"]), settings.get("prior") == "standoff"
+    if not shading:
+        return f"{name}, standoff alone" if standoff else f"{name}, no shading"
+    return f"{name}, standoff" if standoff else name
+
+
+def _phase_net(submission: Submission) -> str:
+    settings = submission.settings
+    shading = "" if settings["shading"] else ", no shading"
+    return f"{printable(settings['weights'])}, 1 {_direction(submission)}{shading}"
+
+
+def _network(submission: Submission) -> str:
+    settings = submission.settings
+    network = _NETWORKS[str(settings["network"])]
+    if not submission.name.startswith(f"{network}, "):
+        raise ValueError("a name of its own")
+    normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]
+    trained_frames = str(settings["trained_frames"])
+    if trained_frames not in CONFIGS:
+        raise ValueError("unknown frames")
+    frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
+    background = "no background" if settings["background_removed"] else ""
+    depth_range = _RANGES[settings.get("depth_range")]  # type: ignore[index]
+    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}", background, depth_range]
+    return ", ".join(part for part in parts if part)
+
+
+def _loss(label: str) -> str:
+    """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
+    kind, _, rest = label.partition("_")
+    if kind == "hybrid":
+        loss, _, weight = rest.partition("_")
+        return f"hybrid {_LOSSES[loss]} {float(weight):g}"
+    return f"masked {_LOSSES[rest]}" if kind == "masked" else _LOSSES[label]
+
+
+def _whole(value: object) -> int:
+    if not isinstance(value, int):
+        raise TypeError("expected a whole number")
+    return value

@@ -9,8 +9,8 @@ from typing import Any
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DatasetError, PublishError
 from fpp_ml_bench.files import file_hash, write_atomically
-from fpp_ml_bench.leaderboard.export import markdown_text
 from fpp_ml_bench.leaderboard.publish_tasks import BENCHMARK, FRAMEWORK, SCORE_TEXT, tasks_of
+from fpp_ml_bench.leaderboard.tables import markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes
 from fpp_ml_bench.loaders.storage import (
     MESH_FOLDER,

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from fpp_ml_bench.baselines.tradeoff import shipped_tradeoff
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.tradeoff import shipped_tradeoff
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files
 
 _README = "README.md"

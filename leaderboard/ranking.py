@@ -9,9 +9,8 @@ from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import Interval, ranks_with_ties
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
+from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked, short_names
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
-from fpp_ml_bench.leaderboard.short_names import short_names
 
 DEFAULT_SORT = "object_mae_mm"
 SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")

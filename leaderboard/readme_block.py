@@ -6,11 +6,10 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.report import millimetres
 from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.leaderboard.columns import RANK_NOTE, SELF_REPORTED, device, reliance
-from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption
 from fpp_ml_bench.leaderboard.paper import paper_tables
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
+from fpp_ml_bench.leaderboard.tables import RANK_NOTE, SELF_REPORTED, device, markdown_rows, markdown_text, reliance
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 _TITLES = (

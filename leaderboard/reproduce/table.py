@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.evaluation.report import percent
-from fpp_ml_bench.leaderboard.columns import device
-from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.paper import paper_tables
 from fpp_ml_bench.leaderboard.reproduce.lines import MAIN_KEY, Line
 from fpp_ml_bench.leaderboard.reproduce.paper_order import Ordering
 from fpp_ml_bench.leaderboard.reproduce.plan import MEAN, PREDICTED, Variant
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, PROVENANCES
+from fpp_ml_bench.leaderboard.tables import device, markdown_rows, markdown_text
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fpp_ml_bench.leaderboard.tradeoff import clock as tradeoff_clock
-from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
-from fpp_ml_bench.leaderboard.tradeoff.figure import draw_growth
-from fpp_ml_bench.leaderboard.tradeoff.growth import fit_power, growth
-from fpp_ml_bench.leaderboard.tradeoff.ladder import Ladder, Rung, time_ladder
-from fpp_ml_bench.leaderboard.tradeoff.report import growth_csv
+from fpp_ml_bench.baselines.tradeoff import measure as tradeoff_measure
+from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, Rung
+from fpp_ml_bench.baselines.tradeoff.measure import Rules, fit_power, growth, time_ladder
+from fpp_ml_bench.baselines.tradeoff.report import draw_growth, growth_csv
 
 AMOUNTS = [10, 20, 40, 80, 160]
 
@@ -75,8 +73,8 @@ class World:
 @pytest.fixture
 def world(monkeypatch):
     clock = World()
-    monkeypatch.setattr(tradeoff_clock, "perf_counter", lambda: clock.now)
-    monkeypatch.setattr(tradeoff_clock, "process_time", lambda: clock.now)
+    monkeypatch.setattr(tradeoff_measure, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(tradeoff_measure, "process_time", lambda: clock.now)
     return clock
 
 

@@ -10,13 +10,12 @@ from scored_dataset import make_dataset
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.tradeoff import networks as tradeoff_networks
+from fpp_ml_bench.baselines.tradeoff.ladders import frame_ladders, pixel_ladders
+from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured
+from fpp_ml_bench.baselines.tradeoff.networks import calibration, network_settings
+from fpp_ml_bench.baselines.tradeoff.settings import TradeoffSettings, choose_views
 from fpp_ml_bench.baselines.training import save_weights
-from fpp_ml_bench.leaderboard.tradeoff import networks as tradeoff_networks
-from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
-from fpp_ml_bench.leaderboard.tradeoff.ladders import frame_ladders, pixel_ladders
-from fpp_ml_bench.leaderboard.tradeoff.measure import measured
-from fpp_ml_bench.leaderboard.tradeoff.networks import calibration, network_settings
-from fpp_ml_bench.leaderboard.tradeoff.views import choose_views
 from fpp_ml_bench.optics import paper_rig
 
 SIZE = (32, 48)
@@ -50,7 +49,8 @@ def runs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chosen(views, runs):
-    return {setting.key: setting for setting in network_settings(views, 1, runs, widths=(4,))}
+    settings = TradeoffSettings(views.opened.path, runs, runs=runs, widths=(4,))
+    return {setting.key: setting for setting in network_settings(views, settings)}
 
 
 def of(chosen, *parts):

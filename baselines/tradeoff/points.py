@@ -1,0 +1,233 @@
+"""What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts; and
+the journal from which a stopped run continues.
+
+There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its whole
+depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import Field, ValidationError
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result import HardwareInfo, read_json
+from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
+
+Group = Literal["classical", "phase", "networks", "precision", "sizes"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+COSTS = "costs"
+"""The group of `Growth`, which compares no methods."""
+Cost = Literal["seconds", "frames"]
+COST_KEYS: tuple[Cost, ...] = get_args(Cost)
+ErrorKey = Literal["object_mae_mm", "measured_mae_mm"]
+SLOWED = 1.25
+"""A setting is marked when the machine ran slower by this factor beside it than in the run's median."""
+MOST_LEFT_OUT = 0.05
+"""Share of the object's pixels without a depth up to which an error over the others is compared."""
+TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.jsonl"
+
+
+class Point(StrictModel):
+    """A setting: ``seconds`` per view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
+
+    ``interval_mm`` is the 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method
+    was told about the views that it is scored on. ``note``: further remarks. ``failed``: why there is no measurement;
+    there are no numbers then. ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's
+    one-minute load average at that time, None where the system does not provide it.
+    """
+
+    key: Text
+    group: Group
+    title: Text
+    frames: Count = 0
+    image_px: Count = 0
+    runs: Count = 0
+    seconds: Positive | None = None
+    seconds_p5: Positive | None = None
+    seconds_p95: Positive | None = None
+    object_mae_mm: NonNegative | None = None
+    interval_mm: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    measured_mae_mm: NonNegative | None = None
+    missing_share: Share | None = None
+    parameters: Count = 0
+    given: Text | None = None
+    note: Text | None = None
+    failed: Text | None = None
+    pace_ms: Positive | None = None
+    load: NonNegative | None = None
+
+    @property
+    def ms(self) -> tuple[float, float, float]:
+        """Median, 5th and 95th percentile of the time per view in ms, 0 where it is not known."""
+        median, low, high = (1000 * (value or 0) for value in (self.seconds, self.seconds_p5, self.seconds_p95))
+        return median, low, high
+
+
+class Growth(StrictModel):
+    """Seconds of one stage (the least of several runs) at ``amounts`` of pixels, frames, objects or rows, and the
+    fitted power: see `fpp_ml_bench.baselines.tradeoff.ladders`."""
+
+    stage: Text
+    over: Text
+    amounts: list[Positive]
+    seconds: list[Positive]
+    exponent: float
+    low: float
+    high: float
+    tail: float
+    flag: Text | None = None
+
+
+class Tradeoff(StrictModel):
+    """A whole run: the data, the rules, the machine, and the results.
+
+    ``sittings``: how often the run was started or continued; times of different sittings may differ by more than the
+    pace shows. ``settings``: the rules and options of the run.
+    """
+
+    tradeoff_schema_version: Literal["1.0.0"] = "1.0.0"
+    created: Text
+    dataset: Text
+    fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    image_size: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    target: Text
+    views: list[Text]
+    settings: dict[Text, Scalar]
+    hardware: HardwareInfo
+    software: dict[Text, Text]
+    sittings: Count
+    points: list[Point]
+    growth: list[Growth]
+
+    @property
+    def pace_ms(self) -> list[float]:
+        """The pace beside each point, ascending."""
+        return sorted(point.pace_ms for point in self.points if point.pace_ms is not None)
+
+    @property
+    def loads(self) -> list[float]:
+        """The system's load beside each point, ascending."""
+        return sorted(point.load for point in self.points if point.load is not None)
+
+    @property
+    def clock(self) -> str:
+        """What the times are of, in words."""
+        return "processor time" if self.settings.get("clock") == "processor" else "wall-clock time"
+
+    def slowed(self, point: Point) -> bool:
+        """Whether the machine was slower beside ``point`` by the factor `SLOWED` than in the run's median."""
+        paces = self.pace_ms
+        return point.pace_ms is not None and point.pace_ms > SLOWED * paces[len(paces) // 2]
+
+    def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
+        """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
+
+        The precisions are left out: they repeat the classical method's arithmetic in plain NumPy. For the error over
+        measured pixels, points that leave out more than `MOST_LEFT_OUT` of the object's pixels are left out too:
+        a method must not gain by leaving out difficult pixels.
+        """
+        points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
+        if error == "measured_mae_mm":
+            points = [point for point in points if (point.missing_share or 0) <= MOST_LEFT_OUT]
+        return [point for point in points if point.seconds and getattr(point, error)]
+
+    def front(self, cost: Cost = "seconds", error: ErrorKey = "object_mae_mm") -> list[Point]:
+        """The comparable points that no other beats in both cost and error, the cheapest first."""
+        points = sorted(self.comparable(error), key=lambda point: point.key)
+        return [points[i] for i in pareto_front([(float(getattr(p, cost)), getattr(p, error)) for p in points])]
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the ``points`` (cost, error) that no other point beats: none is as good in both and better in one.
+
+    Smaller is better. Sorted by cost. Points that are equal in both are all on the front or all off it.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=points.__getitem__):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
+
+
+def read_tradeoff(path: Path) -> Tradeoff:
+    """A ``tradeoff.json``, read strictly. SubmissionError names the file and what is wrong with it."""
+    return validate(Tradeoff, read_json(path), path, "tradeoff file")
+
+
+def shipped_tradeoff() -> Tradeoff:
+    """The trade-off that ships with the package and is shown on the leaderboard's page."""
+    return read_tradeoff(Path(__file__).with_name(TRADEOFF_FILE))
+
+
+class Journal:
+    """The file ``folder``/measured.jsonl: a JSON line for each setting of the run that ``about`` describes.
+
+    The first line names rules and machine; a file of others is refused, because times are only compared within a run.
+    An incomplete last line (after a crash) is dropped and measured again. ``points`` by key, ``growth`` by ladder;
+    points that failed are forgotten: a package may have been installed since. Raises SubmissionError for a file of
+    another run (it names what differs) and for one that can't be read or written.
+    """
+
+    def __init__(self, folder: Path, about: dict[str, Any]) -> None:
+        self.path = folder / JOURNAL
+        self.points: dict[str, Point] = {}
+        self.growth: dict[str, list[Growth]] = {}
+        self.sittings = 1
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if self.path.exists():
+                self._read(about)
+            else:
+                self._append(about)
+            self._append({"sitting": True})
+        except OSError as error:
+            raise SubmissionError(f"{self.path} can't be written: {error.strerror}; give another --out") from None
+
+    def add_point(self, point: Point) -> None:
+        """Store ``point``."""
+        self.points[point.key] = point
+        self._append({"point": point.model_dump(mode="json", exclude_none=True)})
+
+    def add_growth(self, ladder: str, growths: list[Growth]) -> None:
+        """Store the ``growths`` of a ``ladder``."""
+        self.growth[ladder] = growths
+        self._append({"ladder": ladder, "growth": [g.model_dump(mode="json", exclude_none=True) for g in growths]})
+
+    def _append(self, content: dict[str, Any]) -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(content, allow_nan=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _read(self, about: dict[str, Any]) -> None:
+        data = self.path.read_bytes()
+        complete = data[: data.rfind(b"\n") + 1]
+        try:
+            first, *lines = [json.loads(line) for line in complete.decode("utf-8").splitlines()] or [None]
+            if not isinstance(first, dict):
+                raise ValueError("its first line is no description of a run")
+        except ValueError as error:
+            raise SubmissionError(
+                f"{self.path}: expected what a run of fpp-bench tradeoff left ({error}); give another --out"
+            ) from None
+        differs = sorted(key for key in {**first, **about} if first.get(key) != about.get(key))
+        if differs:
+            key = differs[0]
+            raise SubmissionError(
+                f"{self.path}: holds a run with another {', '.join(differs)} ({key}: {first.get(key)!r} there, "
+                f"{about.get(key)!r} now); times are only compared within one run: give another --out"
+            )
+        try:
+            points = [Point.model_validate(line["point"]) for line in lines if "point" in line]
+            ladders = [line for line in lines if "ladder" in line]
+            self.growth = {line["ladder"]: list(map(Growth.model_validate, line["growth"])) for line in ladders}
+        except (ValidationError, KeyError, TypeError) as error:
+            raise SubmissionError(f"{self.path}: damaged ({str(error).splitlines()[0]}); give another --out") from None
+        self.points = {key: point for key, point in {p.key: p for p in points}.items() if point.failed is None}
+        self.sittings += len(lines) - len(points) - len(ladders)
+        if complete != data:
+            os.truncate(self.path, len(complete))
