@@ -20,7 +20,7 @@ from pathlib import Path
 from platform import python_version
 from textwrap import shorten
 from time import perf_counter, process_time
-from typing import Any, Literal, NamedTuple, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ from scipy.special import stdtrit
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder
-from fpp_ml_bench.baselines.tradeoff.points import GROUPS, Growth, Journal, Point, Tradeoff
+from fpp_ml_bench.baselines.tradeoff.points import GROUPS, JOURNAL, Growth, Journal, Point, Tradeoff
 from fpp_ml_bench.baselines.tradeoff.settings import Plan, Setting, TradeoffSettings
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.result import HardwareInfo
@@ -210,63 +210,27 @@ def time_ladder(ladder: Ladder, rules: Rules | None = None) -> list[Growth]:
     return sorted(growths, key=lambda stage_growth: -stage_growth.seconds[-1])
 
 
-class Power(NamedTuple):
-    """``exponent`` p of seconds = c amount^p with its 95% interval ``low`` to ``high``; ``tail``: the exponent over the
-    largest amounts alone, where a fixed cost no longer hides a steep term."""
-
-    exponent: float
-    low: float
-    high: float
-    tail: float
-
-
-def fit_power(amounts: Sequence[float], seconds: Sequence[float]) -> Power:
-    """Least squares of log seconds on log amount; the interval is Student's t over the residuals.
-
-    Raises ValueError for fewer than three amounts, amounts that do not ascend, and values without a logarithm.
-
-    >>> fit_power([1, 2, 4, 8], [3, 12, 48, 192]).exponent
-    2.0
-    """
-    x, y = np.asarray(amounts, np.float64), np.asarray(seconds, np.float64)
-    if len(x) < 3 or len(x) != len(y):
-        raise ValueError(f"expected at least 3 amounts and as many times, got {len(x)} and {len(y)}")
-    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(x > 0) and np.all(y > 0)):
-        raise ValueError(f"expected finite amounts and times above 0, got {list(amounts)} and {list(seconds)}")
-    if np.any(np.diff(x) <= 0):
-        raise ValueError(f"expected ascending amounts, got {list(amounts)}")
-    x, y = np.log(x), np.log(y)
-    slope, error = _slope(x, y)
-    half = float(stdtrit(len(x) - 2, 0.5 + CONFIDENCE / 2)) * error
-    tail, _ = _slope(x[-TAIL_POINTS:], y[-TAIL_POINTS:])
-    return Power(round(slope, 10), slope - half, slope + half, round(tail, 10))
-
-
-def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Slope of the line of least squares, and its standard error."""
-    across = x - x.mean()
-    total = float(across @ across)
-    slope = float(across @ (y - y.mean())) / total
-    residual = y - y.mean() - slope * across
-    return slope, float(np.sqrt(residual @ residual / max(1, len(x) - 2) / total))
-
-
 def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[float]) -> Growth:
-    """The growth of ``stage`` over ``over`` with its flag, None where it is at most linear.
+    """The power p of seconds = c amount^p by least squares of the logarithms, its 95% interval by Student's t over the
+    residuals, and the power over the largest amounts alone (``tail``), where a fixed cost no longer hides a steep term.
 
     A power above `LINEAR_LIMIT` is flagged, over all amounts or over the largest. Where the interval includes the
     limit, the flag says that the times do not prove it.
     """
-    power = fit_power(amounts, seconds)
+    x, y = np.log(amounts), np.log(seconds)
+    (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
+    half = stdtrit(len(x) - 2, 0.5 + CONFIDENCE / 2) * np.sqrt(covariance[0, 0])
+    low, high = float(slope - half), float(slope + half)
+    exponent, tail = round(float(slope), 10), round(float(np.polyfit(x[-TAIL_POINTS:], y[-TAIL_POINTS:], 1)[0]), 10)
     flag = None
-    if power.exponent > LINEAR_LIMIT:
-        above_limit = power.low > LINEAR_LIMIT
-        flag = "steeper than linear" if above_limit else "perhaps steeper than linear: times scatter, run it again"
-    elif power.tail > LINEAR_LIMIT:
+    if exponent > LINEAR_LIMIT:
+        proven = low > LINEAR_LIMIT
+        flag = "steeper than linear" if proven else "perhaps steeper than linear: times scatter, run it again"
+    elif tail > LINEAR_LIMIT:
         flag = "steeper than linear at the largest amounts"
     return Growth(
         stage=stage, over=over, amounts=[float(a) for a in amounts], seconds=[float(f"{s:.4g}") for s in seconds],
-        flag=flag, **{name: round(value, 3) for name, value in power._asdict().items()},
+        exponent=round(exponent, 3), low=round(low, 3), high=round(high, 3), tail=round(tail, 3), flag=flag,
     )  # fmt: skip
 
 
@@ -285,15 +249,19 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
     }  # fmt: skip
     cv2.setNumThreads(settings.threads)  # the phase route's filters take all threads by default; torch: see networks
     with exclusive(settings.out / ".lock", settings.out, "measuring into this folder"):
-        journal = Journal(settings.out, about)
+        path = settings.out / JOURNAL
+        journal = Journal.of(path, about)
+        journal.write(path)
         for setting in plan.settings:
             progress(setting.key)
             if setting.key not in journal.points:
-                journal.add_point(measured(setting, rules))
+                journal.points[setting.key] = measured(setting, rules)
+                journal.write(path)
         for ladder in plan.ladders:
             progress(ladder.key)
             if ladder.key not in journal.growth:
-                journal.add_growth(ladder.key, time_ladder(ladder, rules))
+                journal.growth[ladder.key] = time_ladder(ladder, rules)
+                journal.write(path)
     per_object = max(Counter(plan.views.objects).values())
     return Tradeoff(
         created=datetime.now(UTC).isoformat(timespec="seconds"),

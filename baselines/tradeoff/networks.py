@@ -10,7 +10,7 @@ of ``pip install "fpp-ml-bench[onnx]"``.
 import importlib.util
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,7 @@ from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.networks.network_method import DepthRange, NetworkMethod
 from fpp_ml_bench.baselines.tradeoff.settings import Frames, Setting, StoredViews, TradeoffSettings
 from fpp_ml_bench.baselines.training import SHIPPED, SUFFIX, WeightsFile, open_weights
-from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError
-from fpp_ml_bench.loaders.training import unit_range
 
 PRECISIONS = ("fp32", "bf16", "onnx-fp32", "onnx-int8")
 WIDTHS, QUICK_WIDTHS = (4, 8, 16, 32), (4, 8)
@@ -111,8 +109,9 @@ def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: 
     model = load(path, "cpu")
     if depth_range == "predicted" and model.heads is None:
         raise PredictionError(f"{path.name} holds no range heads, so it can't predict a depth range")
-    in_torch = NetworkMethod(model, depth_range, threads=threads, sequence=views.opened.sequence)
-    return _in_precision(model.network, in_torch, precision, partial(calibration, views, in_torch), threads)
+    trained = NetworkMethod(model, depth_range, threads=threads, sequence=views.opened.sequence)
+    set_precision(model.network, precision, partial(calibration, views, trained.frame), threads)
+    return trained
 
 
 def _untrained(width: int, precision: str, views: StoredViews, threads: int) -> Method:
@@ -122,39 +121,9 @@ def _untrained(width: int, precision: str, views: StoredViews, threads: int) -> 
     parameters = parameter_count(network)
     if parameters > 5e8:
         raise NetworkError(f"a UNet of width {width} has {parameters:,} parameters; give a smaller one")
-    in_torch = UntrainedMethod(network)
-    examples = partial(calibration, views, in_torch, UNTRAINED_EXAMPLES)
-    return _in_precision(network, in_torch, precision, examples, threads)
-
-
-def _in_precision(
-    network: FringeNetwork, in_torch: Method, precision: str, examples: partial[NDArray[np.float32]], threads: int
-) -> Method:
-    """``in_torch``, whose network is ``network``, in ``precision``. The range heads and the conversion to mm stay in
-    float32. ``examples`` are calibrated on."""
-    if precision == "bf16":
-        network.forward = torch.autocast("cpu", dtype=torch.bfloat16)(network.forward)  # type: ignore[method-assign]
-    if not precision.startswith("onnx"):
-        return in_torch
-    return OnnxMethod(network, in_torch, examples(), threads, precision == "onnx-int8")
-
-
-def calibration(views: StoredViews, like: Method, count: int = 8) -> NDArray[np.float32]:
-    """Fringes (n, 1, H, W) in [0, 1] of train samples, spread over the split, as int8 is calibrated on."""
-    opened = views.opened
-    samples = opened.samples("train") if "train" in opened.splits else []
-    if not samples:
-        raise PredictionError(f"{opened.path}: int8 is calibrated on train samples, and it has none")
-    (frame,) = like.frames_used
-    chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // count)][:count]]
-    return fringe_batch(chosen, opened.size, "the calibration").numpy()
-
-
-def _only_frame(frames: Frames, index: int) -> NDArray[np.uint8]:
-    image = frames[index]
-    if image is None:
-        raise PredictionError(f"frame {index} was not captured")
-    return image
+    untrained = UntrainedMethod(network)
+    set_precision(network, precision, partial(calibration, views, 0, UNTRAINED_EXAMPLES), threads)
+    return untrained
 
 
 class UntrainedMethod:
@@ -173,49 +142,45 @@ class UntrainedMethod:
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """The network's output float32 (H, W)."""
-        image = _only_frame(frames, 0)
+        image = frames[0]
+        if image is None:
+            raise PredictionError("frame 0 was not captured")
         batch = fringe_batch([image], (image.shape[0], image.shape[1]), self.name)
         with torch.inference_mode():
             return represent(self.network, batch, self.name)[0, 0].float().numpy()
 
 
-class OnnxMethod:
-    """The network of the method ``like`` in onnxruntime, with the input and the description of ``like``. ``quantised``:
-    in int8, calibrated on ``examples`` float32 (n, 1, H, W).
+def calibration(views: StoredViews, frame: int, count: int = 8) -> NDArray[np.float32]:
+    """Fringes (n, 1, H, W) in [0, 1] of train samples, spread over the split, as int8 is calibrated on."""
+    opened = views.opened
+    samples = opened.samples("train") if "train" in opened.splits else []
+    if not samples:
+        raise PredictionError(f"{opened.path}: int8 is calibrated on train samples, and it has none")
+    chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // count)][:count]]
+    return fringe_batch(chosen, opened.size, "the calibration").numpy()
 
-    Raises `FppBenchError` where onnx or onnxruntime is not installed.
+
+def set_precision(
+    network: FringeNetwork, precision: str, examples: Callable[[], NDArray[np.float32]], threads: int
+) -> None:
+    """Run ``network`` in ``precision`` (of `PRECISIONS`) from now on; what is around it stays as it is, in float32.
+
+    ``examples`` float32 (n, 1, H, W) give the size for onnxruntime, and int8 is calibrated on them. Raises
+    `FppBenchError` where onnx or onnxruntime is not installed.
     """
-
-    def __init__(
-        self, network: FringeNetwork, like: Method, examples: NDArray[np.float32], threads: int, quantised: bool
-    ) -> None:
-        for package in ("onnx", "onnxruntime"):
-            if importlib.util.find_spec(package) is None:
-                raise FppBenchError(f'{package} is not installed: pip install "fpp-ml-bench[onnx]"')
-        self.parameters = sum(parameter.numel() for parameter in network.parameters())
-        self.name, self.frames_used = like.name, like.frames_used
-        self.settings: Mapping[str, Any] = like.settings
-        self.uses_ground_truth_range = like.uses_ground_truth_range
-        self.uses_ground_truth_mask = getattr(like, "uses_ground_truth_mask", False)
-        self.units, self.mode = getattr(like, "units", "mm"), getattr(like, "mode", "standard")
-        self.title = f"{like.title}, onnxruntime {'int8' if quantised else 'fp32'}"
-        self._session = _session(network, examples, threads, quantised)
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in `units`."""
-        image = _only_frame(frames, self.frames_used[0])
-        fringe = np.empty((1, 1, *image.shape), np.float32)
-        unit_range(np.ascontiguousarray(image), fringe[0, 0])
-        values: NDArray[np.float32] = self._session.run(None, {self._session.get_inputs()[0].name: fringe})[0][0, 0]
-        if not np.isfinite(values).all():
-            raise PredictionError(f"{self.title}: gave values that are not finite")
-        if self.units != "mm":
-            return values
-        return denormalise(values, self.settings["normalisation"], 0.0, 0.0).astype(np.float32)
+    if precision == "bf16":
+        network.forward = torch.autocast("cpu", dtype=torch.bfloat16)(network.forward)  # type: ignore[method-assign]
+    elif precision.startswith("onnx"):
+        session = _session(network, examples(), threads, precision == "onnx-int8")
+        name = session.get_inputs()[0].name
+        network.forward = lambda fringe: torch.from_numpy(session.run(None, {name: fringe.numpy()})[0])  # type: ignore[method-assign]
 
 
 def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int, quantised: bool) -> Any:
-    import onnxruntime  # optional, as onnx is
+    for package in ("onnx", "onnxruntime"):
+        if importlib.util.find_spec(package) is None:
+            raise FppBenchError(f'{package} is not installed: pip install "fpp-ml-bench[onnx]"')
+    import onnxruntime
 
     from fpp_ml_bench.baselines.networks.onnx_export import export_onnx
 

@@ -5,16 +5,14 @@ There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel wi
 depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
 """
 
-import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import HardwareInfo, read_json
+from fpp_ml_bench.evaluation.result import HardwareInfo, read_json, write_json
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
 
 Group = Literal["classical", "phase", "networks", "precision", "sizes"]
@@ -28,7 +26,7 @@ SLOWED = 1.25
 """A setting is marked when the machine ran slower by this factor beside it than in the run's median."""
 MOST_LEFT_OUT = 0.05
 """Share of the object's pixels without a depth up to which an error over the others is compared."""
-TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.jsonl"
+TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.json"
 
 
 class Point(StrictModel):
@@ -163,71 +161,42 @@ def shipped_tradeoff() -> Tradeoff:
     return read_tradeoff(Path(__file__).with_name(TRADEOFF_FILE))
 
 
-class Journal:
-    """The file ``folder``/measured.jsonl: a JSON line for each setting of the run that ``about`` describes.
+class Journal(StrictModel):
+    """What the run that ``about`` describes has measured so far, so that a stopped run goes on: points by key, growth
+    by ladder, and how often the run was started."""
 
-    The first line names rules and machine; a file of others is refused, because times are only compared within a run.
-    An incomplete last line (after a crash) is dropped and measured again. ``points`` by key, ``growth`` by ladder;
-    points that failed are forgotten: a package may have been installed since. Raises SubmissionError for a file of
-    another run (it names what differs) and for one that can't be read or written.
-    """
+    about: dict[Text, Any]
+    sittings: Count = 1
+    points: dict[Text, Point] = Field(default_factory=dict)
+    growth: dict[Text, list[Growth]] = Field(default_factory=dict)
 
-    def __init__(self, folder: Path, about: dict[str, Any]) -> None:
-        self.path = folder / JOURNAL
-        self.points: dict[str, Point] = {}
-        self.growth: dict[str, list[Growth]] = {}
-        self.sittings = 1
+    @classmethod
+    def of(cls, path: Path, about: dict[str, Any]) -> "Journal":
+        """The journal in ``path`` for another sitting, or a new one. Points that failed are forgotten: a package may
+        have been installed since.
+
+        Raises SubmissionError for one of other rules or of another machine, because times are only compared within a
+        run; it names what differs.
+        """
+        if not path.exists():
+            return cls(about=about)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if self.path.exists():
-                self._read(about)
-            else:
-                self._append(about)
-            self._append({"sitting": True})
-        except OSError as error:
-            raise SubmissionError(f"{self.path} can't be written: {error.strerror}; give another --out") from None
-
-    def add_point(self, point: Point) -> None:
-        """Store ``point``."""
-        self.points[point.key] = point
-        self._append({"point": point.model_dump(mode="json", exclude_none=True)})
-
-    def add_growth(self, ladder: str, growths: list[Growth]) -> None:
-        """Store the ``growths`` of a ``ladder``."""
-        self.growth[ladder] = growths
-        self._append({"ladder": ladder, "growth": [g.model_dump(mode="json", exclude_none=True) for g in growths]})
-
-    def _append(self, content: dict[str, Any]) -> None:
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(content, allow_nan=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-
-    def _read(self, about: dict[str, Any]) -> None:
-        data = self.path.read_bytes()
-        complete = data[: data.rfind(b"\n") + 1]
-        try:
-            first, *lines = [json.loads(line) for line in complete.decode("utf-8").splitlines()] or [None]
-            if not isinstance(first, dict):
-                raise ValueError("its first line is no description of a run")
-        except ValueError as error:
+            earlier: Journal = validate(cls, read_json(path), path, "journal of a trade-off")
+        except SubmissionError as error:
             raise SubmissionError(
-                f"{self.path}: expected what a run of fpp-bench tradeoff left ({error}); give another --out"
+                f"{error}; expected what a run of fpp-bench tradeoff left: give another --out"
             ) from None
+        first = earlier.about
         differs = sorted(key for key in {**first, **about} if first.get(key) != about.get(key))
         if differs:
             key = differs[0]
             raise SubmissionError(
-                f"{self.path}: holds a run with another {', '.join(differs)} ({key}: {first.get(key)!r} there, "
+                f"{path}: holds a run with another {', '.join(differs)} ({key}: {first.get(key)!r} there, "
                 f"{about.get(key)!r} now); times are only compared within one run: give another --out"
             )
-        try:
-            points = [Point.model_validate(line["point"]) for line in lines if "point" in line]
-            ladders = [line for line in lines if "ladder" in line]
-            self.growth = {line["ladder"]: list(map(Growth.model_validate, line["growth"])) for line in ladders}
-        except (ValidationError, KeyError, TypeError) as error:
-            raise SubmissionError(f"{self.path}: damaged ({str(error).splitlines()[0]}); give another --out") from None
-        self.points = {key: point for key, point in {p.key: p for p in points}.items() if point.failed is None}
-        self.sittings += len(lines) - len(points) - len(ladders)
-        if complete != data:
-            os.truncate(self.path, len(complete))
+        measured = {key: point for key, point in earlier.points.items() if point.failed is None}
+        return earlier.model_copy(update={"points": measured, "sittings": earlier.sittings + 1})
+
+    def write(self, path: Path) -> None:
+        """Write it complete or not at all."""
+        write_json(self.model_dump(mode="json", exclude_none=True), path)

@@ -88,7 +88,7 @@ def test_an_oracle_range_is_told_and_a_range_without_heads_is_refused(chosen, vi
 
 def test_calibration_is_of_train_samples(views, chosen):
     method = of(chosen, "unet-global", "mm-fp32").make()
-    images = calibration(views, method)
+    images = calibration(views, method.frames_used[0])
     train = views.opened.samples("train")
     assert images.shape == (len(train), 1, *SIZE) and images.dtype == np.float32
     np.testing.assert_allclose(images[0, 0] * 255, views.opened.frame(train[0], 0), atol=1e-3)
