@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from fpp_ml_bench.evaluation.report import escaped
 
@@ -32,8 +34,6 @@ _NAME_GAP, _NUMBER_GAPS = 5.0, (3.0, 12.0, 22.0, 34.0, 48.0)
 """From the mark to its name and its number, in points; from the second number's on a thin line joins them."""
 _DIRECTIONS = 16
 
-Box = tuple[float, float, float, float]
-"""Left, lower, right, upper end in px."""
 Place = tuple[float, float]
 
 
@@ -91,45 +91,46 @@ class Scatter:
         lines = _boxes(axes, steps)
         for mark in sorted(self.marks, key=lambda mark: -mark.radius):
             colour = COLOURS.get(mark.colour, mark.colour)
-            # An end at 0 has no place on a log axis: down to the edge.
-            spans = [
-                [(max(x, left), mark.y) for x in mark.x_span or ()],
-                [(mark.x, max(y, bottom)) for y in mark.y_span or ()],
-            ]
-            nowhere = (math.nan, math.nan)
-            places = [(mark.x, mark.y), nowhere, *spans[0], nowhere, *spans[1]]
+            across = [(max(x, left), mark.y) for x in mark.x_span or ()]  # an end at 0 is off the axis: up to its edge
+            up = [(mark.x, max(y, bottom)) for y in mark.y_span or ()]
+            lines += _boxes(axes, across) + _boxes(axes, up)
+            pen_up = (math.nan, math.nan)
             axes.plot(
-                *zip(*places, strict=True), mark.shape + "-", markevery=[0], ms=2 * mark.radius, mew=1.5, lw=1.25,
-                color=to_rgba(colour, 0.55), mec=colour,
+                *zip((mark.x, mark.y), pen_up, *across, pen_up, *up, strict=True), mark.shape + "-", markevery=[0],
+                ms=2 * mark.radius, mew=1.5, lw=1.25, color=to_rgba(colour, 0.55), mec=colour,
                 mfc=to_rgba(COLOURS["panel"], 0.8) if mark.hollow else to_rgba(colour, 0.55),
                 clip_on=False, gid=f"mark-{mark.number}", url=mark.url, zorder=2,
             )  # fmt: skip
-            lines += [box for span in spans for box in _boxes(axes, span)]
         return self._label(axes, lines)
 
-    def _label(self, axes: Axes, lines: Sequence[Box]) -> list[Mark]:
+    def _label(self, axes: Axes, lines: Sequence[Bbox]) -> list[Mark]:
         """No label covers a mark or another label or leaves the axes. A name does not cover ``lines`` either, a number
         where possible."""
         px = axes.get_figure(root=True).dpi / 72
         size = matplotlib.rcParams["font.size"] * px
-        at = {mark: tuple(axes.transData.transform((mark.x, mark.y))) for mark in self.marks}
-        taken = [
-            (x - m.radius * px, y - m.radius * px, x + m.radius * px, y + m.radius * px) for m, (x, y) in at.items()
-        ]
-        inside: Box = axes.bbox.extents
+        at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
+        radii = [mark.radius * px for mark in self.marks]
+        taken = [Bbox([place - radius, place + radius]) for place, radius in zip(at, radii, strict=True)]
+        places = {mark.number: place for mark, place in zip(self.marks, at, strict=True)}
         numbered = []
         for mark in self.labelled:
-            tries = [(mark.name, (_NAME_GAP,), [*taken, *lines])] if self.names else []
-            if self.numbers:
-                tries += [(str(mark.number), _NUMBER_GAPS, [*taken, *lines]), (str(mark.number), _NUMBER_GAPS, taken)]
-            for text, gaps, avoided in tries:
-                half = (_CHARACTER * len(text) / 2 + _PADDING) * size, _LINE * size / 2
-                box = first_free(at[mark], half, [(mark.radius + gap) * px for gap in gaps], avoided, inside)
-                if box is not None:
-                    taken.append(box)
-                    _write(axes, mark, text, box, px)
-                    numbered += [] if text == mark.name else [mark]
-                    break
+            tries = [(mark.name, _NAME_GAP, lines)] if self.names else []
+            tries += [(str(mark.number), gap, more) for more in (lines, ()) for gap in _NUMBER_GAPS if self.numbers]
+            for text, gap, more in tries:
+                half = ((_CHARACTER * len(text) / 2 + _PADDING) * size, _LINE * size / 2)
+                box = free_box(places[mark.number], half, (mark.radius + gap) * px, [*taken, *more], axes.bbox)
+                if box is None:
+                    continue
+                offset = (box.min + box.max) / 2 - places[mark.number]
+                line = {"arrowstyle": "-", "lw": 0.75, "color": COLOURS["soft"], "shrinkA": 0, "shrinkB": mark.radius}
+                axes.annotate(
+                    text, (mark.x, mark.y), offset / px, textcoords="offset points", ha="center", va="center",
+                    color=COLOURS["ink"], parse_math=False, gid=f"label-{mark.number}",
+                    arrowprops=line | {"gid": f"label-{mark.number}"} if gap >= _NUMBER_GAPS[1] else None,
+                )  # fmt: skip
+                taken.append(box)
+                numbered += [mark] if text != mark.name else []
+                break
         return numbered
 
     def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
@@ -184,36 +185,16 @@ def log_axes(axes: Axes) -> None:
         spine.set_color(COLOURS["line"])
 
 
-def first_free(at: Place, half: Place, gaps: Sequence[float], avoided: Sequence[Box], inside: Box) -> Box | None:
-    """The first box of half the size ``half`` around ``at`` that covers nothing of ``avoided`` and is ``inside``: the
-    least of ``gaps`` first, to the right first. All in px."""
-    for gap in gaps:
-        for step in range(_DIRECTIONS):
-            turn = math.tau * step / _DIRECTIONS
-            x, y = (
-                middle + (gap + size) * max(-1.0, min(1.0, 1.45 * share))
-                for middle, size, share in zip(at, half, (math.cos(turn), math.sin(turn)), strict=True)
-            )
-            box = (x - half[0], y - half[1], x + half[0], y + half[1])
-            within = box[0] >= inside[0] and box[1] >= inside[1] and box[2] <= inside[2] and box[3] <= inside[3]
-            if within and not any(_overlap(box, other) for other in avoided):
-                return box
+def free_box(at: Place, half: Place, gap: float, avoided: Sequence[Bbox], inside: Bbox) -> Bbox | None:
+    """The first box of half the size ``half``, by ``gap`` away from ``at``, that covers nothing of ``avoided`` and is
+    ``inside``, to the right of ``at`` first. All in px."""
+    for turn in np.arange(_DIRECTIONS) * math.tau / _DIRECTIONS:
+        middle = at + (gap + np.array(half)) * np.clip((1.45 * math.cos(turn), 1.45 * math.sin(turn)), -1, 1)
+        box = Bbox([middle - half, middle + half])
+        within = (box.min >= inside.min).all() and (box.max <= inside.max).all()
+        if within and not (avoided and box.count_overlaps(avoided)):
+            return box
     return None
-
-
-def _write(axes: Axes, mark: Mark, text: str, box: Box, px: float) -> None:
-    """``text`` of ``mark`` in ``box``, and where it is far from the mark a line that joins them."""
-    at = axes.transData.transform((mark.x, mark.y))
-    middle = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-    away = math.dist(at, (min(max(at[0], box[0]), box[2]), min(max(at[1], box[1]), box[3])))
-    line = {"arrowstyle": "-", "lw": 0.75, "color": COLOURS["soft"], "shrinkA": 0, "shrinkB": mark.radius}
-    label = axes.annotate(
-        text, (mark.x, mark.y), ((middle[0] - at[0]) / px, (middle[1] - at[1]) / px), textcoords="offset points",
-        ha="center", va="center", color=COLOURS["ink"], parse_math=False, gid=f"label-{mark.number}",
-        arrowprops=line if away > (mark.radius + _NUMBER_GAPS[1] / 2) * px else None,
-    )  # fmt: skip
-    if label.arrow_patch is not None:
-        label.arrow_patch.set_gid(f"label-{mark.number}")
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
@@ -224,17 +205,10 @@ def _ends(values: Sequence[float]) -> tuple[float, float]:
     return min(positive) * math.exp(-margin), max(positive) * math.exp(margin)
 
 
-def _boxes(axes: Axes, line: Sequence[Place]) -> list[Box]:
+def _boxes(axes: Axes, line: Sequence[Place]) -> list[Bbox]:
     """Boxes around the straight parts of ``line``, in px."""
     places = axes.transData.transform(line) if line else []
-    return [
-        (min(x, next_x) - 1, min(y, next_y) - 1, max(x, next_x) + 1, max(y, next_y) + 1)
-        for (x, y), (next_x, next_y) in pairwise(places)
-    ]
-
-
-def _overlap(first: Box, second: Box) -> bool:
-    return first[0] < second[2] and second[0] < first[2] and first[1] < second[3] and second[1] < first[3]
+    return [Bbox(np.sort(ends, axis=0)).padded(1) for ends in pairwise(places)]
 
 
 def _for_page(tag: str, groups: dict[str, str]) -> str:

@@ -1,7 +1,7 @@
 """Ladders: a stage of the package on growing amounts of input (pixels, frames, rows, objects), where nested loops show.
 Rendering, decoding, the phase route, networks and scoring run in memory; building and reading on files."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,20 +19,14 @@ from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, Row, ShardWrit
 from fpp_ml_bench.optics import PAPER_SEQUENCE, Rig, Sequence, paper_rig
 
 OBJECT, VIEW = "power_drill", "A60"
-SIZES, QUICK_SIZES = (240, 360, 480, 720, 960), (240, 320, 480)
-NETWORK_SIZES = (240, 320, 480, 640, 960)
-"""Multiples of 16, as a UNet takes them."""
-STEPS, QUICK_STEPS = (4, 8, 16, 32), (4, 8, 16)
+FRAMES_SIZE, BUILT_SIZE, READ_SIZE, ROW_SIZE, BATCH_SIZE = 360, 240, 480, 32, 240
+_SIZES, _QUICK_SIZES = (240, 360, 480, 720, 960), (240, 320, 480)
+_FEW, _ROW_OBJECTS, _QUICK_ROW_OBJECTS = (1, 2, 3), (8, 32, 128, 512), (4, 8, 16)
+"""Objects have six rows each: 48 to 3,072 rows, ten times the benchmark's 300."""
+_STEPS, _QUICK_STEPS = (4, 8, 16, 32), (4, 8, 16)
 """Sinusoids a direction, with 7 Gray bits each, black and white: 24 to 80 frames."""
-FRAMES_SIZE = 360
-BATCHES = (1, 2, 4, 8)
-BUILT_OBJECTS, QUICK_OBJECTS = (1, 2, 4, 8), (1, 2, 3)
-BUILT_SIZE = 240
-ROW_OBJECTS, QUICK_ROW_OBJECTS = (8, 32, 128, 512), (4, 8, 16)
-"""Objects of six rows each: 48 to 3,072 rows, ten times the benchmark's 300."""
-SCORED_OBJECTS = (8, 32, 128)
-READ_FRAMES, READ_SIZES, QUICK_READ_SIZES = (4, 13, 26, 52), (240, 360, 480, 720, 960), (64, 128, 256)
-ROW_SIZE = 32
+_NETWORK_SIZES, _BATCHES = (240, 320, 480, 640, 960), (1, 2, 4, 8)
+"""Multiples of 16, as a UNet takes them."""
 
 Work = Callable[[], object]
 
@@ -61,36 +55,28 @@ class Ladder:
         return f"{self.stage} over {self.over}"
 
 
-def pixel_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over image pixels, each on a view rendered at each size; networks last, because torch stays loaded."""
-    stages: dict[str, Callable[[Rig], Work]] = {
-        "render a view": _render,
-        "decode": _decode,
-        "decode: phase and order of one direction": _phase,
-        "decode: triangulate from both (NumPy)": _triangulate,
-        "phase route": _phase_route,
-        "score a view": _score,
-    }
-    for stage, make in stages.items():
-        yield Ladder(stage, "pixels", QUICK_SIZES if quick else SIZES, partial(_pixel_rung, rig, make))
-    unet, count = "UNet width 8, untrained", 3 if quick else None
-    yield Ladder(unet, "pixels", NETWORK_SIZES[:count], lambda size, folder: Rung(size * size, _network(size, 1)))
-    yield Ladder(unet, "rows", BATCHES[:count], lambda batch, folder: Rung(batch, _network(QUICK_SIZES[0], batch)))
-
-
-def frame_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over the frames of a capture."""
-    for stage, make in (("render a view", _render), ("decode", _decode)):
-        yield Ladder(stage, "frames", QUICK_STEPS if quick else STEPS, partial(_frame_rung, rig, make))
-
-
-def row_ladders(rig: Rig, quick: bool = False) -> Iterator[Ladder]:
-    """Stages over objects and rows, and reading also over pixels and frames."""
-    yield Ladder("build a dataset", "objects", QUICK_OBJECTS if quick else BUILT_OBJECTS, partial(_build, rig))
-    yield Ladder("open and read a frame of each row", "rows", QUICK_ROW_OBJECTS if quick else ROW_OBJECTS, _read_rows)
-    yield Ladder("read a row", "frames", READ_FRAMES[: 3 if quick else None], _read_frames)
-    yield Ladder("read a row", "pixels", QUICK_READ_SIZES if quick else READ_SIZES, _read_pixels)
-    yield Ladder("score a folder of predictions", "rows", QUICK_OBJECTS if quick else SCORED_OBJECTS, _evaluate)
+def package_ladders(rig: Rig, quick: bool = False, more: Iterable[Ladder] = ()) -> list[Ladder]:
+    """The stages of this package, with those of ``more`` behind the stages over rows; networks last, because torch
+    stays loaded. Each stage over pixels is run on a view rendered at each size."""
+    over_pixels: dict[str, Callable[[Rig], Work]] = {
+        "render a view": _render, "decode": _decode, "decode: phase and order of one direction": _phase,
+        "decode: triangulate from both (NumPy)": _triangulate, "phase route": _phase_route, "score a view": _score,
+    }  # fmt: skip
+    sizes, steps, three = _QUICK_SIZES if quick else _SIZES, _QUICK_STEPS if quick else _STEPS, 3 if quick else None
+    row_objects = _QUICK_ROW_OBJECTS if quick else _ROW_OBJECTS
+    return [
+        Ladder("build a dataset", "objects", _FEW if quick else (1, 2, 4, 8), partial(_build, rig)),
+        Ladder("open and read a frame of each row", "rows", row_objects, _read_rows),
+        Ladder("read a row", "frames", (4, 13, 26, 52)[:three], _read_frames),
+        Ladder("read a row", "pixels", (64, 128, 256) if quick else _SIZES, _read_pixels),
+        Ladder("score a folder of predictions", "rows", _FEW if quick else _ROW_OBJECTS[:3], _evaluate),
+        *more,
+        Ladder("render a view", "frames", steps, partial(_frame_rung, rig, _render)),
+        Ladder("decode", "frames", steps, partial(_frame_rung, rig, _decode)),
+        *(Ladder(stage, "pixels", sizes, partial(_pixel_rung, rig, make)) for stage, make in over_pixels.items()),
+        Ladder("UNet width 8, untrained", "pixels", _NETWORK_SIZES[:three], _network),
+        Ladder("UNet width 8, untrained", "rows", _BATCHES[:three], _network_batch),
+    ]
 
 
 def _pixel_rung(rig: Rig, make: Callable[[Rig], Work], size: int, folder: Path) -> Rung:
@@ -143,7 +129,15 @@ def _score(rig: Rig) -> Work:
     return partial(score_sample, depth_mm + np.float32(1.5) * (depth_mm > 0), depth_mm)
 
 
-def _network(size: int, batch: int) -> Work:
+def _network(size: int, folder: Path) -> Rung:
+    return Rung(size * size, _inference(1, size))
+
+
+def _network_batch(batch: int, folder: Path) -> Rung:
+    return Rung(batch, _inference(batch, BATCH_SIZE))
+
+
+def _inference(batch: int, size: int) -> Work:
     import torch
 
     from fpp_ml_bench.baselines.networks import build as build_network
@@ -204,7 +198,7 @@ def _read_rows(objects: int, folder: Path) -> Rung:
 
 
 def _read_frames(frames: int, folder: Path) -> Rung:
-    return Rung(frames, _reading(written_dataset(folder, 1, 480, "all", views=1), frames))
+    return Rung(frames, _reading(written_dataset(folder, 1, READ_SIZE, "all", views=1), frames))
 
 
 def _read_pixels(size: int, folder: Path) -> Rung:

@@ -90,7 +90,7 @@ def _short(point: Point) -> str:
 def draw_tradeoff(tradeoff: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm") -> bool:
     """Two panels on log axes with the front of each; False where no point can be drawn."""
     figure = Figure(figsize=(13, 6.2), dpi=110)
-    figure.subplots_adjust(0.05, 0.08, 0.99, 0.91, 0.06)
+    figure.subplots_adjust(0.05, 0.12, 0.99, 0.91, 0.06)
     panels = figure.subplots(1, 2)
     for cost, axes in zip(COST_KEYS, panels, strict=True):
         picture = scatter(tradeoff, cost, error, all_named=True)
@@ -105,7 +105,7 @@ def draw_tradeoff(tradeoff: Tradeoff, path: Path, error: ErrorKey = "object_mae_
                 form = shape + ("-" if start.startswith("classical") else "")
                 axes.plot(*zip(*places, strict=True), form, color=colour, lw=0.8, markevery=[], label=name)
         picture.draw(axes)
-    panels[0].legend(loc="best", framealpha=0.85)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=len(FAMILIES), frameon=False)
     height, width = tradeoff.image_size
     figure.suptitle(
         f"{tradeoff.dataset}, {width}x{height} px, {len(tradeoff.views)} test views, against {tradeoff.target}; "

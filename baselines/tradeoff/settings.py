@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method, method
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, frame_ladders, pixel_ladders, row_ladders
+from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
 from fpp_ml_bench.constants import MM_PER_M, TEST_OBJECTS, split_sample_name
 from fpp_ml_bench.decoding import MIN_MODULATION, DirectionPlan, Directions, Limits, plan_direction
@@ -307,6 +307,4 @@ def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
 
             settings += network_settings(views, run)
     costs = not run.only or COSTS in run.only
-    rig, quick = views.rig, run.quick
-    ladders = [*row_ladders(rig, quick), *more_ladders, *frame_ladders(rig, quick), *pixel_ladders(rig, quick)]
-    return Plan(opened, views, settings, ladders if costs else [])
+    return Plan(opened, views, settings, package_ladders(views.rig, run.quick, more_ladders) if costs else [])

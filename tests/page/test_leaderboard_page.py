@@ -10,10 +10,11 @@ import pytest
 from board_rows import some_rows, timing, write_result_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
-from fpp_ml_bench.baselines.tradeoff.drawing import first_free
+from fpp_ml_bench.baselines.tradeoff.drawing import free_box
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report import escaped, page
 from fpp_ml_bench.leaderboard.page.page import group_scatter, page_files, slug
@@ -237,11 +238,13 @@ boxes = st.tuples(st.floats(0, 300), st.floats(0, 300), st.floats(1, 80), st.flo
 @settings(max_examples=200, deadline=None)
 def test_a_label_covers_nothing_and_stays_inside(drawn, at):
     avoided = [(x, y, x + width, y + height) for x, y, width, height in drawn]
-    box = first_free(at, (20.0, 8.0), (7.0, 30.0), avoided, (0.0, 0.0, 300.0, 300.0))
+    box = free_box(
+        at, (20.0, 8.0), 7.0, [Bbox.from_extents(*box) for box in avoided], Bbox.from_extents(0, 0, 300, 300)
+    )
     if box is None:
-        assert avoided or min(*at, 300 - at[0], 300 - at[1]) < 8 + 30 + 8
+        assert avoided
         return
-    left, lower, right, upper = box
+    left, lower, right, upper = box.extents
     assert left >= 0 and lower >= 0 and right <= 300 and upper <= 300
     assert right - left == pytest.approx(40) and upper - lower == pytest.approx(16)
     assert all(right <= b[0] or b[2] <= left or upper <= b[1] or b[3] <= lower for b in avoided)

@@ -11,7 +11,7 @@ from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.tradeoff import networks as tradeoff_networks
-from fpp_ml_bench.baselines.tradeoff.ladders import frame_ladders, pixel_ladders
+from fpp_ml_bench.baselines.tradeoff.ladders import package_ladders
 from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured
 from fpp_ml_bench.baselines.tradeoff.networks import calibration, network_settings
 from fpp_ml_bench.baselines.tradeoff.settings import TradeoffSettings, choose_views
@@ -123,9 +123,10 @@ def test_a_processor_without_bf16_is_named(monkeypatch, tmp_path):
 
 def test_every_rung_of_every_ladder_can_be_prepared(tmp_path):
     """The smallest rung is run, and a network takes each of its sizes."""
-    ladders = [*pixel_ladders(paper_rig(480)), *frame_ladders(paper_rig(480))]
+    ladders = package_ladders(paper_rig(480))
     for number, ladder in enumerate(ladders):
-        rung = ladder.prepare(ladder.steps[0], tmp_path / str(number))
+        (folder := tmp_path / str(number)).mkdir()
+        rung = ladder.prepare(ladder.steps[0], folder)
         rung.run()
         assert rung.amount > 0 and list(ladder.steps) == sorted(set(ladder.steps)) and len(ladder.steps) >= 3
     (unet,) = (ladder for ladder in ladders if "UNet" in ladder.stage and ladder.over == "pixels")
