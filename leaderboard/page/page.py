@@ -14,44 +14,19 @@ from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Ladder, Mark, Rung, Scatter, Tradeoff, pareto_front, scatter
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report import millimetres, page, render
-from fpp_ml_bench.evaluation.result import result_json
+from fpp_ml_bench.evaluation.report import data_uri, millimetres, page, render, sample_table, score_table
+from fpp_ml_bench.evaluation.result import PART_TITLES, result_json
 from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption
-from fpp_ml_bench.leaderboard.page.submission_page import milliseconds, submission_page
+from fpp_ml_bench.leaderboard import tables
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.paper import PaperTable
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import (
-    PAPER_TITLES,
-    RANK_NOTE,
-    device,
-    paper_cells,
-    paper_note,
-    reliance,
-    reliance_interval,
-    table_json,
-)
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, picture_of, read_entry
 from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
-_HERE = Path(__file__).resolve().parent
+_HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
 _OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
-_FRAME_LIMITS = (1, 2, 12, 25)
-_COLUMNS = {
-    "rank": "Rank",
-    "name": "Method",
-    DEFAULT_SORT: "Object MAE, mm",
-    "": "95% interval, mm",
-    "object_rmse_mm": "Object RMSE, mm",
-    "overall_mae_mm": "Overall MAE, mm",
-    "ms": "Time, ms",
-    "frames": "Frames",
-    "reliance": "Phase reliance",
-    "provenance": "Provenance",
-}
-"""Titles of the ranking's columns by what they are sorted by; empty: by nothing."""
-_TEXT_COLUMNS = ("Method", "95% interval, mm", "Provenance")
 _PICTURES = (("wide", 860, 430), ("narrow", 360, 380))
 """Class, width and height of a ranking's picture, for a window and for a phone."""
 _TRADEOFF_PICTURE = 430, 380
@@ -59,16 +34,6 @@ _MOST_NAMES = 12
 """Marks up to which a picture names them; more get numbers and a key."""
 _SHADES = 6
 _MARK_COLOURS = {"measured here": "measured", "verified": "verified", "self-reported": "reported"}
-_FRONT_TITLES = (
-    "Setting",
-    "Front of",
-    "Object MAE",
-    "of measured px",
-    "Not measured",
-    "ms per view",
-    "5th to 95th",
-    "Frames",
-)
 _BOARD_ROWS, _QUICK_BOARD_ROWS = (8, 16, 32, 64, 128), (4, 8, 16)
 _BOARD_ROW = "classical-18-vertical.json"
 
@@ -101,24 +66,49 @@ def page_files(
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
     present = {row.entry.provenance for group in groups for row in group.rows}
+    shared = {"meaning": MEANING, "legacy_note": LEGACY_NOTE, "milliseconds": milliseconds}
     body = render(
-        "fpp_ml_bench.leaderboard.page", "index.html",
-        slug=lambda entry: slugs[id(entry)], search=_search, assumption=assumption, device=device,
-        milliseconds=milliseconds, reliance=reliance, reliance_interval=reliance_interval,
-        rankings=_rankings(groups), sections=[_section(group, slugs) for group in groups],
-        frame_limits=_FRAME_LIMITS, provenances=[name for name in MEANING if name in present],
-        columns=list(_COLUMNS.items()), text_columns=_TEXT_COLUMNS, told=TOLD, legacy_note=LEGACY_NOTE,
-        rank_note=RANK_NOTE, tradeoff=_tradeoff(tradeoff), meaning=MEANING, by_the_paper=BY_THE_PAPER,
-        paper_titles=PAPER_TITLES,
-        papers=[(f"{paper.title}, mm", list(map(paper_cells, paper.rows)), paper_note(paper)) for paper in papers],
+        _PACKAGE, "index.html", **shared, tables=tables, told=TOLD, assumption=assumption, search=_search,
+        slug=lambda entry: slugs[id(entry)], rankings=_rankings(groups), by_the_paper=BY_THE_PAPER,
+        sections=[_section(group, slugs) for group in groups], tradeoff=_tradeoff(tradeoff),
+        provenances=[name for name in MEANING if name in present],
+        papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), tables.paper_note(p)) for p in papers],
     )  # fmt: skip
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
-    files = {INDEX: index, DATA: table_json(groups, papers, DEFAULT_SORT)}
+    files = {INDEX: index, DATA: tables.table_json(groups, papers, DEFAULT_SORT)}
     for group in groups:
         for row in group.rows:
-            files[f"{SUBMISSIONS}/{slugs[id(row.entry)]}.html"] = submission_page(group, row, style)
+            body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row))
+            name = f"{SUBMISSIONS}/{slugs[id(row.entry)]}.html"
+            files[name] = page(f"{row.entry.name}: FPP-ML-Bench", body, style)
     return {name: text.encode("utf-8") for name, text in files.items()}
+
+
+def _submission(group: Group, row: Ranked) -> dict[str, Any]:
+    """What the template needs for the page of ``row``."""
+    result, picture = row.entry.result, picture_of(row.entry)
+    bars = [
+        (part.metrics.object_mae_mm, part.spread.get(DEFAULT_SORT), part.object)
+        for part in result.per_object
+        if part.metrics.object_mae_mm is not None
+    ]
+    changes = result.reliance.parts if result.reliance else None
+    parts = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
+    return {
+        "row": row, "key": group.key, "rows": len(group.rows), "assumption_sentences": assumption_sentences,
+        "picture": picture and data_uri(picture), "scores": score_table(result), "samples": sample_table(result),
+        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[2])),
+        "longest_mm": max((mean + (spread or 0.0) for mean, spread, _ in bars), default=0.0),
+        "parts": [(words, f"{value:.2f}") for words, value in parts if value is not None],
+    }  # fmt: skip
+
+
+def milliseconds(value: float | None) -> str:
+    """A time in ms to three significant digits, a dash when unknown."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def slug(entry: Entry) -> str:
@@ -129,7 +119,9 @@ def slug(entry: Entry) -> str:
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    return f"{row.entry.name} {row.short_name} {row.entry.result.submission.method} {device(row.entry)}".casefold()
+    return (
+        f"{row.entry.name} {row.short_name} {row.entry.result.submission.method} {tables.device(row.entry)}".casefold()
+    )
 
 
 def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, int]]]]:
@@ -149,7 +141,7 @@ def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, i
 
 def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
     """What the template needs of a group: its rows' intervals, pictures and objects."""
-    key, machines = group.key, sorted({device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
+    key, machines = group.key, sorted({tables.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
     per_object = [{p.object: p.metrics.object_mae_mm for p in row.entry.result.per_object} for row in group.rows]
     objects = sorted({name for errors in per_object for name in errors})
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
@@ -168,7 +160,7 @@ def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
         "about": f"Dataset {group.dataset_name} ({key.fingerprint[:8]}), {samples} samples of {len(objects)} objects; "
         f"protocol {key.protocol_version}, edge band {key.edge_band_px} px{timed}",
         "machines": machines,
-        "plots": _interval_plots(group),
+        "highest": max((end for r in group.rows for end in _error_ends(r.entry)), default=0.0),
         "front": front,
         "pictures": [_drawn(picture, f"{css} scatter", w, h, description) for css, w, h in _PICTURES]
         if picture
@@ -211,24 +203,8 @@ def _drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> d
     return {"svg": svg, "css": css.split()[0], "numbered": sorted((mark.number, mark.name) for mark in numbered)}
 
 
-def _interval_plots(group: Group) -> list[dict[str, Any] | None]:
-    """Each row's interval and mean on one scale of 142 px from 0 to the largest of the group, and its ends in words."""
-    values, spans = zip(
-        *((r.entry.value(DEFAULT_SORT), r.entry.interval(DEFAULT_SORT)) for r in group.rows), strict=True
-    )
-    highest = max([*(value or 0.0 for value in values), *(end for span in spans for end in span or ())])
-
-    def at(value: float) -> str:
-        return f"{4 + 142 * (value / highest if highest else 0.0):.1f}"
-
-    return [
-        None if value is None else {
-            "mean": at(value),
-            "span": span and tuple(map(at, span)),
-            "words": " to ".join(map(millimetres, span)) if span else "fewer than two objects",
-        }
-        for value, span in zip(values, spans, strict=True)
-    ]  # fmt: skip
+def _error_ends(entry: Entry) -> list[float]:
+    return [end for end in (entry.value(DEFAULT_SORT), *(entry.interval(DEFAULT_SORT) or ())) if end is not None]
 
 
 def _shade(error: float | None, logs: Sequence[float]) -> int | None:
@@ -266,7 +242,6 @@ def _tradeoff(run: Tradeoff | None) -> dict[str, Any] | None:
         "about": f"{data}, {width} x {height} px, {len(run.views)} test views, against {run.target}; {run.clock}, "
         f"{run.settings.get('threads')} thread(s) of {run.hardware.cpu}{load}",
         "pictures": pictures,
-        "titles": _FRONT_TITLES,
         "rows": rows,
         "growth": _growth_words(run),
     }
