@@ -15,11 +15,9 @@ from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark_of
 from fpp_ml_bench.optics import CONFIGS
 
-LEGACY_FINGERPRINTS = frozenset(
-    {
-        "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",
-        "c5f61ca76258e24bc197e1d8a3dce100ecddabb90eef57b1ae0c43334648f4de",
-    }
+LEGACY_FINGERPRINTS = (
+    "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",
+    "c5f61ca76258e24bc197e1d8a3dce100ecddabb90eef57b1ae0c43334648f4de",
 )
 """Data of earlier rows that the package does not build any more, unless it is a named benchmark."""
 LEGACY_NOTE = (
@@ -33,15 +31,12 @@ TOLD = {
     "oracle range + mask": "the test sample's depth range and object mask",
 }
 """What the methods of a track are told about the very samples that they are scored on."""
-_BRIGHTNESS = (
-    "one albedo, known exposure",
+ASSUMED = "one albedo, known exposure"
+_ASSUMES = (
     "Assumes one albedo for all surfaces and a known exposure (the lamp's strength and the ambient light): the "
-    "brightness of the fringe image decides the fringe order.",
+    "brightness of the fringe image decides the fringe order."
 )
-_ASSUMED = {"phase": _BRIGHTNESS, "phase-net": _BRIGHTNESS}
-"""By method: in a few words for a table, and as a sentence. It holds unless the setting ``shading`` is off."""
-
-
+"""What the phase route and the learned one assume, in a few words and as a sentence, unless ``shading`` is off."""
 LONGEST_NAME = 36
 """Characters of a short name."""
 
@@ -65,6 +60,14 @@ class GroupKey:
     size: tuple[int, int]
     edge_band_px: int
     protocol_version: str
+
+    @classmethod
+    def of(cls, result: Result) -> "GroupKey":
+        data = result.dataset
+        return cls(
+            result.track, result.mode, data.split, result.target, data.fingerprint, (data.size[0], data.size[1]),
+            result.edge_band_px, result.protocol_version,
+        )  # fmt: skip
 
     @property
     def is_legacy(self) -> bool:
@@ -123,18 +126,15 @@ class Group:
 
 def assumption(result: Result) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
-    return _of(result)[0]
+    about = result.submission
+    assumes = about.method in ("phase", "phase-net") and about.settings.get("shading") is True
+    return ASSUMED if assumes else ""
 
 
 def assumption_sentences(result: Result) -> str:
     """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
     told = TOLD[result.track]
-    return " ".join(sentence for sentence in (_of(result)[1], f"Told {told}." if told else "") if sentence)
-
-
-def _of(result: Result) -> tuple[str, str]:
-    submission = result.submission
-    return _ASSUMED.get(submission.method, ("", "")) if submission.settings.get("shading") is True else ("", "")
+    return " ".join([*([_ASSUMES] if assumption(result) else []), *([f"Told {told}."] if told else [])])
 
 
 def short_names(submissions: Sequence[Submission]) -> list[str]:
@@ -168,14 +168,8 @@ def cut_at_word(text: str, longest: int = LONGEST_NAME) -> str:
 def _from_settings(submission: Submission) -> str | None:
     """A name made of the method's settings; None for a submission that is not one of this package's methods."""
     try:
-        if submission.method == "classical" and submission.name.startswith("Classical "):
-            name = _classical(submission)
-        elif submission.method == "phase" and submission.name.startswith("Phase route, "):
-            name = _phase(submission)
-        elif submission.method == "phase-net" and submission.name.startswith("Phase route, "):
-            name = _phase_net(submission)
-        else:
-            name = _network(submission)
+        title, make = _METHODS.get(submission.method, ("", _network))
+        name = (make if submission.name.startswith(title) else _network)(submission)
     except (KeyError, TypeError, ValueError):  # settings that the package's methods do not write
         return None
     return name if len(name) <= LONGEST_NAME else None
@@ -240,3 +234,11 @@ def _whole(value: object) -> int:
     if not isinstance(value, int):
         raise TypeError("expected a whole number")
     return value
+
+
+_METHODS = {
+    "classical": ("Classical ", _classical),
+    "phase": ("Phase route, ", _phase),
+    "phase-net": ("Phase route, ", _phase_net),
+}
+"""How the names of each method's submissions begin, and what makes the short name."""

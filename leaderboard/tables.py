@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Literal
 
 from rich.table import Table
@@ -88,17 +89,17 @@ def _error_columns(sort: str) -> Iterator[Column]:
     own = {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
     own = {} if sort in (*_ERRORS, "seconds_per_sample", "frames_used") else own
     for key, (title, from_width) in {**own, **_ERRORS}.items():
-        yield Column(title, lambda row, key=key: _error(row.entry, key), from_width=0 if key == sort else from_width)
+        yield Column(title, partial(_error, key), from_width=0 if key == sort else from_width)
         if key == sort in HEADLINE:
-            yield Column("95% interval", lambda row: _interval(row.entry, sort), from_width=MIDDLE)
+            yield Column("95% interval", partial(_interval, sort), from_width=MIDDLE)
 
 
-def _error(entry: Entry, key: str) -> str:
-    return (percent if key.endswith("_share") else millimetres)(entry.value(key))
+def _error(key: str, row: Ranked) -> str:
+    return (percent if key.endswith("_share") else millimetres)(row.entry.value(key))
 
 
-def _interval(entry: Entry, key: str) -> str:
-    ends = entry.interval(key)
+def _interval(key: str, row: Ranked) -> str:
+    ends = row.entry.interval(key)
     return "-" if ends is None else "-".join(map(millimetres, ends))
 
 
@@ -194,14 +195,17 @@ def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[S
     return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
 
+def markdown_columns(shown: Sequence[Column], rows: Sequence[Ranked]) -> list[str]:
+    """Lines of a Markdown table of ``rows``."""
+    cells = [[markdown_text(column.text(row)) for column in shown] for row in rows]
+    return markdown_rows([column.title for column in shown], [column.right for column in shown], cells)
+
+
 def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
     """The whole leaderboard as Markdown, ending in a newline."""
     lines: list[str] = []
-    shown = columns(sort)
-    titles, right = [column.title for column in shown], [column.right for column in shown]
     for group in groups:
-        rows = [[markdown_text(column.text(row)) for column in shown] for row in group.rows]
-        lines += [f"### {markdown_text(group.key.title)}", "", *markdown_rows(titles, right, rows), ""]
+        lines += [f"### {markdown_text(group.key.title)}", "", *markdown_columns(columns(sort), group.rows), ""]
         lines += [LEGACY_NOTE, ""] if group.key.is_legacy else []
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
     lines += [f"### {PAPER_HEADING}", ""] if papers else []

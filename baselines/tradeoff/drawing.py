@@ -106,7 +106,7 @@ class Scatter:
     def _label(self, axes: Axes, lines: Sequence[Bbox]) -> list[Mark]:
         """No label covers a mark or another label or leaves the axes. A name does not cover ``lines`` either, a number
         where possible."""
-        px = axes.get_figure(root=True).dpi / 72
+        px = axes.figure.dpi / 72
         size = matplotlib.rcParams["font.size"] * px
         at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
         radii = [mark.radius * px for mark in self.marks]
@@ -121,10 +121,10 @@ class Scatter:
                 box = free_box(places[mark.number], half, (mark.radius + gap) * px, [*taken, *more], axes.bbox)
                 if box is None:
                     continue
-                offset = (box.min + box.max) / 2 - places[mark.number]
+                offset = (box.get_points().mean(axis=0) - places[mark.number]) / px
                 line = {"arrowstyle": "-", "lw": 0.75, "color": COLOURS["soft"], "shrinkA": 0, "shrinkB": mark.radius}
                 axes.annotate(
-                    text, (mark.x, mark.y), offset / px, textcoords="offset points", ha="center", va="center",
+                    text, (mark.x, mark.y), tuple(offset), textcoords="offset points", ha="center", va="center",
                     color=COLOURS["ink"], parse_math=False, gid=f"label-{mark.number}",
                     arrowprops=line | {"gid": f"label-{mark.number}"} if gap >= _NUMBER_GAPS[1] else None,
                 )  # fmt: skip
@@ -191,7 +191,7 @@ def free_box(at: Place, half: Place, gap: float, avoided: Sequence[Bbox], inside
     for turn in np.arange(_DIRECTIONS) * math.tau / _DIRECTIONS:
         middle = at + (gap + np.array(half)) * np.clip((1.45 * math.cos(turn), 1.45 * math.sin(turn)), -1, 1)
         box = Bbox([middle - half, middle + half])
-        within = (box.min >= inside.min).all() and (box.max <= inside.max).all()
+        within = np.all(box.min >= inside.min) and np.all(box.max <= inside.max)
         if within and not (avoided and box.count_overlaps(avoided)):
             return box
     return None
@@ -207,7 +207,7 @@ def _ends(values: Sequence[float]) -> tuple[float, float]:
 
 def _boxes(axes: Axes, line: Sequence[Place]) -> list[Bbox]:
     """Boxes around the straight parts of ``line``, in px."""
-    places = axes.transData.transform(line) if line else []
+    places = np.asarray(axes.transData.transform(line) if line else [])
     return [Bbox(np.sort(ends, axis=0)).padded(1) for ends in pairwise(places)]
 
 

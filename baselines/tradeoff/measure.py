@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -33,6 +33,7 @@ from fpp_ml_bench.baselines.tradeoff.ladders import Ladder
 from fpp_ml_bench.baselines.tradeoff.points import GROUPS, JOURNAL, Growth, Journal, Point, Tradeoff
 from fpp_ml_bench.baselines.tradeoff.settings import Plan, Setting, TradeoffSettings
 from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo
 from fpp_ml_bench.evaluation.score import object_interval, score_sample, scored_pair
 from fpp_ml_bench.files import NAME_LIMIT, exclusive, printable
@@ -74,7 +75,8 @@ class Rules:
 
     @classmethod
     def of(cls, settings: TradeoffSettings) -> Self:
-        return cls(settings.clock, settings.threads, **({"runs": 5, "limit_s": 1.0} if settings.quick else {}))
+        rules = cls(settings.clock, settings.threads)
+        return replace(rules, runs=5, limit_s=1.0) if settings.quick else rules
 
     def extended(self, seconds: list[float], call: Callable[[], object]) -> list[float]:
         """``seconds`` and those of further runs of ``call``, as many as these rules ask for. A run longer than the
@@ -163,7 +165,8 @@ def _score(
     method: Method, depth: NDArray[np.floating], target_mm: NDArray[np.float32], name: str
 ) -> tuple[float | None, float | None, float]:
     """Object MAE, the MAE over measured object pixels, and the share of object pixels without a depth."""
-    units, mode = getattr(method, "units", "mm"), getattr(method, "mode", "standard")
+    units: Units = getattr(method, "units", "mm")
+    mode: Mode = getattr(method, "mode", "standard")
     scores = score_sample(*scored_pair(depth, target_mm, units, mode, name))
     pixels = scores.object.pixels
     return scores.object.mae_mm, scores.valid.mae_mm, scores.missing / pixels if pixels else 0.0

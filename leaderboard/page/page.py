@@ -119,9 +119,8 @@ def slug(entry: Entry) -> str:
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    return (
-        f"{row.entry.name} {row.short_name} {row.entry.result.submission.method} {tables.device(row.entry)}".casefold()
-    )
+    entry = row.entry
+    return f"{entry.name} {row.short_name} {entry.result.submission.method} {tables.device(entry)}".casefold()
 
 
 def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, int]]]]:
@@ -145,31 +144,19 @@ def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
     per_object = [{p.object: p.metrics.object_mae_mm for p in row.entry.result.per_object} for row in group.rows]
     objects = sorted({name for errors in per_object for name in errors})
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
-    samples, timed = (
-        group.rows[0].entry.result.dataset.samples,
-        f"; timed on {' and '.join(machines)}" if machines else "",
-    )
+    ends = [(row.entry.value(DEFAULT_SORT), *(row.entry.interval(DEFAULT_SORT) or ())) for row in group.rows]
     picture = group_scatter(group, slugs)
     front = [mark.name for mark in picture.front] if picture else []
     description = (
         "Object MAE in mm against milliseconds per image, both logarithmic. On the front, fastest first: "
         f"{', '.join(front)}. {key.title}"
     )
+    drawn = [_drawn(picture, f"{css} scatter", w, h, description) for css, w, h in _PICTURES] if picture else []
+    cells = [[(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object]
     return {
-        "group": group,
-        "about": f"Dataset {group.dataset_name} ({key.fingerprint[:8]}), {samples} samples of {len(objects)} objects; "
-        f"protocol {key.protocol_version}, edge band {key.edge_band_px} px{timed}",
-        "machines": machines,
-        "highest": max((end for r in group.rows for end in _error_ends(r.entry)), default=0.0),
-        "front": front,
-        "pictures": [_drawn(picture, f"{css} scatter", w, h, description) for css, w, h in _PICTURES]
-        if picture
-        else [],
-        "objects": objects,
-        "object_cells": [
-            [(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object
-        ],
-    }
+        "group": group, "machines": machines, "front": front, "pictures": drawn, "objects": objects,
+        "object_cells": cells, "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
+    }  # fmt: skip
 
 
 def group_scatter(group: Group, slugs: dict[int, str]) -> Scatter | None:
@@ -203,10 +190,6 @@ def _drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> d
     return {"svg": svg, "css": css.split()[0], "numbered": sorted((mark.number, mark.name) for mark in numbered)}
 
 
-def _error_ends(entry: Entry) -> list[float]:
-    return [end for end in (entry.value(DEFAULT_SORT), *(entry.interval(DEFAULT_SORT) or ())) if end is not None]
-
-
 def _shade(error: float | None, logs: Sequence[float]) -> int | None:
     """The larger the error among all ``logs`` of a table, the darker its cell."""
     if error is None or not logs:
@@ -220,9 +203,6 @@ def _tradeoff(run: Tradeoff | None) -> dict[str, Any] | None:
     """The section of a trade-off; None without one, or where no setting has both an error and a time."""
     if run is None or not run.comparable():
         return None
-    (height, width), loads, benchmark = run.image_size, run.loads, benchmark_of(run.fingerprint)
-    load = f", load {loads[0]:g} to {loads[-1]:g}" if loads else ""
-    data = f"{run.dataset} ({run.fingerprint[:8]})" if benchmark is None else benchmark.title
     pictures = []
     for cost in COST_KEYS:
         if picture := scatter(run, cost):
@@ -239,25 +219,10 @@ def _tradeoff(run: Tradeoff | None) -> dict[str, Any] | None:
             f"{ms:.3g}", f"{low:.3g} to {high:.3g}", str(point.frames),
         ))  # fmt: skip
     return {
-        "about": f"{data}, {width} x {height} px, {len(run.views)} test views, against {run.target}; {run.clock}, "
-        f"{run.settings.get('threads')} thread(s) of {run.hardware.cpu}{load}",
-        "pictures": pictures,
-        "rows": rows,
-        "growth": _growth_words(run),
-    }
-
-
-def _growth_words(run: Tradeoff) -> str:
-    """A sentence about the costs that grow."""
-    if not run.growth:
-        return ""
-    flagged = [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag]
-    steepest = max(run.growth, key=lambda growth: growth.exponent)
-    return (
-        f"How costs grow: {len(run.growth)} stages were timed over pixels, frames, objects or rows; the steepest "
-        f"power is {steepest.exponent:.2f} ({steepest.stage} over {steepest.over}). "
-        f"Flagged as steep: {'; '.join(flagged) or 'none'}."
-    )
+        "run": run, "benchmark": benchmark_of(run.fingerprint), "pictures": pictures, "rows": rows,
+        "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
+        "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
+    }  # fmt: skip
 
 
 def board_ladder(quick: bool = False) -> Ladder:
