@@ -1,17 +1,23 @@
-"""Groups of the leaderboard: what results must share to be ranked together, how a group and its data are called, and
-what its methods assumed or were told."""
+"""Groups of the leaderboard: what results must share to be ranked together, what its methods assumed or were told, and
+how a group, its data and its rows are called.
 
+Short names are for tables and pictures; a row's own page has the long name and every setting. Rows of this package's
+methods get a name from their method and settings. Every other submission keeps its own name, cut at a word.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark_of
+from fpp_ml_bench.optics import CONFIGS
 
-LEGACY_FINGERPRINTS = frozenset(
-    {
-        "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",
-        "c5f61ca76258e24bc197e1d8a3dce100ecddabb90eef57b1ae0c43334648f4de",
-    }
+LEGACY_FINGERPRINTS = (
+    "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",
+    "c5f61ca76258e24bc197e1d8a3dce100ecddabb90eef57b1ae0c43334648f4de",
 )
 """Data of earlier rows that the package does not build any more, unless it is a named benchmark."""
 LEGACY_NOTE = (
@@ -25,13 +31,20 @@ TOLD = {
     "oracle range + mask": "the test sample's depth range and object mask",
 }
 """What the methods of a track are told about the very samples that they are scored on."""
-_BRIGHTNESS = (
-    "one albedo, known exposure",
+ASSUMED = "one albedo, known exposure"
+_ASSUMES = (
     "Assumes one albedo for all surfaces and a known exposure (the lamp's strength and the ambient light): the "
-    "brightness of the fringe image decides the fringe order.",
+    "brightness of the fringe image decides the fringe order."
 )
-_ASSUMED = {"phase": _BRIGHTNESS, "phase-net": _BRIGHTNESS}
-"""By method: in a few words for a table, and as a sentence. It holds unless the setting ``shading`` is off."""
+"""What the phase route and the learned one assume, in a few words and as a sentence, unless ``shading`` is off."""
+LONGEST_NAME = 36
+"""Characters of a short name."""
+
+_DIRECTIONS = ("horizontal", "vertical", "both")
+_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD"}
+_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
+_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
+"""By the setting ``depth_range``. That the range was told is the group's track."""
 
 
 @dataclass(frozen=True, order=True)
@@ -47,6 +60,14 @@ class GroupKey:
     size: tuple[int, int]
     edge_band_px: int
     protocol_version: str
+
+    @classmethod
+    def of(cls, result: Result) -> "GroupKey":
+        data = result.dataset
+        return cls(
+            result.track, result.mode, data.split, result.target, data.fingerprint, (data.size[0], data.size[1]),
+            result.edge_band_px, result.protocol_version,
+        )  # fmt: skip
 
     @property
     def is_legacy(self) -> bool:
@@ -105,15 +126,119 @@ class Group:
 
 def assumption(result: Result) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
-    return _of(result)[0]
+    about = result.submission
+    assumes = about.method in ("phase", "phase-net") and about.settings.get("shading") is True
+    return ASSUMED if assumes else ""
 
 
 def assumption_sentences(result: Result) -> str:
     """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
     told = TOLD[result.track]
-    return " ".join(sentence for sentence in (_of(result)[1], f"Told {told}." if told else "") if sentence)
+    return " ".join([*([_ASSUMES] if assumption(result) else []), *([f"Told {told}."] if told else [])])
 
 
-def _of(result: Result) -> tuple[str, str]:
-    submission = result.submission
-    return _ASSUMED.get(submission.method, ("", "")) if submission.settings.get("shading") is True else ("", "")
+def short_names(submissions: Sequence[Submission]) -> list[str]:
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name.
+
+    Where two would get the same, the later by its own name has a number behind it.
+    """
+    derived = {submission.name: _from_settings(submission) for submission in submissions}
+    chosen: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in sorted(derived, key=lambda name: (derived[name] is None, name)):
+        short, number = derived[name] or cut_at_word(printable(name)), 1
+        candidate = short
+        while candidate in taken:
+            number += 1
+            suffix = f" ({number})"
+            candidate = cut_at_word(short, LONGEST_NAME - len(suffix)) + suffix
+        taken.add(candidate)
+        chosen[name] = candidate
+    return [chosen[submission.name] for submission in submissions]
+
+
+def cut_at_word(text: str, longest: int = LONGEST_NAME) -> str:
+    """``text``, or as many of its words as fit into ``longest`` characters with an ellipsis behind them."""
+    if len(text) <= longest:
+        return text
+    words = text[:longest].rpartition(" ")[0].rstrip(" ,;:-+(")
+    return (words or text[: longest - 1]) + "…"
+
+
+def _from_settings(submission: Submission) -> str | None:
+    """A name made of the method's settings; None for a submission that is not one of this package's methods."""
+    try:
+        title, make = _METHODS.get(submission.method, ("", _network))
+        name = (make if submission.name.startswith(title) else _network)(submission)
+    except (KeyError, TypeError, ValueError):  # settings that the package's methods do not write
+        return None
+    return name if len(name) <= LONGEST_NAME else None
+
+
+def _direction(submission: Submission) -> str:
+    return _DIRECTIONS[_DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
+
+
+def _classical(submission: Submission) -> str:
+    steps, direction = _whole(submission.settings["steps"]), _direction(submission)
+    if not submission.settings.get("fewest"):
+        return f"Classical {steps}+Gray, {direction}"
+    gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
+    return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
+
+
+def _phase(submission: Submission) -> str:
+    settings, direction = submission.settings, _direction(submission)
+    if "error_mm" in settings:
+        name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
+    else:
+        name = f"Phase, {_whole(settings['frames'])} {direction}"
+    shading, standoff = bool(settings["shading"]), settings.get("prior") == "standoff"
+    if not shading:
+        return f"{name}, standoff alone" if standoff else f"{name}, no shading"
+    return f"{name}, standoff" if standoff else name
+
+
+def _phase_net(submission: Submission) -> str:
+    settings = submission.settings
+    shading = "" if settings["shading"] else ", no shading"
+    return f"{printable(settings['weights'])}, 1 {_direction(submission)}{shading}"
+
+
+def _network(submission: Submission) -> str:
+    settings = submission.settings
+    network = _NETWORKS[str(settings["network"])]
+    if not submission.name.startswith(f"{network}, "):
+        raise ValueError("a name of its own")
+    normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]
+    trained_frames = str(settings["trained_frames"])
+    if trained_frames not in CONFIGS:
+        raise ValueError("unknown frames")
+    frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
+    background = "no background" if settings["background_removed"] else ""
+    depth_range = _RANGES[settings.get("depth_range")]  # type: ignore[index]
+    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}", background, depth_range]
+    return ", ".join(part for part in parts if part)
+
+
+def _loss(label: str) -> str:
+    """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
+    kind, _, rest = label.partition("_")
+    if kind == "hybrid":
+        loss, _, weight = rest.partition("_")
+        return f"hybrid {_LOSSES[loss]} {float(weight):g}"
+    return f"masked {_LOSSES[rest]}" if kind == "masked" else _LOSSES[label]
+
+
+def _whole(value: object) -> int:
+    if not isinstance(value, int):
+        raise TypeError("expected a whole number")
+    return value
+
+
+_METHODS = {
+    "classical": ("Classical ", _classical),
+    "phase": ("Phase route, ", _phase),
+    "phase-net": ("Phase route, ", _phase_net),
+}
+"""How the names of each method's submissions begin, and what makes the short name."""

@@ -12,7 +12,7 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.files import printable
 
 PAPER_FILE = Path(__file__).resolve().parent / "paper_rows.json"
-PAPER_HEADING = "reported by the paper on other data (not measured here)"
+PAPER_HEADING = "Reported by the paper on other data (not measured here)"
 PAPER_TABLES = TABLES
 SHOWN_BY_DEFAULT = ("architecture", "normalization")
 

@@ -5,13 +5,11 @@ from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS, SIGNED
-from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import Interval, ranks_with_ties
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
+from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked, short_names
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
-from fpp_ml_bench.leaderboard.short_names import short_names
 
 DEFAULT_SORT = "object_mae_mm"
 SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
@@ -20,11 +18,7 @@ SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
 def discover(here: Path) -> list[Path]:
     """Result files where none are named: the rows shipped with the package, then ``result*.json`` and
     ``results/*.json`` of the folder ``here``."""
-    return [
-        *shipped_rows(),
-        *sorted(here.glob("result*.json")),
-        *sorted(here.glob("results/*.json")),
-    ]
+    return [*shipped_rows(), *sorted(here.glob("result*.json")), *sorted(here.glob("results/*.json"))]
 
 
 def shipped_rows() -> list[Path]:
@@ -38,15 +32,12 @@ def expand(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         named = sorted(path.glob("*.json")) if path.is_dir() else [path]
         if not named:
-            raise SubmissionError(
-                f"{printable(str(path), 500)}: expected result files (*.json) in this folder, found none"
-            )
+            shown = printable(str(path), 500)
+            raise SubmissionError(f"{shown}: expected result files (*.json) in this folder, found none")
         files += named
-    seen: set[Path] = set()
-    for path in files:
-        if path.resolve() in seen:
-            raise SubmissionError(f"{printable(str(path), 500)} is given twice; name each result once")
-        seen.add(path.resolve())
+    for number, path in enumerate(whole := [path.resolve() for path in files]):
+        if path in whole[:number]:
+            raise SubmissionError(f"{printable(str(files[number]), 500)} is given twice; name each result once")
     return files
 
 
@@ -65,7 +56,7 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
-        members.setdefault(_key(entry.result), []).append(entry)
+        members.setdefault(GroupKey.of(entry.result), []).append(entry)
     return [_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)]
 
 
@@ -92,20 +83,6 @@ def rank_ranges(values: Sequence[float | None], intervals: Sequence[Interval | N
     ]
 
 
-def _key(result: Result) -> GroupKey:
-    data = result.dataset
-    return GroupKey(
-        track=result.track,
-        mode=result.mode,
-        split=data.split,
-        target=result.target,
-        fingerprint=data.fingerprint,
-        size=(data.size[0], data.size[1]),
-        edge_band_px=result.edge_band_px,
-        protocol_version=result.protocol_version,
-    )
-
-
 def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     named: dict[str, Entry] = {}
     for entry in entries:
@@ -115,15 +92,14 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
                 f"{printable(entry.name)!r} on the same data; leave one out, or give one another name"
             )
         named[entry.name] = entry
-    ordered = sorted(entries, key=lambda entry: (*_sortable(entry.value(sort), sort), entry.name))
+    values = {id(entry): _badness(entry.value(sort), sort) for entry in entries}
+    ordered = sorted(entries, key=lambda entry: (values[id(entry)] is None, values[id(entry)] or 0.0, entry.name))
     ranges = rank_ranges(
-        [_badness(entry.value(sort), sort) for entry in ordered],
+        [values[id(entry)] for entry in ordered],
         [None if sort in HIGHER_IS_BETTER or sort in SIGNED else entry.interval(sort) for entry in ordered],
     )
     names = short_names([entry.result.submission for entry in ordered])
-    ranked = tuple(
-        Ranked(best, worst, entry, name) for (best, worst), entry, name in zip(ranges, ordered, names, strict=True)
-    )
+    ranked = tuple(Ranked(*ends, entry, name) for ends, entry, name in zip(ranges, ordered, names, strict=True))
     return Group(key, min(entry.result.dataset.name for entry in entries), ranked)
 
 
@@ -132,8 +108,3 @@ def _badness(value: float | None, sort: str) -> float | None:
     if value is None:
         return None
     return -value if sort in HIGHER_IS_BETTER else abs(value)
-
-
-def _sortable(value: float | None, sort: str) -> tuple[bool, float]:
-    badness = _badness(value, sort)
-    return badness is None, 0.0 if badness is None else badness

@@ -6,23 +6,31 @@ from pathlib import Path
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.report import millimetres
 from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.leaderboard.columns import RANK_NOTE, SELF_REPORTED, device, reliance
-from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption
+from fpp_ml_bench.leaderboard import tables
+from fpp_ml_bench.leaderboard.groups import ASSUMED, LEGACY_NOTE, TOLD, Group, assumption
 from fpp_ml_bench.leaderboard.paper import paper_tables
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
+from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.leaderboard.tables import Column, markdown_rows, markdown_text
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
-_TITLES = (
-    "Rank", "Method", "Object MAE, mm", "95% interval", "Object RMSE", "Overall MAE", "Time, ms", "Frames",
-    "Phase reliance", "Provenance",
-)  # fmt: skip
-_RIGHT = tuple(title not in ("Method", "Provenance") for title in _TITLES)
+_COLUMNS = (
+    Column("Rank", lambda row: row.ranks),
+    Column("Method", lambda row: printable(row.short_name), right=False),
+    Column("Object MAE, mm", lambda row: millimetres(row.entry.value(DEFAULT_SORT))),
+    Column("95% interval", lambda row: " - ".join(map(millimetres, row.entry.interval(DEFAULT_SORT) or ())) or "-"),
+    Column("Object RMSE", lambda row: millimetres(row.entry.value("object_rmse_mm"))),
+    Column("Overall MAE", lambda row: millimetres(row.entry.value("overall_mae_mm"))),
+    Column("Time, ms", lambda row: _time(row.entry)),
+    Column("Frames", lambda row: str(row.entry.frames)),
+    Column("Phase reliance", lambda row: tables.reliance(row.entry)),
+    Column("Provenance", lambda row: row.entry.provenance, right=False),
+)
 _MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in `leaderboard/rows/`."
 _NOTE = (
-    f"{_MADE_BY} Errors in mm. {RANK_NOTE} Intervals: bootstrap over objects. Time: median latency of one image. "
-    f"\\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 does not "
-    "follow it (docs/reliance.md)."
+    f"{_MADE_BY} Errors in mm. {tables.RANK_NOTE} Intervals: bootstrap over objects. Time: median latency of one "
+    f"image. \\{tables.SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 "
+    "does not follow it (docs/reliance.md)."
 )
 SHOWN = 5
 """Rows of a group that README shows; the page shows them all."""
@@ -38,41 +46,26 @@ def readme_block(groups: Sequence[Group]) -> str:
         return f"{_NO_ROWS}\n"
     lines: list[str] = []
     for group in groups:
-        machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
+        machines = sorted({tables.device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
-        rows = [[markdown_text(cell) for cell in _cells(row)] for row in group.rows[:SHOWN]]
-        lines += [f"**{markdown_text(group.key.title + timed)}**", "", *markdown_rows(_TITLES, _RIGHT, rows), ""]
+        lines += [f"**{markdown_text(group.key.title + timed)}**", ""]
+        lines += [*tables.markdown_columns(_COLUMNS, group.rows[:SHOWN]), ""]
         more = len(group.rows) - SHOWN
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
     notes = [_NOTE, *_assumptions(groups), *([LEGACY_NOTE] if any(group.key.is_legacy for group in groups) else [])]
     return "\n".join([*lines, *_paper_lines(), " ".join(notes)]) + "\n"
 
 
-def _cells(row: Ranked) -> list[str]:
-    entry = row.entry
-    interval = entry.interval(DEFAULT_SORT)
-    time = "-" if entry.latency_ms is None else f"{entry.latency_ms:.3g}{'' if entry.time_measured else SELF_REPORTED}"
-    return [
-        row.ranks,
-        printable(row.short_name),
-        millimetres(entry.value(DEFAULT_SORT)),
-        "-" if interval is None else f"{millimetres(interval[0])} - {millimetres(interval[1])}",
-        millimetres(entry.value("object_rmse_mm")),
-        millimetres(entry.value("overall_mae_mm")),
-        time,
-        str(entry.frames),
-        reliance(entry),
-        entry.provenance,
-    ]
+def _time(entry: Entry) -> str:
+    mark = "" if entry.time_measured else tables.SELF_REPORTED
+    return "-" if entry.latency_ms is None else f"{entry.latency_ms:.3g}{mark}"
 
 
 def _assumptions(groups: Sequence[Group]) -> list[str]:
-    """A sentence for each assumption in ``groups``, with the methods that make it."""
-    methods: dict[str, set[str]] = {}
-    for row in (row for group in groups for row in group.rows):
-        if words := assumption(row.entry.result):
-            methods.setdefault(words, set()).add(row.entry.result.submission.method)
-    return [f"{' and '.join(sorted(names))} assume {words}." for words, names in sorted(methods.items())]
+    """A sentence with the methods in ``groups`` that assume something of the scene."""
+    results = [row.entry.result for group in groups for row in group.rows]
+    methods = sorted({result.submission.method for result in results if assumption(result)})
+    return [f"{' and '.join(methods)} assume {ASSUMED}."] if methods else []
 
 
 def _paper_lines() -> list[str]:

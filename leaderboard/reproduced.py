@@ -22,10 +22,9 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.report import percent
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.leaderboard.columns import device
-from fpp_ml_bench.leaderboard.export import markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.paper import paper_tables
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, PROVENANCES, Entry, read_entry, write_row
+from fpp_ml_bench.leaderboard.tables import device, markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 if TYPE_CHECKING:

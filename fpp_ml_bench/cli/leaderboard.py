@@ -4,8 +4,12 @@ import argparse
 import sys
 from pathlib import Path
 
+from fpp_ml_bench import leaderboard
+from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import METRICS
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.leaderboard import page
 
 SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
 EXAMPLES = (
@@ -68,33 +72,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
     from fpp_ml_bench.cli.console import output_width, show
-    from fpp_ml_bench.files import write_atomically
-    from fpp_ml_bench.leaderboard.export import markdown, table_json
-    from fpp_ml_bench.leaderboard.page import write_page
-    from fpp_ml_bench.leaderboard.paper import chosen_tables
-    from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, discover, expand, rank, read_entries, shipped_rows
-    from fpp_ml_bench.leaderboard.rows import read_entry, write_row
-    from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
 
     if args.check and args.readme is None:
         raise SubmissionError("--check checks a README; give it with --readme FILE")
     if args.tradeoff is not None and args.page is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
-    if args.readme is not None:
-        return _readme(args)
-    if args.row is not None:
+    if args.row is not None and args.readme is None:
         if len(args.results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(args.results)} were given")
-        write_row(read_entry(args.results[0]), args.provenance, args.row)
+        leaderboard.write_row(leaderboard.read_entry(args.results[0]), args.provenance, args.row)
         print(f"{args.row}: {args.provenance}")
         return 0
-    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
-    unnamed = shipped_rows() if args.page is not None else discover(Path.cwd())
-    files = expand(args.results) if args.results else unnamed
-    entries = read_entries(files)
-    groups = rank(entries, args.sort)
-    papers = chosen_tables(args.paper)
-    for path, text in ((args.markdown, markdown), (args.json, table_json)):
+    # Page and README hold the shipped rows or the named files, never results that happen to be in the current folder.
+    published = args.page is not None or args.readme is not None
+    unnamed = leaderboard.shipped_rows() if published else leaderboard.discover(Path.cwd())
+    entries = leaderboard.read_entries(leaderboard.expand(args.results) if args.results else unnamed)
+    if args.readme is not None:
+        return _readme(args, leaderboard.update_readme(args.readme, leaderboard.rank(entries), args.check))
+    groups, papers = leaderboard.rank(entries, args.sort), leaderboard.chosen_tables(args.paper)
+    for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
         if path is None:
             continue
         try:
@@ -102,24 +98,17 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
     if args.page is not None:
-        from fpp_ml_bench.leaderboard.tradeoff import read_tradeoff, shipped_tradeoff
-
-        shipped = None if args.results else shipped_tradeoff()
-        settings = shipped if args.tradeoff is None else read_tradeoff(args.tradeoff)
-        written = write_page(rank(entries, DEFAULT_SORT), papers, args.page, settings)
+        shipped = None if args.results else tradeoff.shipped_tradeoff()
+        settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)
+        written = page.write_page(leaderboard.rank(entries), papers, args.page, settings)
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
-    show(*group_tables(groups, args.sort, output_width()), *paper_rich_tables(papers))
+    show(*leaderboard.group_tables(groups, args.sort, output_width()), *leaderboard.paper_rich_tables(papers))
     return 0
 
 
-def _readme(args: argparse.Namespace) -> int:
-    """Write or check README's block from the shipped rows or the named files, never from the current folder."""
-    from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-    from fpp_ml_bench.leaderboard.readme_block import update_readme
-
-    entries = read_entries(expand(args.results) if args.results else shipped_rows())
-    same = update_readme(args.readme, rank(entries), args.check)
+def _readme(args: argparse.Namespace, same: bool) -> int:
+    """Say whether README's block was the ``same``; the exit status."""
     if args.check and not same:
         print(
             f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "

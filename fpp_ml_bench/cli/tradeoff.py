@@ -2,10 +2,10 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.leaderboard.tradeoff import Plan, TradeoffSettings
+from fpp_ml_bench.baselines import tradeoff
+from fpp_ml_bench.leaderboard import page
+from fpp_ml_bench.machine import limit_threads
 
 SUMMARY = "Error against run time and frames for every method and setting on this machine, and how each cost grows."
 EXAMPLES = (
@@ -51,53 +51,27 @@ def _count(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, write all files, print fronts, growths and remarks."""
-    from fpp_ml_bench.machine import limit_threads
-
-    limit_threads(args.threads)
+    limit_threads(args.threads)  # before NumPy is loaded
     from fpp_ml_bench.cli.console import progress_bar, show
-    from fpp_ml_bench.leaderboard.tradeoff import (
-        TradeoffSettings,
-        front_table,
-        growth_table,
-        planned,
-        remarks,
-        tradeoff,
-        write_report,
-    )
 
-    settings = TradeoffSettings(
+    settings = tradeoff.TradeoffSettings(
         args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock, args.views, args.runs,
         args.widths,
     )  # fmt: skip
-    plan = planned(settings)
+    plan = tradeoff.planned(settings, [page.board_ladder(args.quick)] if not args.only or "costs" in args.only else [])
     if args.list:
-        return _list(settings, plan)
+        show(tradeoff.plan_table(plan))
+        print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
+        return 0
     with progress_bar("measuring", len(plan), "settings") as advance:
-        measurements = tradeoff(settings, plan, lambda key: advance(1))
-    written = write_report(measurements, args.out)
+        measurements = tradeoff.tradeoff(settings, plan, lambda key: advance(1))
+    written = tradeoff.write_report(measurements, args.out)
     if measurements.points:
-        show(front_table(measurements))
+        show(tradeoff.front_table(measurements))
     if measurements.growth:
-        show(growth_table(measurements.growth))
-    for line in remarks(measurements):
+        show(tradeoff.growth_table(measurements.growth))
+    for line in tradeoff.remarks(measurements):
         print(line)
     for path in written:
         print(f"Written: {path}")
-    return 0
-
-
-def _list(settings: "TradeoffSettings", plan: "Plan") -> int:
-    from rich.table import Table
-
-    from fpp_ml_bench.cli.console import show
-
-    table = Table(title=f"{settings.dataset}: {len(plan.views.names)} views", title_justify="left")
-    for title in ("Group", "Setting", "Note"):
-        table.add_column(title, overflow="fold")
-    for setting in plan.settings:
-        table.add_row(setting.group, setting.title, setting.note or "")
-    for ladder in plan.ladders:
-        table.add_row("costs", ladder.key, f"{len(ladder.steps)} steps from {ladder.steps[0]} to {ladder.steps[-1]}")
-    show(table)
-    print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
     return 0

@@ -4,32 +4,38 @@ The page works from disk and from any web server and loads no other file. The sa
 """
 
 import hashlib
+import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
+from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Ladder, Mark, Rung, Scatter, Tradeoff, pareto_front, scatter
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report import escaped, page
-from fpp_ml_bench.evaluation.result import result_json
+from fpp_ml_bench.evaluation.report import data_uri, millimetres, page, render, sample_table, score_table
+from fpp_ml_bench.evaluation.result import PART_TITLES, result_json
 from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.leaderboard.export import table_json
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group
-from fpp_ml_bench.leaderboard.page.objects import objects_table
-from fpp_ml_bench.leaderboard.page.scatter import front_rows, scatter_html
-from fpp_ml_bench.leaderboard.page.submission_page import submission_page
-from fpp_ml_bench.leaderboard.page.table import badge, machines, ranking_table
-from fpp_ml_bench.leaderboard.page.text import INTRODUCTION, SCATTER_KEY, paper_section, reading_section
-from fpp_ml_bench.leaderboard.page.tradeoff_section import tradeoff_section
+from fpp_ml_bench.leaderboard import tables
+from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.paper import PaperTable
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
-from fpp_ml_bench.leaderboard.rows import MEANING, Entry
-from fpp_ml_bench.leaderboard.tradeoff import Tradeoff
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, picture_of, read_entry
+from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
-_HERE = Path(__file__).resolve().parent
+_HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
 _OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
-_FRAME_LIMITS = (1, 2, 12, 25)
+_PICTURES = (("wide", 860, 430), ("narrow", 360, 380))
+"""Class, width and height of a ranking's picture, for a window and for a phone."""
+_TRADEOFF_PICTURE = 430, 380
+_MOST_NAMES = 12
+"""Marks up to which a picture names them; more get numbers and a key."""
+_SHADES = 6
+_MARK_COLOURS = {"measured here": "measured", "verified": "verified", "self-reported": "reported"}
+_BOARD_ROWS, _QUICK_BOARD_ROWS = (8, 16, 32, 64, 128), (4, 8, 16)
+_BOARD_ROW = "classical-18-vertical.json"
 
 
 def write_page(
@@ -59,19 +65,50 @@ def page_files(
     """Relative name -> content of every file of the page."""
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
-    settings = tradeoff_section(tradeoff)
-    body = _header(groups, bool(settings)) + '<main id="main">\n' + _filters(groups)
-    body += "".join(_group_section(group, slugs, number) for number, group in enumerate(groups))
-    if not groups:
-        body += "<section><h2>No submission yet</h2><p>A row is one JSON file: see below how to add it.</p></section>\n"
-    body += settings + paper_section(papers) + reading_section() + "</main>\n"
+    present = {row.entry.provenance for group in groups for row in group.rows}
+    shared = {"meaning": MEANING, "legacy_note": LEGACY_NOTE, "milliseconds": milliseconds}
+    body = render(
+        _PACKAGE, "index.html", **shared, tables=tables, told=TOLD, assumption=assumption, search=_search,
+        slug=lambda entry: slugs[id(entry)], rankings=_rankings(groups), by_the_paper=BY_THE_PAPER,
+        sections=[_section(group, slugs) for group in groups], tradeoff=_tradeoff(tradeoff),
+        provenances=[name for name in MEANING if name in present],
+        papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), tables.paper_note(p)) for p in papers],
+    )  # fmt: skip
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
-    files = {INDEX: index, DATA: table_json(groups, papers, DEFAULT_SORT)}
+    files = {INDEX: index, DATA: tables.table_json(groups, papers, DEFAULT_SORT)}
     for group in groups:
         for row in group.rows:
-            files[f"{SUBMISSIONS}/{slugs[id(row.entry)]}.html"] = submission_page(group, row, style)
+            body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row))
+            name = f"{SUBMISSIONS}/{slugs[id(row.entry)]}.html"
+            files[name] = page(f"{row.entry.name}: FPP-ML-Bench", body, style)
     return {name: text.encode("utf-8") for name, text in files.items()}
+
+
+def _submission(group: Group, row: Ranked) -> dict[str, Any]:
+    """What the template needs for the page of ``row``."""
+    result, picture = row.entry.result, picture_of(row.entry)
+    bars = [
+        (part.metrics.object_mae_mm, part.spread.get(DEFAULT_SORT), part.object)
+        for part in result.per_object
+        if part.metrics.object_mae_mm is not None
+    ]
+    changes = result.reliance.parts if result.reliance else None
+    parts = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
+    return {
+        "row": row, "key": group.key, "rows": len(group.rows), "assumption_sentences": assumption_sentences,
+        "picture": picture and data_uri(picture), "scores": score_table(result), "samples": sample_table(result),
+        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[2])),
+        "longest_mm": max((mean + (spread or 0.0) for mean, spread, _ in bars), default=0.0),
+        "parts": [(words, f"{value:.2f}") for words, value in parts if value is not None],
+    }  # fmt: skip
+
+
+def milliseconds(value: float | None) -> str:
+    """A time in ms to three significant digits, a dash when unknown."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def slug(entry: Entry) -> str:
@@ -80,71 +117,130 @@ def slug(entry: Entry) -> str:
     return f"{plain}-{hashlib.sha256(result_json(entry.result)).hexdigest()[:12]}"
 
 
-def _header(groups: Sequence[Group], tradeoff: bool) -> str:
-    """Title and links: a line for each dataset with its rankings and their number of rows, and a line for the rest."""
-    lines = []
-    numbered = list(enumerate(groups))
-    for data, members in groupby(numbered, key=lambda pair: pair[1].key.data_title):
+def _search(row: Ranked) -> str:
+    """What the search field finds a row by."""
+    entry = row.entry
+    return f"{entry.name} {row.short_name} {entry.result.submission.method} {tables.device(entry)}".casefold()
+
+
+def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, int]]]]:
+    """For each dataset its rankings: number, title, rows."""
+    rankings = []
+    for data, members in groupby(enumerate(groups), key=lambda numbered: numbered[1].key.data_title):
         of_data = list(members)
-        targets = {group.key.against for _, group in of_data}
+        several_targets = len({group.key.against for _, group in of_data}) > 1
         links = []
         for number, group in of_data:
-            target = f", {group.key.against}" if len(targets) > 1 else ""
+            target = f", {group.key.against}" if several_targets else ""
             split = f", {group.key.split} split" if group.key.split != "test" else ""
-            links.append(_link(f"#s{number}", f"{group.key.track}{target}{split}", len(group.rows)))
-        lines.append(f"<b>{escaped(data)}:</b> {' · '.join(links)}")
-    rest = [("#tradeoff", "all settings against time")] if tradeoff else []
-    rest += [("#paper", "paper's tables"), ("#reading", "how to read this"), (DATA, "JSON")]
-    lines.append("<b>More:</b> " + " · ".join(_link(address, text) for address, text in rest))
-    items = "".join(f"<li>{line}</li>" for line in lines)
-    return f'<header>{INTRODUCTION}<nav aria-label="Sections"><ul class="links">{items}</ul></nav></header>\n'
+            links.append((number, f"{group.key.track}{target}{split}", len(group.rows)))
+        rankings.append((data, links))
+    return rankings
 
 
-def _link(address: str, text: str, rows: int | None = None) -> str:
-    count = "" if rows is None else f" ({rows})"
-    return f'<span><a href="{address}">{escaped(text)}</a>{count}</span>'
-
-
-def _filters(groups: Sequence[Group]) -> str:
-    """Filters for all tables. The script shows them: without it they would do nothing."""
-    if not groups:
-        return ""
-    present = {row.entry.provenance for group in groups for row in group.rows}
-    boxes = "".join(
-        f'<label><input type="checkbox" name="provenance" value="{escaped(provenance)}" checked> '
-        f"{badge(provenance)}</label>"
-        for provenance in MEANING
-        if provenance in present
+def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
+    """What the template needs of a group: its rows' intervals, pictures and objects."""
+    key, machines = group.key, sorted({tables.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
+    per_object = [{p.object: p.metrics.object_mae_mm for p in row.entry.result.per_object} for row in group.rows]
+    objects = sorted({name for errors in per_object for name in errors})
+    logs = [math.log(error) for errors in per_object for error in errors.values() if error]
+    ends = [(row.entry.value(DEFAULT_SORT), *(row.entry.interval(DEFAULT_SORT) or ())) for row in group.rows]
+    picture = group_scatter(group, slugs)
+    front = [mark.name for mark in picture.front] if picture else []
+    description = (
+        "Object MAE in mm against milliseconds per image, both logarithmic. On the front, fastest first: "
+        f"{', '.join(front)}. {key.title}"
     )
-    frames = "".join(
-        f'<option value="{limit}">{"1, single shot" if limit == 1 else f"at most {limit}"}</option>'
-        for limit in _FRAME_LIMITS
-    )
-    return (
-        '<form class="filters" id="filters" hidden><label>Method <input type="search" id="q" maxlength="100" '
-        'placeholder="name, method or machine" autocomplete="off"></label>'
-        f'<label>Frames <select id="frames"><option value="">any number</option>{frames}</select></label>'
-        f"<fieldset><legend>Provenance</legend>{boxes}</fieldset>"
-        '<button type="reset">Show all</button></form>\n'
-    )
+    drawn = [_drawn(picture, f"{css} scatter", w, h, description) for css, w, h in _PICTURES] if picture else []
+    cells = [[(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object]
+    return {
+        "group": group, "machines": machines, "front": front, "pictures": drawn, "objects": objects,
+        "object_cells": cells, "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
+    }  # fmt: skip
 
 
-def _group_section(group: Group, slugs: dict[int, str], number: int) -> str:
-    key = group.key
-    objects = {part.object for row in group.rows for part in row.entry.result.per_object}
-    samples = group.rows[0].entry.result.dataset.samples
-    timed = f"; timed on {' and '.join(machines(group))}" if machines(group) else ""
-    about = (
-        f"Dataset {group.dataset_name} ({key.fingerprint[:8]}), {samples} samples of {len(objects)} objects; protocol "
-        f"{key.protocol_version}, edge band {key.edge_band_px} px{timed}"
-    )
-    told = f"<p>These methods were told {TOLD[key.track]}.</p>" if TOLD[key.track] else ""
-    legacy = f'<p class="small">{LEGACY_NOTE}</p>' if key.is_legacy else ""
-    front = ", ".join(escaped(row.short_name) for row in front_rows(group)) or "no row yet"
-    pictures = scatter_html(group, slugs, 860, 430, "wide") + scatter_html(group, slugs, 360, 380, "narrow")
-    return (
-        f'<section id="s{number}"><h2 id="g{number}">{escaped(key.title)}</h2>'
-        f'<p class="soft small">{escaped(about, 500)}</p>{told}{legacy}{ranking_table(group, slugs, number)}'
-        f"<figure>{pictures}<figcaption>{SCATTER_KEY} On the front: {front}.</figcaption></figure>"
-        f"{objects_table(group, slugs)}</section>\n"
-    )
+def group_scatter(group: Group, slugs: dict[int, str]) -> Scatter | None:
+    """The picture of the rows that have a place on log axes: a known time and an error above 0; None without any.
+    ``slugs``: the name of a row's page by id of its entry."""
+    marks = []
+    for number, row in enumerate(group.rows, start=1):
+        entry, timing = row.entry, row.entry.result.timing
+        ms, error, name = entry.latency_ms, entry.value(DEFAULT_SORT), slugs.get(id(entry), "")
+        if not ms or not error:
+            continue
+        frames = "1 frame" if entry.frames == 1 else f"{entry.frames} frames"
+        marks.append(Mark(
+            ms, error, number, printable(row.short_name), _MARK_COLOURS.get(entry.provenance, "soft"),
+            # The area grows with the number of frames, and one frame is still seen.
+            radius=max(4.0, 1.7 * math.sqrt(entry.frames)), hollow=not entry.time_measured,
+            x_span=None if timing is None else (timing.latency_p5_ms, timing.latency_p95_ms),
+            y_span=entry.interval(DEFAULT_SORT),
+            title=f"{entry.name}: rank {row.ranks}, {error:.3g} mm, {ms:.3g} ms, {frames}, {entry.provenance}",
+            css=f"p-{entry.provenance.replace(' ', '-')}{'' if entry.time_measured else ' hollow'}",
+            row=name, url=f"{SUBMISSIONS}/{name}.html",
+        ))  # fmt: skip
+    front = [marks[index] for index in pareto_front([(mark.x, mark.y) for mark in marks])]
+    labelled = [*front, *(mark for mark in marks if mark not in front)]
+    across = "median time per image at batch 1, ms"
+    return Scatter(marks, front, across, labelled, names=len(marks) <= _MOST_NAMES) if marks else None
+
+
+def _drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> dict[str, Any]:
+    svg, numbered = picture.svg(width, height, css, about)
+    return {"svg": svg, "css": css.split()[0], "numbered": sorted((mark.number, mark.name) for mark in numbered)}
+
+
+def _shade(error: float | None, logs: Sequence[float]) -> int | None:
+    """The larger the error among all ``logs`` of a table, the darker its cell."""
+    if error is None or not logs:
+        return None
+    low, high = min(logs), max(logs)
+    share = 0.0 if error == 0 or high == low else (math.log(error) - low) / (high - low)
+    return min(_SHADES - 1, int(share * _SHADES))
+
+
+def _tradeoff(run: Tradeoff | None) -> dict[str, Any] | None:
+    """The section of a trade-off; None without one, or where no setting has both an error and a time."""
+    if run is None or not run.comparable():
+        return None
+    pictures = []
+    for cost in COST_KEYS:
+        if picture := scatter(run, cost):
+            about = f"Object MAE in mm against {picture.across}, both logarithmic"
+            pictures.append(_drawn(picture, "scatter", *_TRADEOFF_PICTURE, about))
+    by_time, by_frames = (run.front(cost) for cost in COST_KEYS)
+    rows = []
+    for point in sorted({p.key: p for p in (*by_time, *by_frames)}.values(), key=lambda p: p.object_mae_mm or 0):
+        fronts = " and ".join(name for name, front in (("time", by_time), ("frames", by_frames)) if point in front)
+        ms, low, high = point.ms
+        missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.2g}%"
+        rows.append((
+            point.title, fronts, millimetres(point.object_mae_mm), millimetres(point.measured_mae_mm), missing,
+            f"{ms:.3g}", f"{low:.3g} to {high:.3g}", str(point.frames),
+        ))  # fmt: skip
+    return {
+        "run": run, "benchmark": benchmark_of(run.fingerprint), "pictures": pictures, "rows": rows,
+        "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
+        "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
+    }  # fmt: skip
+
+
+def board_ladder(quick: bool = False) -> Ladder:
+    """For `fpp-bench tradeoff`: what ranking and the page cost over rows."""
+    return Ladder("rank and render the leaderboard", "rows", _QUICK_BOARD_ROWS if quick else _BOARD_ROWS, _board_rung)
+
+
+def _board_rung(rows: int, folder: Path) -> Rung:
+    """One shipped row under many names, each with its own error and time, so that marks and names do not coincide."""
+    first = read_entry(next(path for path in shipped_rows() if path.name == _BOARD_ROW))
+    entries = []
+    for number in range(rows):
+        result, factor = first.result, 1.03**number
+        about = result.submission.model_copy(update={"name": f"Method {number}"})
+        if (timing := result.timing) is not None:
+            keys = ("latency_median_ms", "latency_p5_ms", "latency_p95_ms")
+            changed = timing.model_copy(update={key: getattr(timing, key) * factor for key in keys})
+            about = about.model_copy(update={"timing": changed})
+        metrics = result.metrics.model_copy(update={DEFAULT_SORT: factor})
+        entries.append(replace(first, result=result.model_copy(update={"submission": about, "metrics": metrics})))
+    return Rung(rows, lambda: page_files(rank(entries), []))

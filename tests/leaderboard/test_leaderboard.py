@@ -11,9 +11,9 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
-from fpp_ml_bench.leaderboard.export import markdown_text
+from fpp_ml_bench.leaderboard.groups import cut_at_word
 from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, SHOWN_BY_DEFAULT, paper_tables
-from fpp_ml_bench.leaderboard.short_names import cut_at_word
+from fpp_ml_bench.leaderboard.tables import markdown_text
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,19 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE, assumption, assumption_sentences
+from fpp_ml_bench.leaderboard.groups import (
+    LEGACY_FINGERPRINTS,
+    LEGACY_NOTE,
+    LONGEST_NAME,
+    assumption,
+    assumption_sentences,
+    cut_at_word,
+    short_names,
+)
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.ranking import rank, rank_ranges, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.readme_block import readme_block
-from fpp_ml_bench.leaderboard.short_names import LONGEST_NAME, cut_at_word, short_names
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
 
 
@@ -58,7 +65,7 @@ def test_the_same_ranks_everywhere(tmp_path, capsys, monkeypatch):
     (group,) = groups = rank(read_entries(files))
     ranks = [row.ranks for row in group.rows]
     assert any("-" in text for text in ranks)
-    cells = re.findall(r"<td data-v=[^>]*>([\d-]+)</td><th", page_files(groups, [])["index.html"].decode())
+    cells = re.findall(r"<td data-v=[^>]*>([\d-]+)</td>\s*<th", page_files(groups, [])["index.html"].decode())
     assert cells == ranks
     shown = re.findall(r"^\| ([\d-]*\d) ", readme_block(groups), flags=re.MULTILINE)
     assert shown == ranks[:5]

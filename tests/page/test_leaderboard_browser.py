@@ -196,7 +196,7 @@ def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_pag
 _LABEL_BOXES = """
 [...document.querySelectorAll("svg.scatter")].filter(svg => svg.getBoundingClientRect().width > 0).map(svg => ({
   frame: (b => [b.left, b.top, b.right, b.bottom])(svg.getBoundingClientRect()),
-  labels: [...svg.querySelectorAll("text.name")].map(text => {
+  labels: [...svg.querySelectorAll(".name text")].map(text => {
     const b = text.getBoundingClientRect(), cut = 0.15 * b.height;
     return [b.left, b.top + cut, b.right, b.bottom - cut];
   }),

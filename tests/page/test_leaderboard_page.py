@@ -1,7 +1,6 @@
 """The static page as files: the same bytes, no way out of it, and nothing that a submission's text could do."""
 
 import html
-import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,16 +10,15 @@ import pytest
 from board_rows import some_rows, timing, write_result_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
+from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
+from fpp_ml_bench.baselines.tradeoff.drawing import free_box
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report import escaped, page
-from fpp_ml_bench.leaderboard.page.labels import Mark, key_list, place_labels
-from fpp_ml_bench.leaderboard.page.log_axis import LogAxis
-from fpp_ml_bench.leaderboard.page.page import page_files, slug
-from fpp_ml_bench.leaderboard.page.scatter import front_rows
+from fpp_ml_bench.leaderboard.page.page import group_scatter, page_files, slug
 from fpp_ml_bench.leaderboard.paper import chosen_tables
-from fpp_ml_bench.leaderboard.pareto import pareto_front
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 
 
@@ -90,7 +88,7 @@ def test_groups_stay_apart_and_the_papers_rows_too(files):
 
 def test_front_is_those_nobody_beats(files):
     metric = rank(read_entries(files))[0]
-    assert [row.entry.name for row in front_rows(metric)] == ["Fast and rough", "Slow and fine"]
+    assert [mark.name for mark in group_scatter(metric, {}).front] == ["Fast and rough", "Slow and fine"]
 
 
 def test_links_lead_to_the_page_and_nowhere_else(files):
@@ -204,49 +202,63 @@ def test_front_against_its_definition(places):
     assert [places[i] for i in pareto_front(places)] == sorted(places[i] for i in pareto_front(places))
 
 
-@given(st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=5), st.integers(3, 9))
+@st.composite
+def drawings(draw):
+    """Marks as far apart, as close together and as equal as they come, with and without intervals and names."""
+    value = st.floats(1e-9, 1e9) | st.sampled_from([1.0, 1.01, 2.0])
+    marks = []
+    for number in range(1, draw(st.integers(1, 15)) + 1):
+        x, y = draw(value), draw(value)
+        span = (0.0, y * 1.5) if draw(st.booleans()) else None
+        name = "x" * draw(st.integers(1, 36))
+        marks.append(Mark(x, y, number, name, "verified", radius=draw(st.floats(4, 12)), y_span=span))
+    front = [marks[index] for index in pareto_front([(mark.x, mark.y) for mark in marks])]
+    return Scatter(marks, front, "a cost", marks, names=draw(st.booleans()))
+
+
+@given(drawings(), st.sampled_from([(360, 380), (860, 430)]))
+@settings(max_examples=25, deadline=None)
+def test_every_mark_has_a_place_and_every_number_an_explanation(picture, size):
+    svg, numbered = picture.svg(*size, "wide scatter", "A picture")
+    parsed = Parsed(svg)
+    assert [tag for tag, _ in parsed.elements].count("use") >= len(picture.marks)
+    for tag, attributes in parsed.elements:
+        assert "style" not in attributes and (tag != "use" or -1 <= float(attributes["x"]) <= size[0])
+    labels = [(number, name) for name, number in re.findall(r'<g class="name">.*?>(x+|(\d+))</text>', svg)]
+    assert [number for number, _ in labels if number] == [str(mark.number) for mark in numbered]
+    shown_names = {name for number, name in labels if not number}
+    assert shown_names <= {mark.name for mark in picture.marks} and (picture.names or not shown_names)
+    assert picture.svg(*size, "wide scatter", "A picture")[0] == svg
+
+
+boxes = st.tuples(st.floats(0, 300), st.floats(0, 300), st.floats(1, 80), st.floats(1, 40))
+
+
+@given(st.lists(boxes, max_size=30), st.tuples(st.floats(0, 300), st.floats(0, 300)))
 @settings(max_examples=200, deadline=None)
-def test_log_axis_holds_its_values_and_its_ticks_are_round(values, most):
-    axis = LogAxis.around(values, 10.0, 110.0)
-    for value in values:
-        assert 10 < axis.at(value) < 110
-    ticks = axis.ticks(most)
-    assert 1 <= len(ticks) <= max(most, 2) + 1
-    assert ticks == sorted(set(ticks)) and all(axis.low <= tick <= axis.high for tick in ticks)
-    for tick in ticks:
-        leading = tick / 10 ** math.floor(math.log10(tick) + 1e-9)
-        assert min(abs(leading - f) for f in (1, 1.5, 2, 3, 4, 5, 7, 10)) < 1e-6
+def test_a_label_covers_nothing_and_stays_inside(drawn, at):
+    avoided = [(x, y, x + width, y + height) for x, y, width, height in drawn]
+    box = free_box(
+        at, (20.0, 8.0), 7.0, [Bbox.from_extents(*box) for box in avoided], Bbox.from_extents(0, 0, 300, 300)
+    )
+    if box is None:
+        assert avoided
+        return
+    left, lower, right, upper = box.extents
+    assert left >= 0 and lower >= 0 and right <= 300 and upper <= 300
+    assert right - left == pytest.approx(40) and upper - lower == pytest.approx(16)
+    assert all(right <= b[0] or b[2] <= left or upper <= b[1] or b[3] <= lower for b in avoided)
 
 
-places = st.tuples(st.floats(62, 350), st.floats(5, 325), st.integers(1, 36), st.floats(4, 12))
-
-
-@given(st.lists(places, min_size=1, max_size=40), st.booleans(), st.sampled_from([360, 860]))
-@settings(max_examples=150, deadline=None)
-def test_labels_cover_neither_each_other_nor_a_mark_nor_the_edge(drawn, names, width):
-    marks = [Mark("x" * length, n, f"m{n}", x, y, r) for n, (x, y, length, r) in enumerate(drawn, start=1)]
-    whiskers = [(mark.x - 20, mark.y - 1, mark.x + 20, mark.y + 1) for mark in marks]
-    labels = place_labels(marks, whiskers, (58, 0, width, 332), names=names)
-    taken = [mark.box for mark in marks]
-    for label in labels:
-        left, top, right, bottom = label.box
-        assert left >= 58 and top >= 0 and right <= width and bottom <= 332
-        assert label.text == (str(label.mark.number) if label.is_number else label.mark.name)
-        assert names or label.is_number
-        for box in taken if label.is_number else [*taken, *whiskers]:
-            assert right <= box[0] or box[2] <= left or bottom <= box[1] or box[3] <= top
-        taken.append(label.box)
-    # Every number in the picture is explained, and no other is.
-    key = dict(re.findall(r'<li value="(\d+)">(x+)</li>', key_list(labels)))
-    assert key == {label.text: label.mark.name for label in labels if label.is_number}
-
-
-def test_text_is_no_wider_than_its_box():
-    """The SVG's anchor and the box agree, or the property above would say nothing about the picture."""
-    (label,) = place_labels([Mark("A name", 1, "", 100.0, 50.0, 5.0)], [], (0, 0, 400, 100))
-    assert label.box[2] - label.box[0] == pytest.approx(6.7 * 6)
-    x = float(re.search(r' x="([\d.]+)"', label.svg())[1])
-    assert x == pytest.approx({"start": label.box[0], "end": label.box[2]}[label.anchor], abs=0.1)
+def test_hostile_names_are_text_in_a_picture():
+    """Also what matplotlib would take for mathematics, and what looks like an attribute that is rewritten."""
+    names = [*HOSTILE, "$x^2$ and \\frac", 'x style="fill: #191c20" id="mark-1"']
+    marks = [Mark(10.0**n, 10.0**-n, n, name, "verified", title=name, row=name) for n, name in enumerate(names)]
+    svg, _ = Scatter(marks, marks, "a cost", marks).svg(3000, 2000, "wide scatter", "A picture")
+    parsed = Parsed(svg)
+    assert all(parsed.text.count(name) >= 2 for name in names)  # label and tooltip
+    assert {tag for tag, _ in parsed.elements} == {"svg", "g", "path", "defs", "use", "text", "title"}
+    assert not any(key.startswith("on") for _, attributes in parsed.elements for key in attributes)
 
 
 def test_empty_board_says_how_to_begin(tmp_path, monkeypatch):

@@ -14,20 +14,23 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.tradeoff import report as tradeoff_report
+from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured, tradeoff
+from fpp_ml_bench.baselines.tradeoff.points import JOURNAL, Point, Tradeoff, read_tradeoff
+from fpp_ml_bench.baselines.tradeoff.report import remarks, write_report
+from fpp_ml_bench.baselines.tradeoff.settings import (
+    DecodeInType,
+    Plan,
+    Setting,
+    TradeoffSettings,
+    choose_views,
+    planned,
+)
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.leaderboard.page import page_files
-from fpp_ml_bench.leaderboard.tradeoff import report as tradeoff_report
-from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
-from fpp_ml_bench.leaderboard.tradeoff.journal import JOURNAL
-from fpp_ml_bench.leaderboard.tradeoff.measure import Setting, measured
-from fpp_ml_bench.leaderboard.tradeoff.measure_all import Plan, TradeoffSettings, planned, tradeoff
-from fpp_ml_bench.leaderboard.tradeoff.points import Point, Tradeoff, read_tradeoff
-from fpp_ml_bench.leaderboard.tradeoff.precision import DecodeInType
-from fpp_ml_bench.leaderboard.tradeoff.report import remarks, write_report
-from fpp_ml_bench.leaderboard.tradeoff.views import choose_views
 
 QUICK = Rules(runs=3, limit_s=0.05)
 
@@ -176,11 +179,10 @@ def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path):
     first = tradeoff(settings_of_run, plan, seen.append)
     assert seen == calls == ["a", "b", "lost"] and first.sittings == 1
     journal = tmp_path / "out" / JOURNAL
-    journal.write_bytes(journal.read_bytes() + b'{"point": {"key": "torn')
     second = tradeoff(settings_of_run, plan)
     assert calls == ["a", "b", "lost", "lost"] and second.sittings == 2
     assert second.points[:2] == first.points[:2]
-    assert all(json.loads(line) for line in journal.read_text().splitlines())
+    assert list(json.loads(journal.read_text())["points"]) == ["a", "b", "lost"]
 
 
 def test_runs_of_other_rules_do_not_mix(small, tmp_path):
@@ -238,8 +240,8 @@ def test_types_of_the_decoder(opened):
     frames = opened.frames(sample, range(len(opened.sequence)))
     for direction in ("vertical", "horizontal"):
         packaged = ClassicalMethod(opened.rig, direction, 18).predict(frames)
-        double = DecodeInType(opened.rig, direction, 18, "float64").predict(frames)
-        single = DecodeInType(opened.rig, direction, 18, "float32").predict(frames)
+        double = DecodeInType(opened.rig, direction, 18, dtype="float64").predict(frames)
+        single = DecodeInType(opened.rig, direction, 18, dtype="float32").predict(frames)
         both = (packaged > 0) & (double > 0) & (single > 0)
         assert both.sum() > 0.99 * (packaged > 0).sum()
         assert (

@@ -10,13 +10,12 @@ from scored_dataset import make_dataset
 from tiny_network import config_of, one_thread, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.tradeoff import networks as tradeoff_networks
+from fpp_ml_bench.baselines.tradeoff.ladders import package_ladders
+from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured
+from fpp_ml_bench.baselines.tradeoff.networks import calibration, network_settings
+from fpp_ml_bench.baselines.tradeoff.settings import TradeoffSettings, choose_views
 from fpp_ml_bench.baselines.training import save_weights
-from fpp_ml_bench.leaderboard.tradeoff import networks as tradeoff_networks
-from fpp_ml_bench.leaderboard.tradeoff.clock import Rules
-from fpp_ml_bench.leaderboard.tradeoff.ladders import frame_ladders, pixel_ladders
-from fpp_ml_bench.leaderboard.tradeoff.measure import measured
-from fpp_ml_bench.leaderboard.tradeoff.networks import calibration, network_settings
-from fpp_ml_bench.leaderboard.tradeoff.views import choose_views
 from fpp_ml_bench.optics import paper_rig
 
 SIZE = (32, 48)
@@ -50,7 +49,8 @@ def runs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chosen(views, runs):
-    return {setting.key: setting for setting in network_settings(views, 1, runs, widths=(4,))}
+    settings = TradeoffSettings(views.opened.path, runs, runs=runs, widths=(4,))
+    return {setting.key: setting for setting in network_settings(views, settings)}
 
 
 def of(chosen, *parts):
@@ -88,7 +88,7 @@ def test_an_oracle_range_is_told_and_a_range_without_heads_is_refused(chosen, vi
 
 def test_calibration_is_of_train_samples(views, chosen):
     method = of(chosen, "unet-global", "mm-fp32").make()
-    images = calibration(views, method)
+    images = calibration(views, method.frames_used[0])
     train = views.opened.samples("train")
     assert images.shape == (len(train), 1, *SIZE) and images.dtype == np.float32
     np.testing.assert_allclose(images[0, 0] * 255, views.opened.frame(train[0], 0), atol=1e-3)
@@ -123,9 +123,10 @@ def test_a_processor_without_bf16_is_named(monkeypatch, tmp_path):
 
 def test_every_rung_of_every_ladder_can_be_prepared(tmp_path):
     """The smallest rung is run, and a network takes each of its sizes."""
-    ladders = [*pixel_ladders(paper_rig(480)), *frame_ladders(paper_rig(480))]
+    ladders = package_ladders(paper_rig(480))
     for number, ladder in enumerate(ladders):
-        rung = ladder.prepare(ladder.steps[0], tmp_path / str(number))
+        (folder := tmp_path / str(number)).mkdir()
+        rung = ladder.prepare(ladder.steps[0], folder)
         rung.run()
         assert rung.amount > 0 and list(ladder.steps) == sorted(set(ladder.steps)) and len(ladder.steps) >= 3
     (unet,) = (ladder for ladder in ladders if "UNet" in ladder.stage and ladder.over == "pixels")

@@ -1,4 +1,5 @@
-"""What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts.
+"""What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts; and
+the journal from which a stopped run continues.
 
 There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its whole
 depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
@@ -6,26 +7,26 @@ depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_sh
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
-from fpp_ml_bench.evaluation.result import HardwareInfo, read_json
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result import HardwareInfo, read_json, write_json
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
-from fpp_ml_bench.leaderboard.pareto import pareto_front
 
 Group = Literal["classical", "phase", "networks", "precision", "sizes"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 COSTS = "costs"
 """The group of `Growth`, which compares no methods."""
 Cost = Literal["seconds", "frames"]
+COST_KEYS: tuple[Cost, ...] = get_args(Cost)
 ErrorKey = Literal["object_mae_mm", "measured_mae_mm"]
 SLOWED = 1.25
 """A setting is marked when the machine ran slower by this factor beside it than in the run's median."""
 MOST_LEFT_OUT = 0.05
 """Share of the object's pixels without a depth up to which an error over the others is compared."""
-TRADEOFF_FILE = "tradeoff.json"
-TRADEOFF_SCHEMA: Literal["1.0.0"] = "1.0.0"
+TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.json"
 
 
 class Point(StrictModel):
@@ -57,10 +58,16 @@ class Point(StrictModel):
     pace_ms: Positive | None = None
     load: NonNegative | None = None
 
+    @property
+    def ms(self) -> tuple[float, float, float]:
+        """Median, 5th and 95th percentile of the time per view in ms, 0 where it is not known."""
+        median, low, high = (1000 * (value or 0) for value in (self.seconds, self.seconds_p5, self.seconds_p95))
+        return median, low, high
+
 
 class Growth(StrictModel):
     """Seconds of one stage (the least of several runs) at ``amounts`` of pixels, frames, objects or rows, and the
-    fitted power: see `fpp_ml_bench.leaderboard.tradeoff.growth`."""
+    fitted power: see `fpp_ml_bench.baselines.tradeoff.ladders`."""
 
     stage: Text
     over: Text
@@ -80,7 +87,7 @@ class Tradeoff(StrictModel):
     pace shows. ``settings``: the rules and options of the run.
     """
 
-    tradeoff_schema_version: Literal["1.0.0"] = TRADEOFF_SCHEMA
+    tradeoff_schema_version: Literal["1.0.0"] = "1.0.0"
     created: Text
     dataset: Text
     fingerprint: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -104,6 +111,11 @@ class Tradeoff(StrictModel):
         """The system's load beside each point, ascending."""
         return sorted(point.load for point in self.points if point.load is not None)
 
+    @property
+    def clock(self) -> str:
+        """What the times are of, in words."""
+        return "processor time" if self.settings.get("clock") == "processor" else "wall-clock time"
+
     def slowed(self, point: Point) -> bool:
         """Whether the machine was slower beside ``point`` by the factor `SLOWED` than in the run's median."""
         paces = self.pace_ms
@@ -123,10 +135,20 @@ class Tradeoff(StrictModel):
 
     def front(self, cost: Cost = "seconds", error: ErrorKey = "object_mae_mm") -> list[Point]:
         """The comparable points that no other beats in both cost and error, the cheapest first."""
-        points = self.comparable(error)
-        points.sort(key=lambda point: point.key)
-        indices = pareto_front([(float(getattr(point, cost)), getattr(point, error)) for point in points])
-        return [points[index] for index in indices]
+        points = sorted(self.comparable(error), key=lambda point: point.key)
+        return [points[i] for i in pareto_front([(float(getattr(p, cost)), getattr(p, error)) for p in points])]
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the ``points`` (cost, error) that no other point beats: none is as good in both and better in one.
+
+    Smaller is better. Sorted by cost. Points that are equal in both are all on the front or all off it.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=points.__getitem__):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
 
 
 def read_tradeoff(path: Path) -> Tradeoff:
@@ -134,12 +156,47 @@ def read_tradeoff(path: Path) -> Tradeoff:
     return validate(Tradeoff, read_json(path), path, "tradeoff file")
 
 
-def shipped_tradeoff() -> Tradeoff | None:
-    """The trade-off that ships with the package and is shown on the leaderboard's page; None without the file."""
-    path = Path(__file__).resolve().parent / TRADEOFF_FILE
-    return read_tradeoff(path) if path.is_file() else None
+def shipped_tradeoff() -> Tradeoff:
+    """The trade-off that ships with the package and is shown on the leaderboard's page."""
+    return read_tradeoff(Path(__file__).with_name(TRADEOFF_FILE))
 
 
-def failures(points: Sequence[Point]) -> list[Point]:
-    """Settings that could not be measured."""
-    return [point for point in points if point.failed]
+class Journal(StrictModel):
+    """What the run that ``about`` describes has measured so far, so that a stopped run goes on: points by key, growth
+    by ladder, and how often the run was started."""
+
+    about: dict[Text, Any]
+    sittings: Count = 1
+    points: dict[Text, Point] = Field(default_factory=dict)
+    growth: dict[Text, list[Growth]] = Field(default_factory=dict)
+
+    @classmethod
+    def of(cls, path: Path, about: dict[str, Any]) -> "Journal":
+        """The journal in ``path`` for another sitting, or a new one. Points that failed are forgotten: a package may
+        have been installed since.
+
+        Raises SubmissionError for one of other rules or of another machine, because times are only compared within a
+        run; it names what differs.
+        """
+        if not path.exists():
+            return cls(about=about)
+        try:
+            earlier: Journal = validate(cls, read_json(path), path, "journal of a trade-off")
+        except SubmissionError as error:
+            raise SubmissionError(
+                f"{error}; expected what a run of fpp-bench tradeoff left: give another --out"
+            ) from None
+        first = earlier.about
+        differs = sorted(key for key in {**first, **about} if first.get(key) != about.get(key))
+        if differs:
+            key = differs[0]
+            raise SubmissionError(
+                f"{path}: holds a run with another {', '.join(differs)} ({key}: {first.get(key)!r} there, "
+                f"{about.get(key)!r} now); times are only compared within one run: give another --out"
+            )
+        measured = {key: point for key, point in earlier.points.items() if point.failed is None}
+        return earlier.model_copy(update={"points": measured, "sittings": earlier.sittings + 1})
+
+    def write(self, path: Path) -> None:
+        """Write it complete or not at all."""
+        write_json(self.model_dump(mode="json", exclude_none=True), path)

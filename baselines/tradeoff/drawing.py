@@ -1,0 +1,226 @@
+"""The one drawing of error against a cost: log axes, intervals as whiskers, the front as steps, and at the marks their
+names, or numbers that a key explains. Into matplotlib axes, or as SVG for a page."""
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
+
+from fpp_ml_bench.evaluation.report import escaped
+
+COLOURS = {
+    "ink": "#191c20", "soft": "#59616b", "line": "#dfe1e5", "panel": "#ffffff", "front": "#b84a00",
+    "measured": "#0b6b50", "verified": "#1b5bb8", "reported": "#8a4b00",
+}  # fmt: skip
+"""Colours of a page in light by the names of its style; in SVG they follow the page into its dark scheme."""
+_IN_PAGE = {colour: f"var(--{name})" for name, colour in COLOURS.items()}
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 18, 14, 48
+_CHARACTER, _LINE, _PADDING = 0.56, 1.25, 0.17
+"""Width of a character, height of a line and room beside a label, in font sizes; wider than most fonts, so that a name
+that fits here fits everywhere."""
+_NAME_GAP, _NUMBER_GAPS = 5.0, (3.0, 12.0, 22.0, 34.0, 48.0)
+"""From the mark to its name and its number, in points; from the second number's on a thin line joins them."""
+_DIRECTIONS = 16
+
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A mark of ``radius`` points at a cost ``x`` and an error ``y``, both above 0, with the intervals of both.
+
+    ``colour``: of `COLOURS` or of matplotlib. ``number`` is unique in a drawing, and ``name`` explains it in the key.
+    For a page: ``title`` is shown under the mouse, ``css`` are classes, ``row`` is the id of a row that the mark
+    belongs to, and ``url`` its page.
+    """
+
+    x: float
+    y: float
+    number: int
+    name: str
+    colour: str
+    shape: str = "o"
+    radius: float = 4.0
+    hollow: bool = False
+    x_span: tuple[float, float] | None = None
+    y_span: tuple[float, float] | None = None
+    title: str = ""
+    css: str = ""
+    row: str = ""
+    url: str | None = None
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """``marks`` with the ``front`` among them, the cheapest first. Those of ``labelled`` get a label as far as there is
+    room, the first one first, by ``names`` or else ``numbers``."""
+
+    marks: Sequence[Mark]
+    front: Sequence[Mark]
+    across: str
+    labelled: Sequence[Mark]
+    up: str = "object MAE, mm"
+    names: bool = True
+    numbers: bool = True
+
+    def draw(self, axes: Axes) -> list[Mark]:
+        """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown by a number."""
+        axes.set_xlabel(self.across)
+        axes.set_ylabel(self.up)
+        axes.set(xscale="log", yscale="log")
+        left, right = axes.set_xlim(_ends([end for m in self.marks for end in (m.x, *(m.x_span or ()))]))
+        bottom, top = axes.set_ylim(_ends([end for m in self.marks for end in (m.y, *(m.y_span or ()))]))
+        log_axes(axes)
+        steps = [(self.front[0].x, top)] if self.front else []
+        for mark in self.front:  # between two points of the front, the error stays that of the cheaper one
+            steps += [(mark.x, steps[-1][1]), (mark.x, mark.y)]
+        steps += [(right, steps[-1][1])] if steps else []
+        axes.plot(*zip(*steps, strict=True) if steps else ([], []), "--", color=COLOURS["front"], lw=1.5, zorder=1)
+        lines = _boxes(axes, steps)
+        for mark in sorted(self.marks, key=lambda mark: -mark.radius):
+            colour = COLOURS.get(mark.colour, mark.colour)
+            across = [(max(x, left), mark.y) for x in mark.x_span or ()]  # an end at 0 is off the axis: up to its edge
+            up = [(mark.x, max(y, bottom)) for y in mark.y_span or ()]
+            lines += _boxes(axes, across) + _boxes(axes, up)
+            pen_up = (math.nan, math.nan)
+            axes.plot(
+                *zip((mark.x, mark.y), pen_up, *across, pen_up, *up, strict=True), mark.shape + "-", markevery=[0],
+                ms=2 * mark.radius, mew=1.5, lw=1.25, color=to_rgba(colour, 0.55), mec=colour,
+                mfc=to_rgba(COLOURS["panel"], 0.8) if mark.hollow else to_rgba(colour, 0.55),
+                clip_on=False, gid=f"mark-{mark.number}", url=mark.url, zorder=2,
+            )  # fmt: skip
+        return self._label(axes, lines)
+
+    def _label(self, axes: Axes, lines: Sequence[Bbox]) -> list[Mark]:
+        """No label covers a mark or another label or leaves the axes. A name does not cover ``lines`` either, a number
+        where possible."""
+        px = axes.figure.dpi / 72
+        size = matplotlib.rcParams["font.size"] * px
+        at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
+        radii = [mark.radius * px for mark in self.marks]
+        taken = [Bbox([place - radius, place + radius]) for place, radius in zip(at, radii, strict=True)]
+        places = {mark.number: place for mark, place in zip(self.marks, at, strict=True)}
+        numbered = []
+        for mark in self.labelled:
+            tries = [(mark.name, _NAME_GAP, lines)] if self.names else []
+            tries += [(str(mark.number), gap, more) for more in (lines, ()) for gap in _NUMBER_GAPS if self.numbers]
+            for text, gap, more in tries:
+                half = ((_CHARACTER * len(text) / 2 + _PADDING) * size, _LINE * size / 2)
+                box = free_box(places[mark.number], half, (mark.radius + gap) * px, [*taken, *more], axes.bbox)
+                if box is None:
+                    continue
+                offset = (box.get_points().mean(axis=0) - places[mark.number]) / px
+                line = {"arrowstyle": "-", "lw": 0.75, "color": COLOURS["soft"], "shrinkA": 0, "shrinkB": mark.radius}
+                axes.annotate(
+                    text, (mark.x, mark.y), tuple(offset), textcoords="offset points", ha="center", va="center",
+                    color=COLOURS["ink"], parse_math=False, gid=f"label-{mark.number}",
+                    arrowprops=line | {"gid": f"label-{mark.number}"} if gap >= _NUMBER_GAPS[1] else None,
+                )  # fmt: skip
+                taken.append(box)
+                numbered += [mark] if text != mark.name else []
+                break
+        return numbered
+
+    def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
+        """An ``svg`` element of ``width`` by ``height`` px, and the marks that it shows by number.
+
+        It is styled by attributes and by the page, which forbids style of its own; its colours are the page's. ``css``:
+        its classes, ``about``: its description, which together tell it from other pictures of the page.
+        """
+        text = io.StringIO()
+        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
+            figure = Figure(figsize=(width / 72, height / 72), dpi=72)
+            inner = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM
+            axes = figure.add_axes((_LEFT / width, _BOTTOM / height, inner[0] / width, inner[1] / height))
+            axes.yaxis.set_label_coords(17 / width, 0.5, figure.transFigure)
+            axes.patch.set_visible(False)
+            figure.patch.set_visible(False)
+            numbered = self.draw(axes)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Glyph .* missing")  # the browser's fonts have it
+                figure.savefig(text, format="svg", metadata={"Date": None})
+        groups = {}
+        for mark in self.marks:
+            row = f' data-row="{escaped(mark.row)}"' if mark.row else ""
+            title = f"<title>{escaped(mark.title, 300)}</title>" if mark.title else ""
+            groups[f"mark-{mark.number}"] = f'<g class="{escaped(f"point {mark.css}".strip())}"{row}>{title}'
+            groups[f"label-{mark.number}"] = f'<g class="name"{row}>'
+        content = text.getvalue()
+        content = content[content.index("<g ") : content.rindex("</g>") + len("</g>")]
+        content = re.sub(r"<[^>]*>", lambda found: _for_page(found[0], groups), content)
+        content = re.sub(r"\s*\n\s*", " ", content)
+        return (
+            f'<svg class="{css}" viewBox="0 0 {width} {height}" role="img" aria-label="{escaped(about, 5000)}">'
+            f"{content}</svg>"
+        ), numbered
+
+
+def log_axes(axes: Axes) -> None:
+    """Log axes with a grid and round numbers, more of them on a short axis."""
+    axes.set(xscale="log", yscale="log")
+    axes.grid(True, color=COLOURS["line"], lw=0.8)
+    axes.set_axisbelow(True)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        factors = (1, 1.5, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if high < 300 * low else (1,)
+        axis.set_major_locator(LogLocator(subs=factors))
+        axis.set_major_formatter(FuncFormatter(lambda value, place: f"{value:g}" if value < 1e6 else f"{value:.0e}"))
+        axis.set_minor_formatter(NullFormatter())
+    axes.tick_params(which="both", length=0, labelcolor=COLOURS["soft"])
+    axes.xaxis.label.set_color(COLOURS["soft"])
+    axes.yaxis.label.set_color(COLOURS["soft"])
+    for spine in axes.spines.values():
+        spine.set_color(COLOURS["line"])
+
+
+def free_box(at: Place, half: Place, gap: float, avoided: Sequence[Bbox], inside: Bbox) -> Bbox | None:
+    """The first box of half the size ``half``, by ``gap`` away from ``at``, that covers nothing of ``avoided`` and is
+    ``inside``, to the right of ``at`` first. All in px."""
+    for turn in np.arange(_DIRECTIONS) * math.tau / _DIRECTIONS:
+        middle = at + (gap + np.array(half)) * np.clip((1.45 * math.cos(turn), 1.45 * math.sin(turn)), -1, 1)
+        box = Bbox([middle - half, middle + half])
+        within = np.all(box.min >= inside.min) and np.all(box.max <= inside.max)
+        if within and not (avoided and box.count_overlaps(avoided)):
+            return box
+    return None
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    """Of an axis over all positive ``values`` with a margin, over at least a factor of 2."""
+    positive = [value for value in values if value > 0]
+    span = math.log(max(positive) / min(positive))
+    margin = max(0.08 * span, 0.5 * (math.log(2) - span), 0.05)
+    return min(positive) * math.exp(-margin), max(positive) * math.exp(margin)
+
+
+def _boxes(axes: Axes, line: Sequence[Place]) -> list[Bbox]:
+    """Boxes around the straight parts of ``line``, in px."""
+    places = np.asarray(axes.transData.transform(line) if line else [])
+    return [Bbox(np.sort(ends, axis=0)).padded(1) for ends in pairwise(places)]
+
+
+def _for_page(tag: str, groups: dict[str, str]) -> str:
+    """A tag of matplotlib's SVG for a page: groups as ``groups`` has them, style as attributes, fonts left to the page,
+    links for the mouse alone (the page's table has them for everyone)."""
+    if tag.startswith("<g"):
+        return groups.get(re.sub(r'.* id="([^"]*)".*', r"\1", tag, flags=re.DOTALL), "<g>")
+    shared = ' id="' in tag  # the shape of a mark, which takes its style where it is used
+    style = re.search(r' style="([^"]*)"', tag)
+    parts = (part.partition(": ") for part in style[1].split("; ")) if style and not shared else ()
+    attributes = "".join(f' {name}="{_IN_PAGE.get(value, value)}"' for name, _, value in parts if "font" not in name)
+    tag = tag.replace(style[0], attributes) if style else tag
+    tag = tag.replace(' target="_blank"', ' tabindex="-1" aria-hidden="true"')
+    tag = re.sub(r' (clip-path|transform)="(url|rotate\(-0)[^"]*"', "", tag)
+    return re.sub(r"(\.\d\d)\d+", r"\1", tag)

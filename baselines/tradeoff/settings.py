@@ -1,0 +1,307 @@
+"""What a run measures: the settings that are compared (numbers of steps, filters of the phase route, float32 against
+float64, image sizes), the views that they are measured on, and the plan. `networks` has the networks, `ladders` the
+costs that grow."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.method import Frames, Method, load_method
+from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
+from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
+from fpp_ml_bench.constants import MM_PER_M, TEST_OBJECTS, split_sample_name
+from fpp_ml_bench.decoding import MIN_MODULATION, DirectionPlan, Directions, Limits, plan_direction
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig, decode_cells
+
+VIEWS_AN_OBJECT, QUICK_VIEWS = 2, 1
+CLASSICAL_DIRECTIONS: tuple[Directions, ...] = ("vertical", "horizontal", "both")
+FEW_FRAMES, QUICK_FRAMES = (2, 3, 4, 6, 9), (3,)
+"""Frames of one direction that the phase route is also given, without Gray code."""
+WINDOWS = ((0.25, 0.2), (0.5, 0.4), (0.7, 0.55))
+"""First and second window of the phase route in fringe periods, besides the default (0.35, 0.27)."""
+SIZES, QUICK_SIZES = (240, 480, 960, 1920), (240, 480)
+SIZE_OBJECTS = ("power_drill", "wooden_boards")
+"""Objects of the image sizes: a concave and a flat object."""
+
+
+@dataclass
+class StoredViews:
+    """Views ``names`` of a dataset, against the exact depth where it is known."""
+
+    opened: DatasetFolder
+    names: Sequence[str]
+
+    @property
+    def rig(self) -> Rig:
+        return self.opened.rig
+
+    @property
+    def objects(self) -> list[str]:
+        return [split_sample_name(name)[0] for name in self.names]
+
+    @property
+    def target(self) -> str:
+        return "depth_exact" if self.opened.has_exact else "depth"
+
+    def frames(self, method: Method, name: str) -> Frames:
+        """The sequence as ``method`` may see it, in memory."""
+        return captured_frames(self.opened, method, name)
+
+    def target_mm(self, name: str) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm to score against, 0 = background."""
+        return self.opened.target_mm(name, self.target)
+
+
+def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> StoredViews:
+    """``per_object`` views of each object of ``split``, spread over its views, in row order.
+
+    Raises `DatasetError` for a split without samples.
+    """
+    samples_by_object: dict[str, list[str]] = {}
+    for sample in opened.samples(split):
+        samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
+    if not samples_by_object:
+        raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
+    chosen: list[str] = []
+    for number, names in enumerate(samples_by_object.values()):
+        count = min(per_object, len(names))
+        # Each object begins one view later, so that the views differ between objects.
+        places = {(number + position * len(names) // count) % len(names) for position in range(count)}
+        chosen += [names[place] for place in sorted(places)]
+    return StoredViews(opened, chosen)
+
+
+@dataclass
+class PhotographedViews:
+    """Objects of the benchmark in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
+
+    rig: Rig
+    objects: list[str]
+    view: str = "A60"
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{name}_{self.view}" for name in self.objects]
+
+    def frames(self, method: Method, name: str) -> Frames:
+        return [f if index in method.frames_used else None for index, f in enumerate(self._captures[name][0])]
+
+    def target_mm(self, name: str) -> NDArray[np.float32]:
+        return self._captures[name][1]
+
+    @cached_property
+    def _captures(self) -> dict[str, tuple[list[NDArray[np.uint8]], NDArray[np.float32]]]:
+        captures = {}
+        for name, object_name in zip(self.names, self.objects, strict=True):
+            # A studio of its own for each view: the frames are its memory, which the next view would overwrite.
+            studio = Studio(BuildSettings(self.rig, tuple(self.objects)))
+            row = studio.photograph(solid_mesh(object_name), self.view)
+            exact = np.zeros_like(row.depth_mm) if row.depth_exact_mm is None else row.depth_exact_mm
+            frames = [row.frames[index] for index in range(len(self.rig.sequence))]
+            captures[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
+        return captures
+
+
+@dataclass(frozen=True)
+class Setting:
+    """``make`` builds the method when the setting is measured, on ``views``. ``scored`` False: time alone, for an
+    untrained network."""
+
+    key: str
+    group: Group
+    title: str
+    make: Callable[[], Method]
+    views: StoredViews | PhotographedViews
+    scored: bool = True
+    note: str | None = None
+
+
+def classical_settings(views: StoredViews, threads: int, quick: bool = False) -> Iterator[Setting]:
+    """N = 3 to all captured steps, of vertical, horizontal and both directions."""
+    most = views.rig.sequence.steps
+    for direction in CLASSICAL_DIRECTIONS:
+        for steps in sorted({3, min(6, most), most}) if quick else range(3, most + 1):
+            make = partial(ClassicalMethod, views.rig, direction, steps, threads)
+            title = f"classical N={steps}, {direction}"
+            yield Setting(f"classical-{direction}-{steps:02d}", "classical", title, make, views)
+
+
+def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:
+    """The phase route: direction, cues for the fringe order, frames, windows of its filters."""
+    rig = views.rig
+
+    def setting(key: str, title: str, note: str | None = None, **options: object) -> Setting:
+        make = partial(load_method, "phase", rig, **options)
+        return Setting(f"phase-{key}", "phase", f"phase {title}", make, views, note=note)
+
+    for direction in DIRECTIONS:
+        yield setting(direction, direction, direction=direction)
+        yield setting(f"{direction}-no-shading", f"{direction}, no shading", direction=direction, shading=False)
+    for direction in DIRECTIONS:
+        for count in (number for number in (QUICK_FRAMES if quick else FEW_FRAMES) if number <= rig.sequence.steps):
+            yield setting(f"{direction}-{count}", f"{direction}, {count} frames", direction=direction, frames=count)
+    if not quick:
+        standoff_note = "assumes objects near the rig's standoff distance, which holds for fixed placement"
+        yield setting("standoff", "horizontal, standoff", standoff_note, prior="standoff")
+        mask_note = "pixels of confidence below 0.5 are masked"
+        yield setting("masked", "horizontal, confident only", mask_note, min_confidence=0.5)
+        for first, second in WINDOWS:
+            title = f"horizontal, windows {first:g}/{second:g}"
+            yield setting(f"window-{first:g}", title, first_window=first, second_window=second)
+
+
+def precision_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:
+    """The decoder's arithmetic in float32 and in float64, for few and for all steps."""
+    most = views.rig.sequence.steps
+    for steps in (most,) if quick else (3, most):
+        for dtype in ("float32", "float64"):
+            make = partial(DecodeInType, views.rig, "vertical", steps, dtype=dtype)
+            yield Setting(f"precision-{steps:02d}-{dtype}", "precision", f"NumPy {dtype}, N={steps}", make, views)
+
+
+def size_settings(rig: Rig, threads: int, quick: bool = False) -> Iterator[Setting]:
+    """Small scenes photographed by ``rig`` at each image size, by all steps, by few, and from one fringe."""
+    for size in QUICK_SIZES if quick else SIZES:
+        scaled = rig.scaled(size)
+        try:
+            scaled.check_sampling()
+        except FppBenchError:
+            continue  # coarser than the fringes allow: no dataset of this rig has such a size
+        views = PhotographedViews(scaled, [name for name in SIZE_OBJECTS if name in TEST_OBJECTS])
+        choices: tuple[tuple[Directions, int], ...] = (("both", rig.sequence.steps), ("vertical", 3))
+        for direction, steps in choices:
+            make = partial(ClassicalMethod, scaled, direction, steps, threads)
+            title = f"classical N={steps}, {direction}"
+            yield Setting(f"size-{size:04d}-{direction}-{steps}", "sizes", title, make, views)
+        phase = partial(load_method, "phase", scaled, direction="horizontal")
+        yield Setting(f"size-{size:04d}-phase", "sizes", "phase horizontal", phase, views)
+
+
+class DecodeInType(ClassicalMethod):
+    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``.
+
+    The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from
+    one projector coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous
+    code, or lies outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is
+    iterated in float64.
+    """
+
+    def __init__(self, rig: Rig, direction: Direction, steps: int, dtype: str) -> None:
+        super().__init__(rig, direction, steps)
+        self.way, self.dtype = direction, dtype
+        if rig.projector.is_distorted:
+            raise DecodeError("float32 against float64 is compared for a projector without distortion; this rig's has")
+
+    @cached_property
+    def _plan(self) -> DirectionPlan:
+        return plan_direction(self.rig, self.way, self.steps, Limits())
+
+    @cached_property
+    def _axis(self) -> int:
+        """Of the projector's image: the one across the fringes."""
+        return 0 if self.direction == "vertical" else 1
+
+    @cached_property
+    def _rays(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Components of R (x, y, 1) across the fringes and forward, (H, W) in ``dtype``."""
+        x, y = (axis.astype(self.dtype) for axis in self.rig.camera.rays())
+        rotation = self.rig.R.astype(self.dtype)
+        across, forward = (rotation[row, 0] * x + rotation[row, 1] * y + rotation[row, 2] for row in (self._axis, 2))
+        return across, forward
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        plan, number = self._plan, np.dtype(self.dtype).type
+        grey = [frame for frame in (frames[index] for index in plan.frames) if frame is not None]
+        if len(grey) != len(plan.frames):
+            raise DecodeError(f"expected the {len(plan.frames)} frames {plan.frames}, {len(grey)} were captured")
+        sums = np.zeros((3, *grey[0].shape), self.dtype)
+        for image, weights in zip(grey, plan.weights.T.astype(self.dtype), strict=False):
+            levels = image.astype(self.dtype)
+            for total, weight in zip(sums, weights, strict=True):
+                total += weight * levels
+        mean, cosine, sine = sums
+        modulation = np.sqrt(cosine * cosine + sine * sine)
+        cells, trusted = decode_cells(np.stack(grey[len(plan.sinusoids) :]), mean, modulation)
+        turn = number(2 * np.pi)
+        phase = -np.arctan2(sine, cosine)
+        centre = plan.centres_rad.astype(self.dtype)[np.minimum(cells, len(plan.centres_rad) - 1)]
+        absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
+        return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
+
+    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        number = np.dtype(self.dtype).type
+        axis, device = self._axis, self.rig.projector
+        ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
+        across, forward = self._rays
+        with np.errstate(all="ignore"):
+            depth = (ideal * number(self.rig.t[2]) - number(self.rig.t[axis])) / (across - ideal * forward)
+            depth_mm = depth * number(MM_PER_M)
+            near, far = self.rig.working_range_mm
+            valid = valid & (depth_mm >= near) & (depth_mm <= far)
+        return np.where(valid, depth_mm, 0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class TradeoffSettings:
+    """Settings of a run: ``only`` these groups (of `GROUPS` and `COSTS`; empty: all), ``runs``: a folder with further
+    trainings, ``widths`` of untrained UNets and ``views`` of each test object (None: the defaults)."""
+
+    dataset: Path
+    out: Path
+    only: Sequence[str] = ()
+    quick: bool = False
+    threads: int = 1
+    clock: Literal["wall", "processor"] = "wall"
+    views: int | None = None
+    runs: Path | None = None
+    widths: Sequence[int] | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The settings and ladders to measure, and the views."""
+
+    opened: DatasetFolder
+    views: StoredViews
+    settings: list[Setting]
+    ladders: list[Ladder]
+
+    def __len__(self) -> int:
+        return len(self.settings) + len(self.ladders)
+
+
+def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
+    """The plan of a run; ``more_ladders`` are measured with this room's own. Nothing is measured yet.
+
+    Raises DatasetError for a folder that is no dataset or has no test split, WeightsError for a ``runs`` that is no
+    folder.
+    """
+    opened = DatasetFolder(run.dataset)
+    views = choose_views(opened, run.views or (QUICK_VIEWS if run.quick else VIEWS_AN_OBJECT))
+    settings: list[Setting] = []
+    for group in (group for group in GROUPS if not run.only or group in run.only):
+        if group == "classical":
+            settings += classical_settings(views, run.threads, run.quick)
+        elif group == "phase":
+            settings += phase_settings(views, run.quick)
+        elif group == "precision":
+            settings += precision_settings(views, run.quick)
+        elif group == "sizes":
+            settings += size_settings(views.rig, run.threads, run.quick)
+        else:
+            from fpp_ml_bench.baselines.tradeoff.networks import network_settings  # torch takes a second
+
+            settings += network_settings(views, run)
+    costs = not run.only or COSTS in run.only
+    return Plan(opened, views, settings, package_ladders(views.rig, run.quick, more_ladders) if costs else [])
