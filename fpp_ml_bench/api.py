@@ -127,7 +127,7 @@ def load_method(name: str | Path, dataset: "storage.DatasetFolder", **options: A
     """
     from fpp_ml_bench.baselines import method
 
-    return method.load_method(name, dataset, **options)
+    return method.load_method(name, dataset.rig, **options)
 
 
 def decode(
