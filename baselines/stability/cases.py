@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from itertools import product
 from typing import Any, Literal
@@ -24,6 +24,8 @@ from fpp_ml_bench.errors import StabilityError
 
 Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
+Run = Callable[..., Any]
+"""Of a case; gives its `Outcome`, or None where a refusal is expected."""
 Refusals = type[Exception] | tuple[type[Exception], ...]
 
 Floats = NDArray[np.float64]
@@ -55,14 +57,14 @@ class Outcome:
     """The measurement of a case at its worst element, which has the largest error / bound.
 
     ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
-    that were refused; ``may_flag``: largest share that theory allows. ``condition``: the condition number behind the
-    bound, if any.
+    that were refused; ``may_flag``: largest share that theory allows (default: none where a number is expected, else
+    all). ``condition``: the condition number behind the bound, if any.
     """
 
     error: float | None
     bound: float = 0.0
     flagged: float = 0.0
-    may_flag: float = 0.0
+    may_flag: float | None = None
     note: str = ""
     condition: float | None = None
 
@@ -97,7 +99,7 @@ class Case:
     reference: str
     predicts: str
     unit: str
-    run: Callable[[], Outcome] = field(repr=False)
+    run: Run = field(repr=False)
     expects: Expects = "number"
     refuses: Refusals = ()
     heavy: bool = False
@@ -134,12 +136,12 @@ class Group:
         refuses: Refusals = (),
         heavy: Callable[..., bool] = lambda **_: False,
         **grid: Iterable[Scalar],
-    ) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
+    ) -> Callable[[Run], Run]:
         """Declare a function as a family: a case for each combination of the grid's values, which the function,
         ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
         against its reference; bound: how theory predicts it"."""
 
-        def declare(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
+        def declare(run: Run) -> Run:
             text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
             computes, reference, predicts = re.split("; against |; bound: ", text)
             for values in product(*grid.values()):
@@ -186,7 +188,7 @@ def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: Non
         started = time.process_time()
         try:
             with np.errstate(all="ignore"):
-                outcome = case.run()
+                outcome = case.run() or Outcome(0.0)
             verdict, against = judge(case, outcome)
         except case.refuses as error:
             outcome = Outcome(None, flagged=1.0, note=str(error))
@@ -211,8 +213,9 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
         return Verdict.FAIL, "theory predicts no finite error, so the number is meaningless and should be refused"
     if not outcome.error <= outcome.bound:  # NaN is not
         return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
-    if outcome.flagged > outcome.may_flag:
-        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {outcome.may_flag:.2%}"
+    allowed = float(case.expects != "number") if outcome.may_flag is None else outcome.may_flag
+    if outcome.flagged > allowed:
+        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {allowed:.2%}"
     return Verdict.WITHIN, ""
 
 
@@ -220,7 +223,7 @@ def worst(
     errors: ArrayLike,
     bounds: ArrayLike = 0.0,
     flagged: ArrayLike = False,
-    may_flag: float = 0.0,
+    may_flag: float | None = None,
     condition: float | None = None,
     note: str = "",
 ) -> Outcome:
@@ -242,24 +245,34 @@ def masked(flagged: ArrayLike) -> Outcome:
     return worst(np.zeros(np.shape(flagged)), 0.0, flagged)
 
 
-def high_precision() -> Any:
-    """A separate mpmath context of 50 digits, so that the global precision does not change."""
+@cache
+def high_precision(digits: int = 50) -> Any:
+    """A separate mpmath context, so that the global precision does not change."""
     import mpmath
 
     context = mpmath.MPContext()
-    context.dps = 50
+    context.dps = digits
     return context
 
 
-def difference(values: NDArray, exact: Iterable[Any]) -> Floats:
-    """``values`` (n,) minus high-precision numbers, subtracted before it is rounded."""
-    context = high_precision()
-    return np.array([float(context.mpf(float(a)) - b) for a, b in zip(values, exact, strict=True)])
+def wide(values: ArrayLike, digits: int = 50) -> NDArray[np.object_]:
+    """Numbers as an array of mpmath's, with which NumPy's operators compute in ``digits`` digits."""
+    return np.asarray(np.frompyfunc(high_precision(digits).mpf, 1, 1)(np.asarray(values, float)))
 
 
-def rounded(values: Iterable[Any]) -> Floats:
+def by_mpmath(name: str, *values: NDArray[np.object_]) -> NDArray[np.object_]:
+    """A function of mpmath, of each element."""
+    return np.frompyfunc(getattr(high_precision(), name), len(values), 1)(*values)
+
+
+def rounded(values: NDArray[np.object_]) -> Floats:
     """High-precision numbers rounded once to float64."""
-    return np.array([float(value) for value in values])
+    return values.astype(np.float64)
+
+
+def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
+    """``values`` minus high-precision numbers, subtracted before it is rounded."""
+    return rounded(wide(values) - exact)
 
 
 def gamma(operations: float, unit: float = U64) -> float:

@@ -7,18 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import decoding, optics
-from fpp_ml_bench.baselines.stability.cases import (
-    U64,
-    Expects,
-    Floats,
-    Group,
-    Mask,
-    Outcome,
-    difference,
-    high_precision,
-    masked,
-    worst,
-)
+from fpp_ml_bench.baselines.stability import cases
+from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, difference, rounded, wide, worst
 from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError, RigError
@@ -120,13 +110,13 @@ def plane_stack(
     return frames, exact
 
 
-def inside_pattern(rig: optics.Rig, exact: dict[optics.Direction, Floats]) -> Mask:
+def inside_pattern(rig: optics.Rig, exact: dict[optics.Direction, Floats]) -> cases.Mask:
     """The pixels more than 3 px inside the projector's image."""
     u, v = exact["vertical"], exact["horizontal"]
     return (u > 3) & (u < rig.projector.width - 4) & (v > 3) & (v < rig.projector.height - 4)
 
 
-def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, Mask]:
+def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, cases.Mask]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
     plan = decoding.plan_direction(rig, "vertical", rig.sequence.steps, decoding.Limits())
     decoded = decoding.decode_direction(grey(levels), plan, decoding.Limits())
@@ -141,7 +131,7 @@ def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: f
 
 def _decoded_phase(
     mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
-) -> tuple[Floats, Mask]:
+) -> tuple[Floats, cases.Mask]:
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
     rig, rng = coded_rig(), np.random.default_rng(7)
     positions_px = _positions_px(rig, count)
@@ -161,17 +151,13 @@ def _rounding_px(rig: optics.Rig) -> float:
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(0.5 * frame_gain(rig.sequence.steps))
 
 
-def _exact_phase(frames: NDArray, deltas: list) -> list:
-    """Least-squares phase of float64 frames (N, 1, n) in 50 digits, for any shifts (exact numbers)."""
-    mp = high_precision()
-    model = mp.matrix([[1, mp.cos(d), mp.sin(d)] for d in deltas])
+def _exact_phase(frames: NDArray, deltas: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Least-squares phase of float64 frames (N, 1, n) in 50 digits, for any shifts (50-digit numbers)."""
+    mp = cases.high_precision()
+    model = mp.matrix([[1, mp.cos(delta), mp.sin(delta)] for delta in deltas])
     solve = (model.T * model) ** -1 * model.T
-    exact = []
-    for pixel in frames[:, 0].T:
-        levels = [mp.mpf(float(level)) for level in pixel]
-        cosine, sine = (mp.fsum(solve[row, n] * level for n, level in enumerate(levels)) for row in (1, 2))
-        exact.append(-mp.atan2(sine, cosine))
-    return exact
+    _, cosine, sine = np.array(solve.tolist()) @ wide(frames[:, 0])
+    return -cases.by_mpmath("atan2", sine, cosine)
 
 
 @PHASE.family("modulation, real frames", "rad", modulation=MODULATIONS)
@@ -179,14 +165,13 @@ def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     """wrapped phase of 18 float64 frames; against least squares of the same frames in 50 digits; bound: sqrt(2) 2 (N +
     4 pi + 2) u (A + B) / B: N + 1 roundings a sum, 4 pi + 1 in each weight, over B"""
     frames = sinusoids(phases(48), shifts(steps), MEAN, modulation)
-    mp = high_precision()
-    exact = _exact_phase(frames, [2 * mp.pi * n / steps for n in range(steps)])
+    exact = _exact_phase(frames, 2 * cases.high_precision().pi * wide(range(steps)) / steps)
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
     return worst(difference(decoding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
-def _expects(modulation: float, spread: float) -> Expects:
+def _expects(modulation: float, spread: float) -> cases.Expects:
     """What is expected of a modulation that is measured within ``spread`` of its value."""
     if modulation + spread < decoding.MIN_MODULATION:
         return "refusal"
@@ -250,7 +235,7 @@ def saturation_phase(share: float, steps: int) -> Outcome:
     return worst(phase_error(frames), bound)
 
 
-def _expects_saturation(share: float) -> Expects:
+def _expects_saturation(share: float) -> cases.Expects:
     clipped = math.floor(18 * share)  # frames, or one more
     return "refusal" if clipped > 2 else "number" if clipped < 2 else "either"
 
@@ -320,8 +305,7 @@ def close_steps(spread_rad: float) -> Outcome:
     deltas = np.array([0.0, spread_rad, 2 * spread_rad])
     frames = sinusoids(phases(48), deltas)
     measured = decoding.wrapped_phase(frames, deltas).phase[0]
-    mp = high_precision()
-    exact = _exact_phase(frames, [mp.mpf(float(delta)) for delta in deltas])
+    exact = _exact_phase(frames, wide(deltas))
     model = np.stack([np.ones(3), np.cos(deltas), np.sin(deltas)], axis=1)
     singular = np.linalg.svd(model, compute_uv=False)
     condition = float(singular[0] / singular[-1])
@@ -422,12 +406,9 @@ def order_of_pi(phase_rad: float) -> Outcome:
     centres = optics.cell_centres_rad(rig.pattern_length("vertical"), rig.pitch("vertical"))
     cells = np.arange(len(centres), dtype=np.int32)
     absolute, agrees = optics.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
-    mp = high_precision()
-    exact = []
-    for centre in centres:
-        order = mp.floor((mp.mpf(float(centre)) - mp.mpf(phase_rad)) / (2 * mp.pi) + mp.mpf(0.5))
-        exact.append(mp.mpf(phase_rad) + 2 * mp.pi * order)
-    near = np.array([abs(float(value) - centre) for value, centre in zip(exact, centres, strict=True)])
+    two_pi = 2 * cases.high_precision().pi
+    exact = phase_rad + two_pi * cases.by_mpmath("floor", (wide(centres) - phase_rad) / two_pi + 0.5)
+    near = np.abs(rounded(exact) - centres)
     may_flag = float(np.mean(near > optics.INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
@@ -448,9 +429,7 @@ def arctangent(scale: float, code: str) -> Outcome:
         phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:
         phase = decoding.minus_atan2(sine, cosine)
-    mp = high_precision()
-    exact = [-mp.atan2(mp.mpf(float(a)), mp.mpf(float(b))) for a, b in zip(sine, cosine, strict=True)]
-    error = difference(phase, exact)
+    error = difference(phase, -cases.by_mpmath("atan2", wide(sine), wide(cosine)))
     error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi and -pi are the same angle
     bound = np.maximum(4 * U64 * np.abs(phase), 2.0**-1073)
     return worst(error, np.maximum(bound, 8 * U64 * (np.abs(phase) > 3.0)))
@@ -526,7 +505,7 @@ def cell_off_pattern(cell: int) -> Outcome:
     bits = np.array([(code >> (6 - bit)) & 1 for bit in range(7)], float)
     waves = sinusoids(np.linspace(-3, 3, 50), shifts(rig.sequence.steps))[:, 0]
     levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2 * bits[:, None] - 1), 50, axis=1)])
-    return masked(coordinate_error(rig, levels, np.zeros(50))[1])
+    return cases.masked(coordinate_error(rig, levels, np.zeros(50))[1])
 
 
 @ORDER.family("code length", "px", bits=(1, 2, 7, 10, 13, 15))

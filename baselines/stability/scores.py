@@ -6,7 +6,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, high_precision, worst, wrong
+from fpp_ml_bench.baselines.stability import cases
+from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, wide, worst, wrong
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import score
@@ -138,16 +139,14 @@ def scored(kind: str, mode: str) -> Outcome:
 
 def _exact(*parts: tuple[Floats, int]) -> tuple[float, float]:
     """MAE and RMSE of arrays repeated so many times: exact sums (integers of 2^-1074) in 50 digits."""
-    mp = high_precision()
-    mp.prec = 2300  # every product of two float64, added without rounding
-    pixels = sum(array.size * times for array, times in parts)
-    absolute, squares = mp.mpf(0), mp.mpf(0)
+    digits = 700  # every product of two float64, added without rounding
+    pixels, absolute, squares = 0, 0, 0
     for array, times in parts:
         values, counts = np.unique(np.abs(array), return_counts=True)
-        for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-            absolute += mp.mpf(value) * (count * times)
-            squares += mp.mpf(value) ** 2 * (count * times)
-    return float(absolute / pixels), float(mp.sqrt(squares / pixels))
+        exact, weights = wide(values, digits), wide(counts * times, digits)
+        pixels += array.size * times
+        absolute, squares = absolute + weights @ exact, squares + weights @ exact**2
+    return float(absolute / pixels), float(cases.high_precision(digits).sqrt(squares / pixels))
 
 
 def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: float = RANDOM) -> Outcome:
