@@ -15,14 +15,13 @@ from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability import cases
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, difference, rounded, wide, worst
-from fpp_ml_bench.baselines.stability.phase_order import inside_pattern, plane_stack
+from fpp_ml_bench.baselines.stability.phase_order import DIRECTIONS, plane_stack
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.loaders.render import Lighting, light_surface
 
 TRIANGULATION, RIG = Group("triangulation"), Group("rig")
 BASELINES = (160.0, 50.0, 10.0, 1.0, 0.1, 0.01)
-DIRECTIONS: tuple[optics.Direction, ...] = ("vertical", "horizontal")
 PAPER = optics.paper_rig(24)
 _TURN = optics.rotation_matrix((0.05, -0.09, 0.12))
 _WEIGHTS = (0.7, 1.3)
@@ -213,8 +212,7 @@ def point_at_infinity() -> Outcome:
 def decoded_far(range_m: float) -> Outcome:
     """decoded depth of a plane outside the working range; against the working range; bound: must be masked"""
     rig = optics.paper_rig(32)
-    frames, exact = plane_stack(rig, range_m)  # at the farthest its parallax is under a hundredth of a pixel
-    inside = inside_pattern(rig, exact)
+    frames, inside = plane_stack(rig, range_m)  # at the farthest its parallax is under a hundredth of a pixel
     depth_mm = decoding.decode_stack(frames, rig, mask=inside).depth_mm[inside]
     return worst(depth_mm, 0.0, depth_mm == 0)
 
