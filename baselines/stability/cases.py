@@ -10,7 +10,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache, partial
 from importlib import import_module
@@ -25,11 +25,10 @@ from fpp_ml_bench.errors import StabilityError
 Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
 Run = Callable[..., Any]
-"""Of a case; gives its `Outcome`, or None where a refusal is expected."""
+"""Of a case; gives its `Outcome`, or anything where a refusal is expected."""
 Refusals = type[Exception] | tuple[type[Exception], ...]
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
@@ -71,10 +70,8 @@ class Outcome:
     @property
     def ratio(self) -> float | None:
         """Error / bound; 0 where both are 0, None where nothing was computed."""
-        if self.error is None:
-            return None
-        if self.error == 0:
-            return 0.0
+        if not self.error:
+            return self.error
         return self.error / self.bound if self.bound > 0 else math.inf
 
 
@@ -126,31 +123,21 @@ class Group:
         self.cases: list[Case] = []
 
     def family(
-        self,
-        name: str,
-        unit: str,
-        /,
-        *,
-        about: str | None = None,
-        expects: Expects | Callable[..., Expects] = "number",
-        refuses: Refusals = (),
-        heavy: Callable[..., bool] = lambda **_: False,
-        **grid: Iterable[Scalar],
-    ) -> Callable[[Run], Run]:
+        self, name: str, unit: str, /, *, about: str = "", expects: Expects | Callable[..., Expects] = "number",
+        refuses: Refusals = (), heavy: Callable[..., bool] = lambda **_: False, **grid: Iterable[Scalar],
+    ) -> Callable[[Run], Run]:  # fmt: skip
         """Declare a function as a family: a case for each combination of the grid's values, which the function,
         ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
         against its reference; bound: how theory predicts it"."""
 
         def declare(run: Run) -> Run:
-            text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
-            computes, reference, predicts = re.split("; against |; bound: ", text)
+            texts = re.split("; against |; bound: ", " ".join((about or run.__doc__ or "; against ; bound: ").split()))
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
                 expected = expects(**given) if callable(expects) else expects
-                case = Case(
-                    self.name, name, given, computes, reference, predicts, unit, partial(run, **given), expected
+                self.cases.append(
+                    Case(self.name, name, given, *texts, unit, partial(run, **given), expected, refuses, heavy(**given))
                 )
-                self.cases.append(replace(case, refuses=refuses, heavy=heavy(**given)))
             return run
 
         return declare
@@ -185,17 +172,17 @@ def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: Non
     case did not name, is a FAIL."""
     rows = []
     for case in cases:
-        started = time.process_time()
+        started, failure = time.process_time(), ""
         try:
             with np.errstate(all="ignore"):
-                outcome = case.run() or Outcome(0.0)
-            verdict, against = judge(case, outcome)
+                outcome = case.run()
+            outcome = outcome if isinstance(outcome, Outcome) else Outcome(0.0)
         except case.refuses as error:
             outcome = Outcome(None, flagged=1.0, note=str(error))
-            verdict, against = judge(case, outcome)
         except _CRASHES as error:
             outcome = Outcome(None, note=f"{type(error).__name__}: {error}")
-            verdict, against = Verdict.FAIL, f"ended in {outcome.note}"
+            failure = f"ended in {outcome.note}"
+        verdict, against = (Verdict.FAIL, failure) if failure else judge(case, outcome)
         rows.append(Row(case, outcome, verdict, against, time.process_time() - started))
         done(rows[-1])
     return rows
@@ -220,29 +207,19 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
 
 
 def worst(
-    errors: ArrayLike,
-    bounds: ArrayLike = 0.0,
-    flagged: ArrayLike = False,
-    may_flag: float | None = None,
-    condition: float | None = None,
-    note: str = "",
-) -> Outcome:
+    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, may_flag: float | None = None,
+    condition: float | None = None, note: str = "",
+) -> Outcome:  # fmt: skip
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)
-    share = float(refused.mean()) if refused.size else 0.0
-    unflagged = np.flatnonzero(~refused)
-    if not unflagged.size:
+    if refused.all():
         return Outcome(None, 0.0, 1.0, may_flag, note or "every element is masked", condition)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(error[unflagged] == 0, 0.0, error[unflagged] / bound[unflagged])
-    index = unflagged[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
-    return Outcome(float(error[index]), float(bound[index]), share, may_flag, note, condition)
-
-
-def masked(flagged: ArrayLike) -> Outcome:
-    """The outcome of elements that must all be masked."""
-    return worst(np.zeros(np.shape(flagged)), 0.0, flagged)
+        ratio = np.where(error == 0, 0.0, error / bound)
+    ratio = np.where(refused, -1.0, np.where(np.isnan(ratio), np.inf, ratio))
+    index = int(np.argmax(ratio))
+    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), may_flag, note, condition)
 
 
 @cache
@@ -265,14 +242,9 @@ def by_mpmath(name: str, *values: NDArray[np.object_]) -> NDArray[np.object_]:
     return np.frompyfunc(getattr(high_precision(), name), len(values), 1)(*values)
 
 
-def rounded(values: NDArray[np.object_]) -> Floats:
-    """High-precision numbers rounded once to float64."""
-    return values.astype(np.float64)
-
-
 def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
     """``values`` minus high-precision numbers, subtracted before it is rounded."""
-    return rounded(wide(values) - exact)
+    return (wide(values) - exact).astype(np.float64)
 
 
 def gamma(operations: float, unit: float = U64) -> float:

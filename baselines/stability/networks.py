@@ -3,7 +3,7 @@ the phase methods on images without an object; the training metric."""
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -195,15 +195,11 @@ def nearly_constant(offset: float) -> Outcome:
 @NETWORKS.family("instance norm gradient", "1")
 def instance_norm_gradient() -> Outcome:
     """closed-form gradient in float64; against torch's own instance norm in float64; bound: 12 u sum |seed|"""
-    layers = InstanceNorm(3, affine=True).double(), nn.InstanceNorm2d(3, affine=True).double()
-    x, seed = normal((2, 3, 12, 10), 6), normal((2, 3, 12, 10), 7)
+    x, seed = normal((2, 3, 12, 10), 6).requires_grad_(), normal((2, 3, 12, 10), 7)
     gradients = []
-    for layer in layers:
-        with torch.no_grad():
-            for parameter in layer.parameters():
-                parameter.copy_(normal((3,), 5))
-        inner = x.clone().requires_grad_()
-        gradients.append(torch.autograd.grad((layer(inner) * seed).sum(), [inner, *layer.parameters()]))
+    for layer in InstanceNorm(3, affine=True).double(), nn.InstanceNorm2d(3, affine=True).double():
+        layer.load_state_dict({name: normal((3,), 5) for name in ("weight", "bias")})
+        gradients.append(torch.autograd.grad((layer(x) * seed).sum(), [x, *layer.parameters()]))
     errors = [float((a - b).abs().max()) for a, b in zip(*gradients, strict=True)]
     return worst(errors, gamma(12) * np.float32(seed.abs().sum()))
 
@@ -264,22 +260,23 @@ def network_gradient(name: str) -> Outcome:
 def network_single(name: str) -> Outcome:
     """output in float32; against the same weights in float64; bound: 16 x what rounding each weight and pixel once
     (2^-24) does: condition number x unit round-off"""
-    network = small_network(name).double().eval()
-    x = uniform((1, 1, 64, 64), 11)
-    state = copy.deepcopy(network.state_dict())
+    network, x = small_network(name).double().eval(), uniform((1, 1, 64, 64), 11)
+    weights = [*copy.deepcopy(network).parameters()]
 
-    def inexact(values: Tensor, generator: torch.Generator) -> Tensor:
-        return values * (1 + U32 * (torch.rand(values.shape, generator=generator, dtype=torch.float64) * 2 - 1))
+    def output(values: Sequence[Tensor], image: Tensor) -> Tensor:
+        for parameter, value in zip(network.parameters(), values, strict=True):
+            parameter.copy_(value)
+        return network(image)
 
     with torch.no_grad():
-        exact = network(x)
-        spread, weights = torch.zeros_like(exact), [parameter.clone() for parameter in network.parameters()]
+        exact, spread = network(x), torch.zeros(1, dtype=torch.float64)
         for generator in map(_seeded, (20, 21, 22)):
-            nearby = [inexact(values, generator) for values in (*weights, x)]
-            for parameter, weight in zip(network.parameters(), nearby, strict=False):
-                parameter.copy_(weight)
-            spread = torch.maximum(spread, (network(nearby[-1]) - exact).abs())
-        network.load_state_dict(state)
+            *inexact, image = (
+                values * (1 + U32 * (torch.rand(values.shape, generator=generator, dtype=torch.float64) * 2 - 1))
+                for values in (*weights, x)
+            )
+            spread = torch.maximum(spread, (output(inexact, image) - exact).abs())
+        output(weights, x)
         single = network.float()(x.float()).double()
     scale = float(spread.max())
     # A weight takes part in sums of up to 10^3 products: 16 is half of sqrt(10^3), and includes the weights' rounding.
@@ -344,28 +341,20 @@ def phase_output(name: str, image: str) -> Outcome:
 @NETWORKS.family("training metric", "relative", refuses=PredictionError, scale=(1.0, 1e-30, 1e30, 1e-160, 1e-300))
 def metric_scale(scale: float) -> Outcome:
     """mean RMSE of 50 samples as a torchmetrics metric; against exactly rounded sums; bound: gamma of 460 roundings"""
-    metric = DepthScores()
-    target = torch.zeros((1, 20, 20), dtype=torch.float64)
+    metric, target = DepthScores(), torch.zeros((1, 20, 20), dtype=torch.float64)
     target[:, 5:15, 5:15] = 4096 * scale
     errors = scale * torch.randint(1, 999, (50, 20, 20), generator=_seeded(14)).double()
     for error in errors:
         metric.update(target + error[None], target)
-    roots = [
-        scale * math.sqrt(math.fsum((value / scale) ** 2 for value in sample.flatten().tolist()) / sample.numel())
-        for sample in (target + errors) - target
-    ]
+    scaled = (((target + errors) - target) / scale).flatten(1)
+    roots = [scale * math.sqrt(math.fsum(value**2 for value in row) / len(row)) for row in scaled.tolist()]
     exact_mm = math.fsum(roots) / len(roots)
     error = float(metric.compute()["overall_rmse_mm"]) / exact_mm - 1
     return worst(error, gamma(460) + 2 * 2.0**-1074 / max(exact_mm, 2.0**-1074))
 
 
-@NETWORKS.family(
+NETWORKS.family(
     "training metric, not a number", "mm", expects="refusal", refuses=PredictionError,
-    value=(float("nan"), float("inf"), 1e200),
-)  # fmt: skip
-def metric_refuses(value: float) -> None:
-    """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
-    target = torch.full((1, 8, 8), 1800.0, dtype=torch.float64)
-    prediction = target.clone()
-    prediction[0, 1, 2] = value
-    DepthScores().update(prediction, target)
+    about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
+    value=(math.nan, math.inf, 1e200),
+)(lambda value: DepthScores().update(torch.tensor([[[1800.0, value]]]).double(), torch.full((1, 1, 2), 1800.0)))  # fmt: skip

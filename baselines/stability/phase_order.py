@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.stability import cases
-from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, difference, rounded, wide, worst
+from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, difference, wide, worst
 from fpp_ml_bench.compiled import numba_enabled
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError, RigError
@@ -28,13 +28,9 @@ def phases(count: int = 720) -> Floats:
     return -np.pi + 2 * np.pi * (np.arange(count) + 0.3819) / count
 
 
-def shifts(steps: int) -> Floats:
-    """Equal phase shifts 2 pi n / N."""
-    return 2 * np.pi * np.arange(steps) / steps
-
-
-def sinusoids(phase: NDArray, deltas: NDArray, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
-    """Frames A + B cos(phi + delta_n), (N, 1, n)."""
+def sinusoids(phase: NDArray, shifts: int | NDArray, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
+    """Frames A + B cos(phi + delta_n), (N, 1, n), of these shifts or a number of equal ones."""
+    deltas = 2 * np.pi * np.arange(shifts) / shifts if isinstance(shifts, int) else shifts
     return mean + modulation * np.cos(phase[None, None, :] + np.reshape(deltas, (-1, 1, 1)))
 
 
@@ -85,7 +81,7 @@ def direction_levels(
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to.
     """
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
-    waves = sinusoids(2 * np.pi * coordinate_px / pitch, shifts(rig.sequence.steps), mean, modulation)[:, 0]
+    waves = sinusoids(2 * np.pi * coordinate_px / pitch, rig.sequence.steps, mean, modulation)[:, 0]
     code = optics.binary_to_gray(optics.cell_of(np.rint(coordinate_px), pitch))
     bright = (code >> np.arange(bits - 1, -1, -1)[:, None]) & 1
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
@@ -124,16 +120,11 @@ def _decoded_phase(
     mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
 ) -> tuple[Floats, NDArray]:
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
-    rig, rng = coded_rig(), np.random.default_rng(7)
-    positions_px = _positions_px(rig, count)
+    rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, count)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
-    levels = levels + noise_grey * rng.standard_normal(levels.shape)
+    levels += noise_grey * np.random.default_rng(7).standard_normal(levels.shape)
     error_px, flagged = coordinate_error(rig, levels, positions_px)
-    return error_px * 2 * np.pi / rig.pitch("vertical"), flagged
-
-
-def _positions_px(rig: optics.Rig, count: int) -> Floats:
-    return np.linspace(2.0, rig.pattern_length("vertical") - 1 - 2.0, count)
+    return error_px * 2 * np.pi / 18.0, flagged
 
 
 def _px_per_m(rig: optics.Rig) -> float:
@@ -159,7 +150,7 @@ def _exact_phase(frames: NDArray, deltas: NDArray[np.object_]) -> NDArray[np.obj
 def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     """wrapped phase of 18 float64 frames; against least squares of the same frames in 50 digits; bound: sqrt(2) 2 (N +
     4 pi + 2) u (A + B) / B: N + 1 roundings a sum, 4 pi + 1 in each weight, over B"""
-    frames = sinusoids(phases(48), shifts(steps), MEAN, modulation)
+    frames = sinusoids(phases(48), steps, MEAN, modulation)
     exact = _exact_phase(frames, 2 * cases.high_precision().pi * wide(range(steps)) / steps)
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
@@ -198,11 +189,6 @@ def noise(modulation: float) -> Outcome:
     return Outcome(float(np.sqrt(np.mean(unflagged**2))), bound, float(flagged.mean()))
 
 
-def _clipped_mean(share: float) -> float:
-    """The mean with which ``share`` of a period is above 255."""
-    return 255.0 - MODULATION * math.cos(math.pi * share) if share else MEAN
-
-
 def _clip_harmonic(order: int, alpha: float) -> float:
     """Fourier coefficient of max(cos t - cos alpha, 0): (2/pi) times its integral against cos(order t), 0..alpha."""
     if order == 1:
@@ -216,19 +202,20 @@ def _aliases(steps: int, highest: int) -> list[int]:
     return [k * steps + side for k in range(1, highest) for side in (-1, 1)]
 
 
-def _clipped(share: float, steps: int, highest: int) -> tuple[float, float]:
-    """Aliased harmonics and what is left of the first, of a cosine clipped in ``share`` of the period."""
-    leak = sum(abs(_clip_harmonic(order, math.pi * share)) for order in _aliases(steps, highest))
-    return leak, 1 - _clip_harmonic(1, math.pi * share)
+def _clipped(share: float, steps: int, highest: int) -> tuple[float, float, float]:
+    """The mean with which ``share`` of a period is above 255; aliased harmonics, and what is left of the first."""
+    alpha = math.pi * share
+    leak = sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(steps, highest))
+    return 255.0 - MODULATION * math.cos(alpha) if share else MEAN, leak, 1 - _clip_harmonic(1, alpha)
 
 
 @PHASE.family("saturation, phase alone", "rad", steps=(18, 3), share=SHARES)
 def saturation_phase(share: float, steps: int) -> Outcome:
     """wrapped phase of frames clipped in a share of the period; against the phase that the frames were made from;
     bound: asin(sum |c_(kN-1)| + |c_(kN+1)| over c_1): aliased harmonics of a clipped cosine, closed form"""
-    frames = np.minimum(sinusoids(phases(), shifts(steps), _clipped_mean(share)), 255.0)
     highest = 4000
-    leak, left = _clipped(share, steps, highest)
+    mean, leak, left = _clipped(share, steps, highest)
+    frames = np.minimum(sinusoids(phases(), steps, mean), 255.0)
     rest = 8 / (math.pi * (steps * highest) * steps) if share else 0.0  # of the tail: |coefficient| <= 4 / (pi order^2)
     return worst(phase_error(frames), worst_angle(leak + rest, left) + 100 * U64)
 
@@ -240,8 +227,8 @@ def saturation_phase(share: float, steps: int) -> Outcome:
 def saturation_decoder(share: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: as above,
     plus half a grey level; more than 2 clipped frames of 18 must be refused"""
-    error, flagged = _decoded_phase(_clipped_mean(share))
-    leak, left = _clipped(share, 18, 500)
+    mean, leak, left = _clipped(share, 18, 500)
+    error, flagged = _decoded_phase(mean)
     return worst(error, worst_angle(MODULATION * leak + ROUNDING, MODULATION * left), flagged)
 
 
@@ -249,7 +236,7 @@ def saturation_decoder(share: float) -> Outcome:
 def gamma_bend(gamma: float, steps: int) -> Outcome:
     """wrapped phase of frames 255 (I / 255)^gamma; against the phase that the frames were made from; bound: asin(sum of
     the harmonics kN +- 1 over the first), which N steps alias with the fringe"""
-    frames = 255.0 * (sinusoids(phases(), shifts(steps), MEAN, 120.0) / 255.0) ** gamma
+    frames = 255.0 * (sinusoids(phases(), steps, MEAN, 120.0) / 255.0) ** gamma
     theta = 2 * np.pi * np.arange(1 << 14) / (1 << 14)
     harmonics = np.abs(np.fft.rfft((0.5 + 120.0 / 255.0 * np.cos(theta)) ** gamma)) / theta.size
     leak = float(sum(harmonics[order] for order in _aliases(steps, 4000 // steps)))
@@ -261,7 +248,7 @@ def quantisation(bits: int, steps: int) -> Outcome:
     """wrapped phase of frames of this bit depth, B = 100; against the phase that the frames were made from; bound:
     asin(q g / 2B), q = 255 / (2^bits - 1); pi / N where one bit leaves 2N states or N"""
     levels = 2**bits - 1
-    frames = np.rint(sinusoids(phases(), shifts(steps)) / 255.0 * levels) * (255.0 / levels)
+    frames = np.rint(sinusoids(phases(), steps) / 255.0 * levels) * (255.0 / levels)
     bound = worst_angle(255.0 / levels / 2 * frame_gain(steps))
     return worst(phase_error(frames), (min(bound, math.pi / steps) if bits == 1 else bound) + 100 * U64)
 
@@ -270,7 +257,7 @@ def quantisation(bits: int, steps: int) -> Outcome:
 def few_steps(steps: int) -> Outcome:
     """wrapped phase of 8-bit frames, B = 100; against the phase that the frames were made from; bound: asin(g / 2B), g
     = max (2/N) sum |sin|"""
-    return worst(phase_error(grey(sinusoids(phases(), shifts(steps)))), worst_angle(0.5 * frame_gain(steps)))
+    return worst(phase_error(grey(sinusoids(phases(), steps))), worst_angle(0.5 * frame_gain(steps)))
 
 
 @PHASE.family("unequal steps", "rad", chosen=(3, 4, 5, 7, 8, 11, 13, 17))
@@ -302,11 +289,10 @@ def close_steps(spread_rad: float) -> Outcome:
     return worst(error, bound, condition=largest / least)
 
 
-@PHASE.family("equal shifts", "rad", expects="refusal", refuses=DecodeError)
-def equal_shifts() -> None:
-    """weights of the shifts 0, 1, 1 rad; against there is no such phase; bound: two different shifts do not determine
-    the phase"""
-    decoding.phase_weights([0.0, 1.0, 1.0])
+PHASE.family(
+    "equal shifts", "rad", expects="refusal", refuses=DecodeError, about="weights of the shifts 0, 1, 1 rad; against "
+    "there is no such phase; bound: two different shifts do not determine the phase",
+)(lambda: decoding.phase_weights([0.0, 1.0, 1.0]))  # fmt: skip
 
 
 @PHASE.family("dead frame", "mm", expects="refusal", refuses=DecodeError, steps=(18, 9, 6, 4), level=(0, 255))
@@ -334,7 +320,7 @@ PHASE.family(
 def repeated_frame(steps: int) -> Outcome:
     """wrapped phase where frame 1 is frame 0 again; against the phase that the frames were made from; bound: asin((2/N)
     2 sin(pi/N)): one frame off by 2 B sin(pi/N) at most"""
-    frames = sinusoids(phases(), shifts(steps))
+    frames = sinusoids(phases(), steps)
     frames[1] = frames[0]
     return worst(phase_error(frames), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
 
@@ -347,7 +333,7 @@ def pitch(pitch_px: float) -> Outcome:
     """projector coordinate by the decoder, 8-bit frames; against the coordinate of the pixel; bound: P / 2 pi asin(g /
     2B) over the whole pattern; under 4 px or beyond the pattern refused"""
     rig = coded_rig(pitch_px)
-    positions_px = _positions_px(rig, 20_000)
+    positions_px = np.linspace(2.0, 909.0, 20_000)
     return _decoded(rig, direction_levels(rig, positions_px), positions_px)
 
 
@@ -377,23 +363,20 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
     return _decoded(rig, levels, positions_px)
 
 
-_PI = 3.141592653589793
-
-
 @ORDER.family(
-    "order of a phase at the wrap", "rad",
-    phase_rad=(-_PI, _PI, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, 1.5707963267948966),
+    "order of a phase at the wrap", "rad", phase_rad=(
+        -math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2,
+    ),
 )  # fmt: skip
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
-    rig = optics.paper_rig(32)
-    centres = optics.cell_centres_rad(rig.pattern_length("vertical"), rig.pitch("vertical"))
+    centres = optics.cell_centres_rad(912, 18.0)
     cells = np.arange(len(centres), dtype=np.int32)
     absolute, agrees = optics.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
     two_pi = 2 * cases.high_precision().pi
     exact = phase_rad + two_pi * cases.by_mpmath("floor", (wide(centres) - phase_rad) / two_pi + 0.5)
-    near = np.abs(rounded(exact) - centres)
+    near = np.abs(exact.astype(float) - centres)
     may_flag = float(np.mean(near > optics.INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
@@ -402,12 +385,10 @@ def order_of_pi(phase_rad: float) -> Outcome:
 def arctangent(scale: float, code: str) -> Outcome:
     """-atan2 in all octants, on the axes, beside +-pi; against 50 digits; bound: 4 u |phi|, the 2 ulp that the compiled
     arctangent promises"""
-    beside = np.logspace(-15, -1, 15)
-    turn = np.concatenate(
-        [np.linspace(-np.pi, np.pi, 97), np.pi - beside, -np.pi + beside, np.pi / 8 + np.array([-1e-15, 0, 1e-15])]
-    )
-    cosine = np.concatenate([scale * np.cos(turn), scale * np.array([1.0, -1, 0, 0, -1, 1])])
-    sine = np.concatenate([scale * np.sin(turn), scale * np.array([0.0, 0, 1, -1, -1e-17, 1e-300])])
+    beside, eighth = np.logspace(-15, -1, 15), np.pi / 8 + np.array([-1e-15, 0, 1e-15])
+    turn = np.concatenate([np.linspace(-np.pi, np.pi, 97), np.pi - beside, -np.pi + beside, eighth])
+    cosine = scale * np.concatenate([np.cos(turn), [1.0, -1, 0, 0, -1, 1]])
+    sine = scale * np.concatenate([np.sin(turn), [0.0, 0, 1, -1, -1e-17, 1e-300]])
     if code == "compiled" and numba_enabled():
         from fpp_ml_bench.decoding.kernels import _minus_atan2
 
@@ -446,13 +427,11 @@ def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
 def flipped_bit_alone(bit: int) -> Outcome:
     """coordinate with one bit inverted, and the flagged pixels; against integer arithmetic on the misread cell: error
     in whole periods, or refused; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
-    rig = coded_rig()
-    pitch, bits = 18.0, rig.sequence.bits("vertical")
-    positions_px = np.arange(3.0, rig.pattern_length("vertical") - 3.0, 0.25)
-    levels = direction_levels(rig, positions_px)
-    row = rig.sequence.steps + bit
+    rig, pitch = coded_rig(), 18.0
+    positions_px = np.arange(3.0, 909.0, 0.25)
+    levels, row = direction_levels(rig, positions_px), rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
-    cells = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int)
+    cells, bits = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int), rig.sequence.bits("vertical")
     read = np.asarray(optics.gray_to_binary(optics.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
     centres = optics.cell_centres_rad(912, pitch)
     centre = centres[np.minimum(read, len(centres) - 1)]
@@ -469,10 +448,10 @@ def flipped_bit_alone(bit: int) -> Outcome:
     return worst(np.where(wrong_flag, np.inf, error), _rounding_px(rig), flagged & ~wrong_flag, note=note)
 
 
-@ORDER.family("more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6))
-def too_few_codes(bits: int) -> None:
-    """a rig of 51 periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat"""
-    replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits))
+ORDER.family(
+    "more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6), about="a rig of 51 "
+    "periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat",
+)(lambda bits: replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits)))  # fmt: skip
 
 
 @ORDER.family("cell off the pattern", "px", expects="refusal", cell=(102, 103, 111, 127))
@@ -480,9 +459,9 @@ def cell_off_pattern(cell: int) -> Outcome:
     """a pixel whose code names a cell beyond the pattern; against there is no such cell; bound: must be masked"""
     rig = optics.paper_rig(32)
     bright = (int(optics.binary_to_gray(cell)) >> np.arange(6, -1, -1)[:, None]) & 1
-    waves = sinusoids(np.linspace(-3, 3, 50), shifts(rig.sequence.steps))[:, 0]
+    waves = sinusoids(np.linspace(-3, 3, 50), rig.sequence.steps)[:, 0]
     levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2.0 * bright - 1), 50, axis=1)])
-    return cases.masked(coordinate_error(rig, levels, np.zeros(50))[1])
+    return worst(0.0, flagged=coordinate_error(rig, levels, np.zeros(50))[1])
 
 
 @ORDER.family("code length", "px", bits=(1, 2, 7, 10, 13, 15))

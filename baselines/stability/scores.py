@@ -23,7 +23,6 @@ hundred million (Higham and Mary 2019). Where the numbers are all alike the wors
 RANDOM = LIKELY * math.sqrt(score.BLOCK)
 _TINY = 2.0**-149
 _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
-_SIDE = 100
 
 
 def depth_map(kind: str, low_mm: float, span_mm: float) -> Floats:
@@ -74,8 +73,12 @@ for _family, _grid in {
     NORMALISATION.family(_family, "mm", **_grid)(round_trip)
 
 
-def _quotient_error(depth: NDArray, low: float, high: float) -> Outcome:
-    """The individual representation of the object against the quotient in 80-bit arithmetic, within 4 u32."""
+@NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
+def forward(low_mm: float, span_mm: float, kind: str = "part", stored: str = "") -> Outcome:
+    """(D - D_min) / (D_max - D_min) in float32; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value:
+    difference, range and quotient round once each"""
+    depth = depth_map(kind, low_mm, span_mm).astype(stored or "float32")
+    low, high = _range(depth) if stored else (low_mm + span_mm * 1e-9, low_mm + span_mm * (1 - 1e-9))
     inside = object_mask(depth)
     exact = (depth[inside].astype(np.longdouble) - low) / (np.longdouble(high) - low) if high > low else 0.0
     representation = normalise(depth, "individual", low, high)[inside]
@@ -83,35 +86,21 @@ def _quotient_error(depth: NDArray, low: float, high: float) -> Outcome:
     return worst(np.asarray(representation - exact, float), bound)
 
 
-@NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
-def forward(kind: str, low_mm: float, span_mm: float, stored: str) -> Outcome:
-    """(D - D_min) / (D_max - D_min) in float32; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value:
-    difference, range and quotient round once each"""
-    depth = depth_map(kind, low_mm, span_mm).astype(stored)
-    return _quotient_error(depth, *_range(depth))
-
-
-@NORMALISATION.family("range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3))
-def foreign_range(low_mm: float, span_mm: float) -> Outcome:
-    """individual depth with a range that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4
-    u32 of the value"""
-    depth = depth_map("part", low_mm, span_mm).astype(np.float32)
-    return _quotient_error(depth, low_mm + span_mm * 1e-9, low_mm + span_mm * (1 - 1e-9))
-
-
+NORMALISATION.family(
+    "range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3), about="individual depth with a range "
+    "that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value",
+)(forward)  # fmt: skip
 NORMALISATION.family(
     "subnormal range", "mm", name=("individual",), kind=("full frame",), low_mm=(0.0,), stored=("float64",),
     span_mm=(1e-40, 1e-60, 1e-300),
 )(round_trip)  # fmt: skip
 
 
-@NORMALISATION.family(
+NORMALISATION.family(
     "impossible range", "1", expects="refusal", refuses=ValueError,
-    low_mm=(1600.0, float("nan"), float("-inf")), high_mm=(1500.0, float("inf"), float("nan")),
-)  # fmt: skip
-def impossible_range(low_mm: float, high_mm: float) -> None:
-    """depth with an invalid range; against there is no such representation; bound: must be refused"""
-    normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm)
+    about="depth with an invalid range; against there is no such representation; bound: must be refused",
+    low_mm=(1600.0, math.nan, -math.inf), high_mm=(1500.0, math.inf, math.nan),
+)(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))  # fmt: skip
 
 
 @NORMALISATION.family(
@@ -213,8 +202,8 @@ def one_large(large_mm: float) -> Outcome:
 def sample(scale_mm: float, stored: str) -> Outcome:
     """object and background MAE and RMSE of 100 x 100 px; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
     in float64, random roundings; blocks are added exactly"""
-    errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (_SIDE, _SIDE))
-    target = np.zeros((_SIDE, _SIDE), stored)
+    errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (100, 100))
+    target = np.zeros((100, 100), stored)
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
     scores = score.score_sample(prediction, target)
@@ -231,8 +220,8 @@ def sample(scale_mm: float, stored: str) -> Outcome:
 def distribution(scale_mm: float) -> Outcome:
     """median, 95th percentile, largest, bias, shift-free MAE; against sorted values and exact sums; bound: gamma_9600
     mean |e| + 4 u"""
-    errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (_SIDE, _SIDE)).astype(np.float64)
-    target = np.full((_SIDE, _SIDE), 4096.0 * scale_mm)
+    errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (100, 100)).astype(np.float64)
+    target = np.full((100, 100), 4096.0 * scale_mm)
     prediction = target + errors
     measured = score.score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
@@ -281,23 +270,17 @@ def merged(order: str) -> Outcome:
     return _compared(total, (whole.mae_mm, whole.rmse_mm), LIKELY * math.sqrt(6 * len(parts)))
 
 
-@METRICS.family(
-    "not a number", "mm", expects="refusal", refuses=PredictionError,
-    value=(float("nan"), float("inf"), float("-inf"), 1e300),
-)  # fmt: skip
-def not_a_number(value: float) -> None:
-    """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
-    target = np.full((8, 8), 1800.0)
-    score.score_sample(np.where(np.arange(64).reshape(8, 8) == 28, value, target), target)
+METRICS.family(
+    "not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, -math.inf, 1e300),
+    about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
+)(lambda value: score.score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))  # fmt: skip
 
 
 @METRICS.family("perfect and empty", "mm")
 def flawless() -> Outcome:
     """scores of a perfect prediction and of an empty set; against 0, and none; bound: exact"""
-    target = np.zeros((64, 64), np.float32)
-    target[10:40, 10:40] = 1234.567
-    scores = score.score_sample(target, target)
-    empty = score.score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
+    target = np.pad(np.full((30, 30), 1234.567, np.float32), 17)
+    scores, empty = score.score_sample(target, target), score.score_sample(*np.zeros((2, 4, 4))).object
     parts = scores.overall, scores.object, scores.background
     good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == score.EMPTY
     return Outcome(0.0) if good else wrong()

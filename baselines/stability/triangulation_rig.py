@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability import cases
-from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, difference, rounded, wide, worst
+from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, difference, wide, worst
 from fpp_ml_bench.baselines.stability.phase_order import DIRECTIONS, plane_stack
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
@@ -29,8 +29,8 @@ _WEIGHTS = (0.7, 1.3)
 
 def _rays(count: int) -> optics.Maps:
     """Normalised coordinates of camera rays across the paper's field of view, seeded."""
-    rng = np.random.default_rng(5)
-    return rng.uniform(-0.2, 0.2, count), rng.uniform(-0.2, 0.2, count)
+    x, y = np.random.default_rng(5).uniform(-0.2, 0.2, (2, count))
+    return x, y
 
 
 RAYS = _rays(40)
@@ -59,7 +59,7 @@ def exact_coordinates(depth_m: float, rig: optics.Rig, rays: optics.Maps = RAYS)
     """Projector px (2, n) of points at ``depth_m`` on the rays, in 50 digits, rounded once."""
     focal, centre = _device(rig)
     points = _turned(rig, rays) * depth_m + wide(rig.t)[:, None]
-    return rounded(wide(focal) * points[:2] / points[2] + centre)
+    return (wide(focal) * points[:2] / points[2] + centre).astype(float)
 
 
 def exact_depth_mm(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> NDArray[np.object_]:
@@ -72,7 +72,7 @@ def exact_depth_mm(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> NDArr
 
 def relative(depth_mm: NDArray, exact: NDArray[np.object_]) -> Floats:
     """Relative error of depths, against high-precision numbers."""
-    return difference(depth_mm, exact) / np.abs(rounded(exact))
+    return difference(depth_mm, exact) / np.abs(exact.astype(float))
 
 
 def depth_of(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> Floats:
@@ -101,8 +101,8 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
     """The outcome of depths from one coordinate; the ``indistinct`` ones may be masked."""
     exact, depth_mm = exact_depth_mm(coordinate, rig, axis), depth_of(coordinate, rig, axis)
     bound, condition = conditioning(coordinate, rig, axis)
-    # Where the bound exceeds half of the depth, the number is round-off and must be masked, as behind the camera.
-    nothing = ~(bound < 0.5) | ~(rounded(exact) > 0)
+    # Where the bound exceeds half of the depth, the number is round-off and must be as behind the camera.
+    nothing = ~(bound < 0.5) | ~(exact.astype(float) > 0)
     error = np.where(nothing, np.inf, relative(depth_mm, exact))
     return worst(error, bound, np.isnan(depth_mm), float(np.mean(nothing | indistinct)), float(condition.max()))
 
@@ -145,7 +145,7 @@ def _least_squares(
         h = 2 * t[2] * g / q  # d2r/dw2
         square, bend = weights @ g**2, weights @ (r * h)
         w = w + weights @ (r * g) / (square + bend)
-    return 1000 / w, rounded(np.abs(bend / square)), rounded(np.abs((first - w) / w))
+    return 1000 / w, np.abs(bend / square).astype(float), np.abs((first - w) / w).astype(float)
 
 
 @TRIANGULATION.family(
@@ -161,7 +161,7 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     exact, contraction, start = _least_squares(measured_px, rig, rays)
     depth_mm = decoding.depth_from_both(rays, *measured_px, rig, *_WEIGHTS).depth_mm
     bounds, conditions = zip(*(conditioning(measured_px[i], rig, i, rays) for i in (0, 1)), strict=True)
-    in_front = rounded(exact) > 0
+    in_front = exact.astype(float) > 0
     bound = 8 * np.maximum(*bounds) + start * (contraction + 4 * start) ** 3
     error = np.where(in_front, relative(depth_mm, exact), 0.0)
     return worst(error, bound, np.isnan(depth_mm), float(np.mean(~in_front)), float(np.max(conditions)))
@@ -205,7 +205,7 @@ def point_at_infinity() -> Outcome:
     """depth where ray and projector plane are exactly parallel; against there is none; bound: must be masked"""
     rays = np.array([0.0, 0.125, -0.25]), np.zeros(3)  # where its coordinate is exact
     coordinate = PAPER.projector.fx * rays[0] + PAPER.projector.cx
-    return cases.masked(np.isnan(decoding.depth_from_coordinate(rays, coordinate, PAPER, "vertical")))
+    return worst(0.0, flagged=np.isnan(decoding.depth_from_coordinate(rays, coordinate, PAPER, "vertical")))
 
 
 @TRIANGULATION.family("far plane through the decoder", "mm", expects="refusal", range_m=(0.3, 1.0, 3.2, 20.0, 100.0))
@@ -223,7 +223,7 @@ def behind_projector(ahead_m: float) -> Outcome:
     rig = replace(PAPER, translation_m=(0.125, -0.1, -ahead_m))
     points = _RAYS_3D * (0.5 * ahead_m) + rig.t
     mirrored = rig.projector.fx * points[:, 0] / points[:, 2] + rig.projector.cx
-    return cases.masked(np.isnan(depth_of(mirrored, rig)))
+    return worst(0.0, flagged=np.isnan(depth_of(mirrored, rig)))
 
 
 @TRIANGULATION.family("projector behind the surface", "grey", expects="refusal")
@@ -294,18 +294,17 @@ def overflowing(value: float) -> Outcome:
 @TRIANGULATION.family("no weight", "mm", expects="refusal")
 def no_weight() -> Outcome:
     """depth from two directions without modulation; against there is none; bound: must be masked"""
-    u, v = exact_coordinates(1.8, PAPER)
-    return cases.masked(np.isnan(decoding.depth_from_both(RAYS, u, v, PAPER, 0.0, 0.0).depth_mm))
+    depth_mm = decoding.depth_from_both(RAYS, *exact_coordinates(1.8, PAPER), PAPER, 0.0, 0.0).depth_mm
+    return worst(0.0, flagged=np.isnan(depth_mm))
 
 
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:
-    camera = optics.Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px)
-    u = np.linspace(-0.5, 959.5, 97)
-    if not all(np.isfinite(axis).all() for axis in camera.rays()):
+    camera, u = optics.Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px), np.linspace(-0.5, 959.5, 97)
+    if not np.isfinite(camera.rays()).all():
         return Outcome(math.inf, 1.0, note="rays that are not finite")
+    size = np.abs(u - centre_px) + abs(centre_px)
     back = camera.pixels(*camera.normalised(u, u))[0]
-    bound = 3 * U64 * (np.abs(u - centre_px) + abs(centre_px)) + U64 * np.abs(u)
-    return worst(back - u, bound, condition=float(np.max((np.abs(u - centre_px) + abs(centre_px)) / 960)))
+    return worst(back - u, 3 * U64 * size + U64 * np.abs(u), condition=float(np.max(size / 960)))
 
 
 _BACK = "pixel to ray and back; against the pixel; bound: 3 u (|u - c| + |c|) + u |u|; refused from a condition number "
@@ -381,9 +380,9 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
         below = (forward(middle) < target).astype(bool)
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     square = low * low
-    slope = np.maximum(rounded(1 + square * (3 * a + square * (5 * b + square * 7 * c))), 1e-9)
+    slope = np.maximum((1 + square * (3 * a + square * (5 * b + square * 7 * c))).astype(float), 1e-9)
     invertible = (target < largest).astype(bool)
-    error = np.where(invertible, radii - rounded(low), np.where(np.isnan(radii), 0.0, np.inf))
+    error = np.where(invertible, radii - low.astype(float), np.where(np.isnan(radii), 0.0, np.inf))
     near = np.abs(radius - float(largest)) < 1e-3
     may_flag, bound = float(np.mean(~invertible | near)), 32 * U64 / np.where(invertible, slope, 1.0)
     return worst(error, bound, np.isnan(radii), may_flag, condition=float(1 / slope[invertible].min()))
@@ -426,9 +425,9 @@ def tangential(p1: float) -> Outcome:
 @RIG.family("lens without inverse at the corner", "mm", expects="either", k1=(-0.1, -0.5, -2.0, -10.0))
 def folding_camera(k1: float) -> Outcome:
     """decoded depth where the lens model has no inverse; against there is none; bound: must be masked"""
-    base = optics.paper_rig(32)
-    camera = replace(base.camera, fx=base.camera.fx / 4, fy=base.camera.fy / 4, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
-    frames, _ = plane_stack(replace(base, camera=replace(camera, distortion=(0.0,) * 5)))
+    base, none = optics.paper_rig(32), (0.0,) * 4
+    camera = replace(base.camera, fx=base.camera.fx / 4, fy=base.camera.fy / 4, distortion=(k1, *none))
+    frames, _ = plane_stack(replace(base, camera=replace(camera, distortion=(0.0, *none))))
     x, y = camera.rays()
     without = np.isnan(x) | np.isnan(y)
     decoded = decoding.decode_stack(frames, replace(base, camera=camera), direction="vertical")
