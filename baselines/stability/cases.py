@@ -131,13 +131,13 @@ class Group:
         against its reference; bound: how theory predicts it"."""
 
         def declare(run: Run) -> Run:
-            texts = re.split("; against |; bound: ", " ".join((about or run.__doc__ or "; against ; bound: ").split()))
+            text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
+            of, against, bound = re.split("; against |; bound: ", text)
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
-                expected = expects(**given) if callable(expects) else expects
-                self.cases.append(
-                    Case(self.name, name, given, *texts, unit, partial(run, **given), expected, refuses, heavy(**given))
-                )
+                expected, call = expects(**given) if callable(expects) else expects, partial(run, **given)
+                rest = call, expected, refuses, heavy(**given)
+                self.cases.append(Case(self.name, name, given, of, against, bound, unit, *rest))
             return run
 
         return declare

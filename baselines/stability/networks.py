@@ -353,8 +353,10 @@ def metric_scale(scale: float) -> Outcome:
     return worst(error, gamma(460) + 2 * 2.0**-1074 / max(exact_mm, 2.0**-1074))
 
 
-NETWORKS.family(
-    "training metric, not a number", "mm", expects="refusal", refuses=PredictionError,
-    about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
-    value=(math.nan, math.inf, 1e200),
-)(lambda value: DepthScores().update(torch.tensor([[[1800.0, value]]]).double(), torch.full((1, 1, 2), 1800.0)))  # fmt: skip
+@NETWORKS.family(
+    "training metric, not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, 1e200)
+)
+def metric_refuses(value: float) -> None:
+    """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
+    prediction = torch.tensor([[[1800.0, value]]], dtype=torch.float64)
+    DepthScores().update(prediction, torch.full_like(prediction, 1800.0))

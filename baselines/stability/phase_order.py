@@ -405,8 +405,7 @@ def arctangent(scale: float, code: str) -> Outcome:
 def order_range() -> Outcome:
     """-atan2 of signed zeros and the smallest sines at a negative cosine; against the interval [-pi, pi); bound: exact:
     +pi is mapped to -pi"""
-    sine, cosine = np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0, -1.0, -1.0, -1.0, -1e-300])
-    phase = decoding.minus_atan2(sine, cosine)
+    phase = decoding.minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 

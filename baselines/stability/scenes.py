@@ -79,8 +79,7 @@ def edge_on(off_deg: float) -> Outcome:
 def needle(width_px: float, centre_px: float) -> Outcome:
     """pixels of an upright strip at 1.8 m, and their depth; against the columns that it covers; bound: exact where no
     edge is within 1e-9 px of a centre; depth 64 u"""
-    camera, half = RIG.camera, 0.1
-    column = 90.0 + centre_px
+    camera, half, column = RIG.camera, 0.1, 90.0 + centre_px
     left, right = ((column + side * width_px / 2 - camera.cx) / camera.fx * 1.8 for side in (-1, 1))
     hits = seen([[left, -half, 1.8], [right, -half, 1.8], [right, half, 1.8], [left, half, 1.8]])
     depth_m = image(hits)
@@ -204,11 +203,12 @@ def misplaced(name: str) -> None:
     render.place(mesh, "A0", RIG, "fixed", 0)
 
 
-@SCENES.family("behind the camera", "m", expects="refusal")
-def behind_camera() -> Outcome:
-    """pixels of a wall behind the camera; against none; bound: must see nothing"""
-    hits = seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]])
-    return worst(0.0, flagged=len(hits.pixels) == 0)
+SCENES.family(
+    "behind the camera",
+    "m",
+    expects="refusal",
+    about="pixels of a wall behind the camera; against none; bound: must see nothing",
+)(lambda: worst(0, flagged=not seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).pixels.size))
 
 
 @SCENES.family("light at distance 0", "grey")

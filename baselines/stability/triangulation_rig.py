@@ -71,7 +71,6 @@ def exact_depth_mm(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> NDArr
 
 
 def relative(depth_mm: NDArray, exact: NDArray[np.object_]) -> Floats:
-    """Relative error of depths, against high-precision numbers."""
     return difference(depth_mm, exact) / np.abs(exact.astype(float))
 
 
@@ -159,7 +158,7 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     measured_px = exact_coordinates(1.8, rig, rays)
     measured_px += noise_px * rng.standard_normal(measured_px.shape)
     exact, contraction, start = _least_squares(measured_px, rig, rays)
-    depth_mm = decoding.depth_from_both(rays, *measured_px, rig, *_WEIGHTS).depth_mm
+    depth_mm = decoding.depth_from_both(rays, measured_px[0], measured_px[1], rig, *_WEIGHTS).depth_mm
     bounds, conditions = zip(*(conditioning(measured_px[i], rig, i, rays) for i in (0, 1)), strict=True)
     in_front = exact.astype(float) > 0
     bound = 8 * np.maximum(*bounds) + start * (contraction + 4 * start) ** 3
@@ -230,10 +229,10 @@ def behind_projector(ahead_m: float) -> Outcome:
 def lit_from_behind() -> Outcome:
     """projector light on a surface lit from its far side; against none reaches the camera; bound: exactly 0, so the
     decoder masks it for want of modulation"""
-    turn, centre = optics.rotation_matrix((0.0, math.pi, 0.0)), np.array([-0.125, 0.1, 3.0])
-    rig = replace(PAPER, rotation=turn.tolist(), translation_m=tuple((-turn @ centre).tolist()))
-    points = _RAYS_3D * 1.8
-    lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), rig, Lighting())
+    turn = optics.rotation_matrix((0.0, math.pi, 0.0))
+    shift = -turn @ np.array([-0.125, 0.1, 3.0])
+    rig = replace(PAPER, rotation=turn.tolist(), translation_m=tuple(shift.tolist()))
+    lit = light_surface(_RAYS_3D * 1.8, np.tile([0.0, 0.0, -1.0], (40, 1)), rig, Lighting())
     return worst(lit.gain, 0.0, lit.gain == 0)
 
 
@@ -294,8 +293,8 @@ def overflowing(value: float) -> Outcome:
 @TRIANGULATION.family("no weight", "mm", expects="refusal")
 def no_weight() -> Outcome:
     """depth from two directions without modulation; against there is none; bound: must be masked"""
-    depth_mm = decoding.depth_from_both(RAYS, *exact_coordinates(1.8, PAPER), PAPER, 0.0, 0.0).depth_mm
-    return worst(0.0, flagged=np.isnan(depth_mm))
+    u, v = exact_coordinates(1.8, PAPER)
+    return worst(0.0, flagged=np.isnan(decoding.depth_from_both(RAYS, u, v, PAPER, 0.0, 0.0).depth_mm))
 
 
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:
@@ -363,10 +362,8 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
     """ideal radius of distorted ones up to 1.6; against bisection in 50 digits below the fold; bound: 32 u / slope of
     the model: a residual of some roundings; masked where no point maps there"""
     coefficients = (k1, k2, 0.0, 0.0, k3)
-    fold = math.sqrt(optics.fold_radius_squared(coefficients))
-    radius = np.linspace(0.0, 1.6, 81)[1:]
+    fold, radius = math.sqrt(optics.fold_radius_squared(coefficients)), np.linspace(0.0, 1.6, 81)[1:]
     radii = np.hypot(*optics.undistort(radius * math.cos(0.7), radius * math.sin(0.7), coefficients))
-
     a, b, c = wide((k1, k2, k3))
 
     def forward(r: Any) -> Any:
@@ -377,11 +374,11 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
     target, low, high = wide(radius), 0 * wide(radius), top + 0 * wide(radius)
     for _ in range(80):
         middle = (low + high) / 2
-        below = (forward(middle) < target).astype(bool)
+        below = forward(middle) < target
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     square = low * low
     slope = np.maximum((1 + square * (3 * a + square * (5 * b + square * 7 * c))).astype(float), 1e-9)
-    invertible = (target < largest).astype(bool)
+    invertible = target < largest
     error = np.where(invertible, radii - low.astype(float), np.where(np.isnan(radii), 0.0, np.inf))
     near = np.abs(radius - float(largest)) < 1e-3
     may_flag, bound = float(np.mean(~invertible | near)), 32 * U64 / np.where(invertible, slope, 1.0)
@@ -463,9 +460,9 @@ def impossible_rig(change: str) -> None:
 def file_round_trip(suffix: str) -> Outcome:
     """a rig of awkward numbers, written and read; against the rig; bound: exact"""
     awkward = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
-    camera = replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward)
     rig = replace(
-        PAPER, camera=camera, translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
+        PAPER, camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
+        translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
         rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(), pitch_vertical_px=18 + 2**-48,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
