@@ -10,9 +10,9 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from itertools import product
 from typing import Any, Literal
@@ -24,10 +24,11 @@ from fpp_ml_bench.errors import StabilityError
 
 Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
+Run = Callable[..., Any]
+"""Of a case; gives its `Outcome`, or anything where a refusal is expected."""
 Refusals = type[Exception] | tuple[type[Exception], ...]
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
@@ -55,24 +56,22 @@ class Outcome:
     """The measurement of a case at its worst element, which has the largest error / bound.
 
     ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
-    that were refused; ``may_flag``: largest share that theory allows. ``condition``: the condition number behind the
-    bound, if any.
+    that were refused; ``may_flag``: largest share that theory allows (default: none where a number is expected, else
+    all). ``condition``: the condition number behind the bound, if any.
     """
 
     error: float | None
     bound: float = 0.0
     flagged: float = 0.0
-    may_flag: float = 0.0
+    may_flag: float | None = None
     note: str = ""
     condition: float | None = None
 
     @property
     def ratio(self) -> float | None:
         """Error / bound; 0 where both are 0, None where nothing was computed."""
-        if self.error is None:
-            return None
-        if self.error == 0:
-            return 0.0
+        if not self.error:
+            return self.error
         return self.error / self.bound if self.bound > 0 else math.inf
 
 
@@ -97,7 +96,7 @@ class Case:
     reference: str
     predicts: str
     unit: str
-    run: Callable[[], Outcome] = field(repr=False)
+    run: Run = field(repr=False)
     expects: Expects = "number"
     refuses: Refusals = ()
     heavy: bool = False
@@ -124,31 +123,21 @@ class Group:
         self.cases: list[Case] = []
 
     def family(
-        self,
-        name: str,
-        unit: str,
-        /,
-        *,
-        about: str | None = None,
-        expects: Expects | Callable[..., Expects] = "number",
-        refuses: Refusals = (),
-        heavy: Callable[..., bool] = lambda **_: False,
-        **grid: Iterable[Scalar],
-    ) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
+        self, name: str, unit: str, /, *, about: str = "", expects: Expects | Callable[..., Expects] = "number",
+        refuses: Refusals = (), heavy: Callable[..., bool] = lambda **_: False, **grid: Iterable[Scalar],
+    ) -> Callable[[Run], Run]:  # fmt: skip
         """Declare a function as a family: a case for each combination of the grid's values, which the function,
         ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
         against its reference; bound: how theory predicts it"."""
 
-        def declare(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
+        def declare(run: Run) -> Run:
             text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
-            computes, reference, predicts = re.split("; against |; bound: ", text)
+            of, against, bound = re.split("; against |; bound: ", text)
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
-                expected = expects(**given) if callable(expects) else expects
-                case = Case(
-                    self.name, name, given, computes, reference, predicts, unit, partial(run, **given), expected
-                )
-                self.cases.append(replace(case, refuses=refuses, heavy=heavy(**given)))
+                expected, call = expects(**given) if callable(expects) else expects, partial(run, **given)
+                rest = call, expected, refuses, heavy(**given)
+                self.cases.append(Case(self.name, name, given, of, against, bound, unit, *rest))
             return run
 
         return declare
@@ -183,17 +172,17 @@ def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: Non
     case did not name, is a FAIL."""
     rows = []
     for case in cases:
-        started = time.process_time()
+        started, failure = time.process_time(), ""
         try:
             with np.errstate(all="ignore"):
                 outcome = case.run()
-            verdict, against = judge(case, outcome)
+            outcome = outcome if isinstance(outcome, Outcome) else Outcome(0.0)
         except case.refuses as error:
             outcome = Outcome(None, flagged=1.0, note=str(error))
-            verdict, against = judge(case, outcome)
         except _CRASHES as error:
             outcome = Outcome(None, note=f"{type(error).__name__}: {error}")
-            verdict, against = Verdict.FAIL, f"ended in {outcome.note}"
+            failure = f"ended in {outcome.note}"
+        verdict, against = (Verdict.FAIL, failure) if failure else judge(case, outcome)
         rows.append(Row(case, outcome, verdict, against, time.process_time() - started))
         done(rows[-1])
     return rows
@@ -211,55 +200,51 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
         return Verdict.FAIL, "theory predicts no finite error, so the number is meaningless and should be refused"
     if not outcome.error <= outcome.bound:  # NaN is not
         return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
-    if outcome.flagged > outcome.may_flag:
-        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {outcome.may_flag:.2%}"
+    allowed = float(case.expects != "number") if outcome.may_flag is None else outcome.may_flag
+    if outcome.flagged > allowed:
+        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {allowed:.2%}"
     return Verdict.WITHIN, ""
 
 
 def worst(
-    errors: ArrayLike,
-    bounds: ArrayLike = 0.0,
-    flagged: ArrayLike = False,
-    may_flag: float = 0.0,
-    condition: float | None = None,
-    note: str = "",
-) -> Outcome:
+    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, may_flag: float | None = None,
+    condition: float | None = None, note: str = "",
+) -> Outcome:  # fmt: skip
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)
-    share = float(refused.mean()) if refused.size else 0.0
-    unflagged = np.flatnonzero(~refused)
-    if not unflagged.size:
+    if refused.all():
         return Outcome(None, 0.0, 1.0, may_flag, note or "every element is masked", condition)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(error[unflagged] == 0, 0.0, error[unflagged] / bound[unflagged])
-    index = unflagged[int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio)))]
-    return Outcome(float(error[index]), float(bound[index]), share, may_flag, note, condition)
+        ratio = np.where(error == 0, 0.0, error / bound)
+    ratio = np.where(refused, -1.0, np.where(np.isnan(ratio), np.inf, ratio))
+    index = int(np.argmax(ratio))
+    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), may_flag, note, condition)
 
 
-def masked(flagged: ArrayLike) -> Outcome:
-    """The outcome of elements that must all be masked."""
-    return worst(np.zeros(np.shape(flagged)), 0.0, flagged)
-
-
-def high_precision() -> Any:
-    """A separate mpmath context of 50 digits, so that the global precision does not change."""
+@cache
+def high_precision(digits: int = 50) -> Any:
+    """A separate mpmath context, so that the global precision does not change."""
     import mpmath
 
     context = mpmath.MPContext()
-    context.dps = 50
+    context.dps = digits
     return context
 
 
-def difference(values: NDArray, exact: Iterable[Any]) -> Floats:
-    """``values`` (n,) minus high-precision numbers, subtracted before it is rounded."""
-    context = high_precision()
-    return np.array([float(context.mpf(float(a)) - b) for a, b in zip(values, exact, strict=True)])
+def wide(values: ArrayLike, digits: int = 50) -> NDArray[np.object_]:
+    """Numbers as an array of mpmath's, with which NumPy's operators compute in ``digits`` digits."""
+    return np.asarray(np.frompyfunc(high_precision(digits).mpf, 1, 1)(np.asarray(values, float)))
 
 
-def rounded(values: Iterable[Any]) -> Floats:
-    """High-precision numbers rounded once to float64."""
-    return np.array([float(value) for value in values])
+def by_mpmath(name: str, *values: NDArray[np.object_]) -> NDArray[np.object_]:
+    """A function of mpmath, of each element."""
+    return np.frompyfunc(getattr(high_precision(), name), len(values), 1)(*values)
+
+
+def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
+    """``values`` minus high-precision numbers, subtracted before it is rounded."""
+    return (wide(values) - exact).astype(np.float64)
 
 
 def gamma(operations: float, unit: float = U64) -> float:

@@ -2,27 +2,19 @@
 phases of +-pi exactly, with flipped bits and with more periods than codes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import decoding, optics
-from fpp_ml_bench.baselines.stability.cases import (
-    U64,
-    Expects,
-    Floats,
-    Group,
-    Mask,
-    Outcome,
-    difference,
-    high_precision,
-    masked,
-    worst,
-)
+from fpp_ml_bench.baselines.stability import cases
+from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, difference, wide, worst
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.machine import numba_enabled
 
+DIRECTIONS: tuple[optics.Direction, ...] = ("vertical", "horizontal")
 PHASE, ORDER = Group("phase"), Group("order")
 MEAN, MODULATION = 127.5, 100.0
 MODULATIONS = (100.0, 30.0, 10.0, 5.0, 3.0, 1.0, 0.3, 0.1)
@@ -36,13 +28,9 @@ def phases(count: int = 720) -> Floats:
     return -np.pi + 2 * np.pi * (np.arange(count) + 0.3819) / count
 
 
-def shifts(steps: int) -> Floats:
-    """Equal phase shifts 2 pi n / N."""
-    return 2 * np.pi * np.arange(steps) / steps
-
-
-def sinusoids(phase: NDArray, deltas: NDArray, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
-    """Frames A + B cos(phi + delta_n), (N, 1, n)."""
+def sinusoids(phase: NDArray, shifts: int | NDArray, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
+    """Frames A + B cos(phi + delta_n), (N, 1, n), of these shifts or a number of equal ones."""
+    deltas = 2 * np.pi * np.arange(shifts) / shifts if isinstance(shifts, int) else shifts
     return mean + modulation * np.cos(phase[None, None, :] + np.reshape(deltas, (-1, 1, 1)))
 
 
@@ -80,53 +68,42 @@ def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: i
     if length is not None:
         focal = device.fx * length / device.width
         device = optics.Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
-    bits_v, bits_u = (optics.bits_needed(side, pitch_px) for side in (device.height, device.width))
-    sequence = optics.Sequence(steps, bits_v, bits_u)
+    sequence = optics.Sequence(steps, *(optics.bits_needed(side, pitch_px) for side in (device.height, device.width)))
     return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
 def direction_levels(
-    rig: optics.Rig,
-    coordinate_px: NDArray,
-    direction: optics.Direction = "vertical",
-    mean: float = MEAN,
+    rig: optics.Rig, coordinate_px: NDArray, direction: optics.Direction = "vertical", mean: float = MEAN,
     modulation: float = MODULATION,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,); float64 (N + bits, n).
 
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to.
     """
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
-    angle = 2 * np.pi * coordinate_px / pitch
-    waves = sinusoids(angle, shifts(rig.sequence.steps), mean, modulation)[:, 0]
+    waves = sinusoids(2 * np.pi * coordinate_px / pitch, rig.sequence.steps, mean, modulation)[:, 0]
     code = optics.binary_to_gray(optics.cell_of(np.rint(coordinate_px), pitch))
-    bright = np.stack([(code >> (bits - 1 - bit)) & 1 for bit in range(bits)])
+    bright = (code >> np.arange(bits - 1, -1, -1)[:, None]) & 1
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
 
 def plane_stack(
     rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
-) -> tuple[list[NDArray[np.uint8] | None], dict[optics.Direction, Floats]]:
-    """All frames of a plane square to the axis, and its exact projector coordinates by direction, (H, W)."""
+) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
+    """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
     x, y = rig.camera.rays()
-    u, v = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
-    exact: dict[optics.Direction, Floats] = {"vertical": u, "horizontal": v}
+    exact = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
-    for direction in optics.DIRECTIONS:
-        levels = grey(direction_levels(rig, exact[direction].ravel(), direction, mean, modulation))
+    for direction, coordinate_px in zip(DIRECTIONS, exact, strict=True):
+        levels = grey(direction_levels(rig, coordinate_px.ravel(), direction, mean, modulation))
         indices = [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)]
         for index, level in zip(indices, levels, strict=True):
             frames[index] = level.reshape(x.shape)
-    return frames, exact
+    sides = rig.projector.width, rig.projector.height
+    return frames, np.logical_and(*((w > 3) & (w < side - 4) for w, side in zip(exact, sides, strict=True)))
 
 
-def inside_pattern(rig: optics.Rig, exact: dict[optics.Direction, Floats]) -> Mask:
-    """The pixels more than 3 px inside the projector's image."""
-    u, v = exact["vertical"], exact["horizontal"]
-    return (u > 3) & (u < rig.projector.width - 4) & (v > 3) & (v < rig.projector.height - 4)
-
-
-def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, Mask]:
+def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
     plan = decoding.plan_direction(rig, "vertical", rig.sequence.steps, decoding.Limits())
     decoded = decoding.decode_direction(grey(levels), plan, decoding.Limits())
@@ -141,19 +118,18 @@ def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: f
 
 def _decoded_phase(
     mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
-) -> tuple[Floats, Mask]:
+) -> tuple[Floats, NDArray]:
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
-    rig, rng = coded_rig(), np.random.default_rng(7)
-    positions_px = _positions_px(rig, count)
+    rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, count)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
-    if noise_grey:
-        levels = levels + noise_grey * rng.standard_normal(levels.shape)
+    levels += noise_grey * np.random.default_rng(7).standard_normal(levels.shape)
     error_px, flagged = coordinate_error(rig, levels, positions_px)
-    return error_px * 2 * np.pi / rig.pitch("vertical"), flagged
+    return error_px * 2 * np.pi / 18.0, flagged
 
 
-def _positions_px(rig: optics.Rig, count: int) -> Floats:
-    return np.linspace(2.0, rig.pattern_length("vertical") - 1 - 2.0, count)
+def _px_per_m(rig: optics.Rig) -> float:
+    """Change of u with depth at 1.8 m: f b / Z^2."""
+    return rig.projector.fx * rig.translation_m[0] / 1.8**2
 
 
 def _rounding_px(rig: optics.Rig) -> float:
@@ -161,36 +137,31 @@ def _rounding_px(rig: optics.Rig) -> float:
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(0.5 * frame_gain(rig.sequence.steps))
 
 
-def _exact_phase(frames: NDArray, deltas: list) -> list:
-    """Least-squares phase of float64 frames (N, 1, n) in 50 digits, for any shifts (exact numbers)."""
-    mp = high_precision()
-    model = mp.matrix([[1, mp.cos(d), mp.sin(d)] for d in deltas])
+def _exact_phase(frames: NDArray, deltas: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Least-squares phase of float64 frames (N, 1, n) in 50 digits, for any shifts (50-digit numbers)."""
+    mp = cases.high_precision()
+    model = mp.matrix([[1, mp.cos(delta), mp.sin(delta)] for delta in deltas])
     solve = (model.T * model) ** -1 * model.T
-    exact = []
-    for pixel in frames[:, 0].T:
-        levels = [mp.mpf(float(level)) for level in pixel]
-        cosine, sine = (mp.fsum(solve[row, n] * level for n, level in enumerate(levels)) for row in (1, 2))
-        exact.append(-mp.atan2(sine, cosine))
-    return exact
+    _, cosine, sine = np.array(solve.tolist()) @ wide(frames[:, 0])
+    return -cases.by_mpmath("atan2", sine, cosine)
 
 
 @PHASE.family("modulation, real frames", "rad", modulation=MODULATIONS)
 def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     """wrapped phase of 18 float64 frames; against least squares of the same frames in 50 digits; bound: sqrt(2) 2 (N +
     4 pi + 2) u (A + B) / B: N + 1 roundings a sum, 4 pi + 1 in each weight, over B"""
-    frames = sinusoids(phases(48), shifts(steps), MEAN, modulation)
-    mp = high_precision()
-    exact = _exact_phase(frames, [2 * mp.pi * n / steps for n in range(steps)])
+    frames = sinusoids(phases(48), steps, MEAN, modulation)
+    exact = _exact_phase(frames, 2 * cases.high_precision().pi * wide(range(steps)) / steps)
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
     return worst(difference(decoding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
-def _expects(modulation: float, spread: float) -> Expects:
+def _expects(modulation: float, spread: float) -> cases.Expects:
     """What is expected of a modulation that is measured within ``spread`` of its value."""
-    if modulation + spread < decoding.MIN_MODULATION:
-        return "refusal"
-    return "number" if modulation - spread >= decoding.MIN_MODULATION else "either"
+    if abs(modulation - decoding.MIN_MODULATION) <= spread:
+        return "either"
+    return "number" if modulation > decoding.MIN_MODULATION else "refusal"
 
 
 @PHASE.family(
@@ -200,13 +171,12 @@ def modulation_8bit(modulation: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: asin(g /
     2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused"""
     error, flagged = _decoded_phase(modulation=modulation)
-    may_flag = float(_expects(modulation, ROUNDING) != "number")
-    return worst(error, worst_angle(ROUNDING, modulation), flagged, may_flag)
+    return worst(error, worst_angle(ROUNDING, modulation), flagged)
 
 
 @PHASE.family(
-    "modulation, noise of 1 grey level", "rad", expects=lambda modulation: _expects(modulation, 6 * NOISE),
-    modulation=MODULATIONS,
+    "modulation, noise of 1 grey level", "rad", modulation=MODULATIONS,
+    expects=lambda modulation: _expects(modulation, 6 * NOISE),  # up to six sigma off the limit
 )  # fmt: skip
 def noise(modulation: float) -> Outcome:
     """rms error of absolute phase, 20,000 pixels; against the phase that the frames were made from; bound: sqrt(2/N)
@@ -216,13 +186,7 @@ def noise(modulation: float) -> Outcome:
     if not unflagged.size:
         return Outcome(None, flagged=1.0, note="every pixel is masked: low modulation")
     bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * unflagged.size))
-    may_flag = float(_expects(modulation, 6 * NOISE) != "number")  # up to six sigma above the limit
-    return Outcome(float(np.sqrt(np.mean(unflagged**2))), bound, float(flagged.mean()), may_flag)
-
-
-def _clipped_mean(share: float) -> float:
-    """The mean with which ``share`` of a period is above 255."""
-    return 255.0 - MODULATION * math.cos(math.pi * share) if share else MEAN
+    return Outcome(float(np.sqrt(np.mean(unflagged**2))), bound, float(flagged.mean()))
 
 
 def _clip_harmonic(order: int, alpha: float) -> float:
@@ -238,40 +202,41 @@ def _aliases(steps: int, highest: int) -> list[int]:
     return [k * steps + side for k in range(1, highest) for side in (-1, 1)]
 
 
+def _clipped(share: float, steps: int, highest: int) -> tuple[float, float, float]:
+    """The mean with which ``share`` of a period is above 255; aliased harmonics, and what is left of the first."""
+    alpha = math.pi * share
+    leak = sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(steps, highest))
+    return 255.0 - MODULATION * math.cos(alpha) if share else MEAN, leak, 1 - _clip_harmonic(1, alpha)
+
+
 @PHASE.family("saturation, phase alone", "rad", steps=(18, 3), share=SHARES)
 def saturation_phase(share: float, steps: int) -> Outcome:
     """wrapped phase of frames clipped in a share of the period; against the phase that the frames were made from;
     bound: asin(sum |c_(kN-1)| + |c_(kN+1)| over c_1): aliased harmonics of a clipped cosine, closed form"""
-    frames = np.minimum(sinusoids(phases(), shifts(steps), _clipped_mean(share)), 255.0)
-    alpha, highest = math.pi * share, 4000
-    leak = sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(steps, highest)) if share else 0.0
-    rest = 8 / (math.pi * (steps * highest) * steps)  # of the tail: |coefficient| <= 4 / (pi order^2)
-    bound = worst_angle(leak + (rest if share else 0.0), 1 - _clip_harmonic(1, alpha)) + 100 * U64
-    return worst(phase_error(frames), bound)
+    highest = 4000
+    mean, leak, left = _clipped(share, steps, highest)
+    frames = np.minimum(sinusoids(phases(), steps, mean), 255.0)
+    rest = 8 / (math.pi * (steps * highest) * steps) if share else 0.0  # of the tail: |coefficient| <= 4 / (pi order^2)
+    return worst(phase_error(frames), worst_angle(leak + rest, left) + 100 * U64)
 
 
-def _expects_saturation(share: float) -> Expects:
-    clipped = math.floor(18 * share)  # frames, or one more
-    return "refusal" if clipped > 2 else "number" if clipped < 2 else "either"
-
-
-@PHASE.family("saturation, decoder", "rad", expects=_expects_saturation, share=SHARES)
+@PHASE.family(
+    "saturation, decoder", "rad", share=SHARES,  # clipped are floor(18 share) frames, or one more
+    expects=lambda share: ("number", "number", "either", "refusal")[min(math.floor(18 * share), 3)],
+)  # fmt: skip
 def saturation_decoder(share: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: as above,
     plus half a grey level; more than 2 clipped frames of 18 must be refused"""
-    error, flagged = _decoded_phase(_clipped_mean(share))
-    alpha = math.pi * share
-    left = MODULATION * (1 - _clip_harmonic(1, alpha))
-    leak = MODULATION * sum(abs(_clip_harmonic(order, alpha)) for order in _aliases(18, 500))
-    may_flag = float(_expects_saturation(share) != "number")
-    return worst(error, worst_angle(leak + ROUNDING, left), flagged, may_flag)
+    mean, leak, left = _clipped(share, 18, 500)
+    error, flagged = _decoded_phase(mean)
+    return worst(error, worst_angle(MODULATION * leak + ROUNDING, MODULATION * left), flagged)
 
 
 @PHASE.family("gamma", "rad", steps=(18, 4, 3), gamma=(1.0, 1.5, 2.2, 3.0))
 def gamma_bend(gamma: float, steps: int) -> Outcome:
     """wrapped phase of frames 255 (I / 255)^gamma; against the phase that the frames were made from; bound: asin(sum of
     the harmonics kN +- 1 over the first), which N steps alias with the fringe"""
-    frames = 255.0 * (sinusoids(phases(), shifts(steps), MEAN, 120.0) / 255.0) ** gamma
+    frames = 255.0 * (sinusoids(phases(), steps, MEAN, 120.0) / 255.0) ** gamma
     theta = 2 * np.pi * np.arange(1 << 14) / (1 << 14)
     harmonics = np.abs(np.fft.rfft((0.5 + 120.0 / 255.0 * np.cos(theta)) ** gamma)) / theta.size
     leak = float(sum(harmonics[order] for order in _aliases(steps, 4000 // steps)))
@@ -283,18 +248,16 @@ def quantisation(bits: int, steps: int) -> Outcome:
     """wrapped phase of frames of this bit depth, B = 100; against the phase that the frames were made from; bound:
     asin(q g / 2B), q = 255 / (2^bits - 1); pi / N where one bit leaves 2N states or N"""
     levels = 2**bits - 1
-    frames = np.rint(sinusoids(phases(), shifts(steps)) / 255.0 * levels) * (255.0 / levels)
+    frames = np.rint(sinusoids(phases(), steps) / 255.0 * levels) * (255.0 / levels)
     bound = worst_angle(255.0 / levels / 2 * frame_gain(steps))
-    if bits == 1:
-        bound = min(bound, math.pi / steps)
-    return worst(phase_error(frames), bound + 100 * U64)
+    return worst(phase_error(frames), (min(bound, math.pi / steps) if bits == 1 else bound) + 100 * U64)
 
 
 @PHASE.family("few steps", "rad", steps=(3, 4, 5, 6, 7, 9, 12, 18))
 def few_steps(steps: int) -> Outcome:
     """wrapped phase of 8-bit frames, B = 100; against the phase that the frames were made from; bound: asin(g / 2B), g
     = max (2/N) sum |sin|"""
-    return worst(phase_error(grey(sinusoids(phases(), shifts(steps)))), worst_angle(0.5 * frame_gain(steps)))
+    return worst(phase_error(grey(sinusoids(phases(), steps))), worst_angle(0.5 * frame_gain(steps)))
 
 
 @PHASE.family("unequal steps", "rad", chosen=(3, 4, 5, 7, 8, 11, 13, 17))
@@ -306,8 +269,7 @@ def uneven_steps(chosen: int) -> Outcome:
     solve = np.linalg.inv(model.T @ model) @ model.T
     turn = np.linspace(0, np.pi, 3601)
     shift = np.abs(np.cos(turn)[:, None] * solve[1] + np.sin(turn)[:, None] * solve[2]).sum(axis=1).max()
-    error = phase_error(grey(sinusoids(phases(), deltas)), deltas)
-    return worst(error, worst_angle(0.5 * float(shift) * (1 + 1e-6)))
+    return worst(phase_error(grey(sinusoids(phases(), deltas)), deltas), worst_angle(0.5 * float(shift) * (1 + 1e-6)))
 
 
 @PHASE.family(
@@ -317,25 +279,20 @@ def uneven_steps(chosen: int) -> Outcome:
 def close_steps(spread_rad: float) -> Outcome:
     """wrapped phase at shifts 0, s, 2 s; against least squares of the same frames in 50 digits; bound: 8 N u cond (A +
     B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused"""
-    deltas = np.array([0.0, spread_rad, 2 * spread_rad])
+    deltas = spread_rad * np.arange(3)
     frames = sinusoids(phases(48), deltas)
-    measured = decoding.wrapped_phase(frames, deltas).phase[0]
-    mp = high_precision()
-    exact = _exact_phase(frames, [mp.mpf(float(delta)) for delta in deltas])
     model = np.stack([np.ones(3), np.cos(deltas), np.sin(deltas)], axis=1)
-    singular = np.linalg.svd(model, compute_uv=False)
-    condition = float(singular[0] / singular[-1])
+    largest, _, least = map(float, np.linalg.svd(model, compute_uv=False))
     strength = float(np.linalg.norm(frames[:, 0], axis=0).max())
-    bound = 8 * 3 * U64 * condition * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / float(singular[-1]) / 100.0
-    return worst(difference(measured, exact), bound, condition=condition)
+    bound = 8 * 3 * U64 * (largest / least) * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / least / 100.0
+    error = difference(decoding.wrapped_phase(frames, deltas).phase[0], _exact_phase(frames, wide(deltas)))
+    return worst(error, bound, condition=largest / least)
 
 
-@PHASE.family("equal shifts", "rad", expects="refusal", refuses=DecodeError)
-def equal_shifts() -> Outcome:
-    """weights of the shifts 0, 1, 1 rad; against there is no such phase; bound: two different shifts do not determine
-    the phase"""
-    decoding.phase_weights([0.0, 1.0, 1.0])
-    return Outcome(0.0)
+PHASE.family(
+    "equal shifts", "rad", expects="refusal", refuses=DecodeError, about="weights of the shifts 0, 1, 1 rad; against "
+    "there is no such phase; bound: two different shifts do not determine the phase",
+)(lambda: decoding.phase_weights([0.0, 1.0, 1.0]))  # fmt: skip
 
 
 @PHASE.family("dead frame", "mm", expects="refusal", refuses=DecodeError, steps=(18, 9, 6, 4), level=(0, 255))
@@ -344,14 +301,12 @@ def dead_frame(steps: int, level: int) -> Outcome:
     bound: frame means follow A + C cos + S sin too; from 4 steps on the dead frame must be refused"""
     rig = coded_rig(steps=steps)
     frames, _ = plane_stack(rig, mean=120.0)
-    dead = rig.sequence.sinusoids("vertical")[1]
-    frames[dead] = np.full((32, 32), level, np.uint8)
+    frames[rig.sequence.sinusoids("vertical")[1]] = np.full((32, 32), level, np.uint8)
     depth = decoding.decode_stack(frames, rig).depth_mm
     # The epipolar check allows 1.5 px across the line, and e px of u alone are e sin(alpha) across.
     tx, ty, _ = rig.translation_m
     slip_px = 1.5 / (abs(ty) / math.hypot(tx, ty))
-    per_metre = rig.projector.fx * tx / 1.8**2
-    return worst(depth - 1800.0, 1000.0 * slip_px / per_metre * 1.1, depth == 0, 1.0)
+    return worst(depth - 1800.0, MM_PER_M * slip_px / _px_per_m(rig) * 1.1, depth == 0)
 
 
 PHASE.family(
@@ -365,7 +320,7 @@ PHASE.family(
 def repeated_frame(steps: int) -> Outcome:
     """wrapped phase where frame 1 is frame 0 again; against the phase that the frames were made from; bound: asin((2/N)
     2 sin(pi/N)): one frame off by 2 B sin(pi/N) at most"""
-    frames = sinusoids(phases(), shifts(steps))
+    frames = sinusoids(phases(), steps)
     frames[1] = frames[0]
     return worst(phase_error(frames), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
 
@@ -378,7 +333,7 @@ def pitch(pitch_px: float) -> Outcome:
     """projector coordinate by the decoder, 8-bit frames; against the coordinate of the pixel; bound: P / 2 pi asin(g /
     2B) over the whole pattern; under 4 px or beyond the pattern refused"""
     rig = coded_rig(pitch_px)
-    positions_px = _positions_px(rig, 20_000)
+    positions_px = np.linspace(2.0, 909.0, 20_000)
     return _decoded(rig, direction_levels(rig, positions_px), positions_px)
 
 
@@ -387,8 +342,8 @@ def edge_blend(pitch_px: float, blend: float) -> Outcome:
     """coordinate of pixels that see both cells, at every edge of the code; against the coordinate that the frames were
     made from; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
     rig = coded_rig(pitch_px)
-    length, half = rig.pattern_length("vertical"), pitch_px / 2
-    edges = np.ceil(np.arange(1, optics.cell_count(length, pitch_px)) * half)
+    cells = optics.cell_count(rig.pattern_length("vertical"), pitch_px)
+    edges = np.ceil(np.arange(1, cells) * (pitch_px / 2))
     positions_px = edges - 1 + blend  # between the last pixel of a cell and the first of the next
     levels, steps = direction_levels(rig, positions_px), rig.sequence.steps
     below, above = (direction_levels(rig, px)[steps:] for px in (edges - 1, edges))
@@ -408,26 +363,20 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
     return _decoded(rig, levels, positions_px)
 
 
-_PI = 3.141592653589793
-
-
 @ORDER.family(
-    "order of a phase at the wrap", "rad",
-    phase_rad=(-_PI, _PI, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, 1.5707963267948966),
+    "order of a phase at the wrap", "rad", phase_rad=(
+        -math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2,
+    ),
 )  # fmt: skip
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
-    rig = optics.paper_rig(32)
-    centres = optics.cell_centres_rad(rig.pattern_length("vertical"), rig.pitch("vertical"))
+    centres = optics.cell_centres_rad(912, 18.0)
     cells = np.arange(len(centres), dtype=np.int32)
     absolute, agrees = optics.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
-    mp = high_precision()
-    exact = []
-    for centre in centres:
-        order = mp.floor((mp.mpf(float(centre)) - mp.mpf(phase_rad)) / (2 * mp.pi) + mp.mpf(0.5))
-        exact.append(mp.mpf(phase_rad) + 2 * mp.pi * order)
-    near = np.array([abs(float(value) - centre) for value, centre in zip(exact, centres, strict=True)])
+    two_pi = 2 * cases.high_precision().pi
+    exact = phase_rad + two_pi * cases.by_mpmath("floor", (wide(centres) - phase_rad) / two_pi + 0.5)
+    near = np.abs(exact.astype(float) - centres)
     may_flag = float(np.mean(near > optics.INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
@@ -436,21 +385,17 @@ def order_of_pi(phase_rad: float) -> Outcome:
 def arctangent(scale: float, code: str) -> Outcome:
     """-atan2 in all octants, on the axes, beside +-pi; against 50 digits; bound: 4 u |phi|, the 2 ulp that the compiled
     arctangent promises"""
-    beside = np.logspace(-15, -1, 15)
-    turn = np.concatenate(
-        [np.linspace(-np.pi, np.pi, 97), np.pi - beside, -np.pi + beside, np.pi / 8 + np.array([-1e-15, 0, 1e-15])]
-    )
-    cosine = np.concatenate([scale * np.cos(turn), scale * np.array([1.0, -1, 0, 0, -1, 1])])
-    sine = np.concatenate([scale * np.sin(turn), scale * np.array([0.0, 0, 1, -1, -1e-17, 1e-300])])
+    beside, eighth = np.logspace(-15, -1, 15), np.pi / 8 + np.array([-1e-15, 0, 1e-15])
+    turn = np.concatenate([np.linspace(-np.pi, np.pi, 97), np.pi - beside, -np.pi + beside, eighth])
+    cosine = scale * np.concatenate([np.cos(turn), [1.0, -1, 0, 0, -1, 1]])
+    sine = scale * np.concatenate([np.sin(turn), [0.0, 0, 1, -1, -1e-17, 1e-300]])
     if code == "compiled" and numba_enabled():
         from fpp_ml_bench.decoding.kernels import _minus_atan2
 
         phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:
         phase = decoding.minus_atan2(sine, cosine)
-    mp = high_precision()
-    exact = [-mp.atan2(mp.mpf(float(a)), mp.mpf(float(b))) for a, b in zip(sine, cosine, strict=True)]
-    error = difference(phase, exact)
+    error = difference(phase, -cases.by_mpmath("atan2", wide(sine), wide(cosine)))
     error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi and -pi are the same angle
     bound = np.maximum(4 * U64 * np.abs(phase), 2.0**-1073)
     return worst(error, np.maximum(bound, 8 * U64 * (np.abs(phase) > 3.0)))
@@ -460,40 +405,32 @@ def arctangent(scale: float, code: str) -> Outcome:
 def order_range() -> Outcome:
     """-atan2 of signed zeros and the smallest sines at a negative cosine; against the interval [-pi, pi); bound: exact:
     +pi is mapped to -pi"""
-    sine, cosine = np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0, -1.0, -1.0, -1.0, -1e-300])
-    phase = decoding.minus_atan2(sine, cosine)
+    phase = decoding.minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 
-@ORDER.family(
-    "flipped bit, both directions", "mm", expects="either", direction=("vertical", "horizontal"), bit=range(7)
-)
+@ORDER.family("flipped bit, both directions", "mm", expects="either", direction=DIRECTIONS, bit=range(7))
 def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
     """depth of a plane with one Gray bit inverted in the whole image; against the plane, 1800 mm; bound: 8-bit frames,
     by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line"""
     rig = coded_rig(size=96)
-    frames, exact = plane_stack(rig)
+    frames, inside = plane_stack(rig)
     flipped = rig.sequence.gray(direction)[bit]
-    turned_over = frames[flipped]
-    frames[flipped] = None if turned_over is None else 255 - turned_over
-    inside = inside_pattern(rig, exact)
+    frames[flipped] = 255 - np.asarray(frames[flipped])
     decoded = decoding.decode_stack(frames, rig, mask=inside)
-    per_metre = rig.projector.fx * rig.translation_m[0] / 1.8**2
-    bound_mm = _rounding_px(rig) / per_metre * MM_PER_M * np.sqrt(2) * 1.01
-    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != decoding.Reason.DECODED, 1.0)
+    bound_mm = _rounding_px(rig) / _px_per_m(rig) * MM_PER_M * np.sqrt(2) * 1.01
+    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != decoding.Reason.DECODED)
 
 
 @ORDER.family("flipped bit, one direction", "px", expects="either", bit=range(7))
 def flipped_bit_alone(bit: int) -> Outcome:
     """coordinate with one bit inverted, and the flagged pixels; against integer arithmetic on the misread cell: error
     in whole periods, or refused; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
-    rig = coded_rig()
-    pitch, bits = 18.0, rig.sequence.bits("vertical")
-    positions_px = np.arange(3.0, rig.pattern_length("vertical") - 3.0, 0.25)
-    levels = direction_levels(rig, positions_px)
-    row = rig.sequence.steps + bit
+    rig, pitch = coded_rig(), 18.0
+    positions_px = np.arange(3.0, 909.0, 0.25)
+    levels, row = direction_levels(rig, positions_px), rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
-    cells = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int)
+    cells, bits = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int), rig.sequence.bits("vertical")
     read = np.asarray(optics.gray_to_binary(optics.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
     centres = optics.cell_centres_rad(912, pitch)
     centre = centres[np.minimum(read, len(centres) - 1)]
@@ -507,26 +444,23 @@ def flipped_bit_alone(bit: int) -> Outcome:
     wrong_flag = (flagged != refused) & ~(np.abs(off - optics.INCONSISTENT_RAD) < 0.01)
     silent = float(np.mean(~flagged & (slip != 0)))
     note = f"{silent:.0%} of the pixels are wrong by whole periods, which only both directions together can detect"
-    return worst(np.where(wrong_flag, np.inf, error), _rounding_px(rig), flagged & ~wrong_flag, 1.0, note=note)
+    return worst(np.where(wrong_flag, np.inf, error), _rounding_px(rig), flagged & ~wrong_flag, note=note)
 
 
-@ORDER.family("more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6))
-def too_few_codes(bits: int) -> Outcome:
-    """a rig of 51 periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat"""
-    rig = optics.paper_rig(32)
-    optics.Rig(rig.camera, rig.projector, rig.rotation, rig.translation_m, 18.0, 18.0, optics.Sequence(18, 7, bits))
-    return Outcome(0.0)
+ORDER.family(
+    "more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6), about="a rig of 51 "
+    "periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat",
+)(lambda bits: replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits)))  # fmt: skip
 
 
 @ORDER.family("cell off the pattern", "px", expects="refusal", cell=(102, 103, 111, 127))
 def cell_off_pattern(cell: int) -> Outcome:
     """a pixel whose code names a cell beyond the pattern; against there is no such cell; bound: must be masked"""
     rig = optics.paper_rig(32)
-    code = int(optics.binary_to_gray(cell))
-    bits = np.array([(code >> (6 - bit)) & 1 for bit in range(7)], float)
-    waves = sinusoids(np.linspace(-3, 3, 50), shifts(rig.sequence.steps))[:, 0]
-    levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2 * bits[:, None] - 1), 50, axis=1)])
-    return masked(coordinate_error(rig, levels, np.zeros(50))[1])
+    bright = (int(optics.binary_to_gray(cell)) >> np.arange(6, -1, -1)[:, None]) & 1
+    waves = sinusoids(np.linspace(-3, 3, 50), rig.sequence.steps)[:, 0]
+    levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2.0 * bright - 1), 50, axis=1)])
+    return worst(0.0, flagged=coordinate_error(rig, levels, np.zeros(50))[1])
 
 
 @ORDER.family("code length", "px", bits=(1, 2, 7, 10, 13, 15))

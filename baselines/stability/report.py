@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,8 +15,7 @@ from fpp_ml_bench.evaluation.result import environment
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.machine import numba_enabled
 
-PAGE, DATA, PICTURE = "index.html", "stability.json", "stability.png"
-SCHEMA_VERSION = "1.0.0"
+_LIMITS = 1e-3, 0.1, 0.5
 LEVELS = {
     "error 0": "#dff1ea",
     "error under 1/1000 of its bound": "#b5dfcf",
@@ -41,16 +41,14 @@ td.FAIL { color: #d1242f; font-weight: 600; }
 """
 
 
-def number(value: float | None) -> float | str | None:
-    """A number for JSON; NaN and infinity by name."""
-    return value if value is None or math.isfinite(value) else str(value)
+def number(value: Any) -> Any:
+    """A value for JSON; NaN and infinity by name."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def short(value: float | None) -> str:
     """A number for a table."""
-    if value is None:
-        return "-"
-    return f"{value:.2g}" if math.isfinite(value) else str(value)
+    return "-" if value is None else f"{value:.2g}"
 
 
 def families(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
@@ -82,33 +80,19 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 def row_content(row: Row) -> dict[str, Any]:
     """A case as JSON values."""
-    case, outcome = row.case, row.outcome
-    parameters = {key: number(value) if isinstance(value, float) else value for key, value in case.parameters.items()}
-    return {
-        "group": case.group,
-        "family": case.family,
-        "parameters": parameters,
-        "computes": case.computes,
-        "reference": case.reference,
-        "predicts": case.predicts,
-        "unit": case.unit,
-        "expects": case.expects,
-        "verdict": row.verdict.value,
-        "error": number(outcome.error),
-        "bound": number(outcome.bound),
-        "ratio": number(outcome.ratio),
-        "flagged_share": outcome.flagged,
-        "condition": number(outcome.condition),
-        "note": outcome.note,
-        "against": row.against,
-        "cpu_seconds": round(row.cpu_seconds, 3),
-    }
+    names = ("group", "family", "parameters", "computes", "reference", "predicts", "unit", "expects")
+    content = {name: getattr(row.case, name) for name in names}
+    content["parameters"] = {key: number(value) for key, value in row.case.parameters.items()}
+    content["verdict"] = row.verdict.value
+    content |= {name: number(getattr(row.outcome, name)) for name in ("error", "bound", "ratio")}
+    content |= {"flagged_share": row.outcome.flagged, "condition": number(row.outcome.condition)}
+    return {**content, "note": row.outcome.note, "against": row.against, "cpu_seconds": round(row.cpu_seconds, 3)}
 
 
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """The whole run as JSON values."""
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": "1.0.0",
         "summary": summary(rows),
         "compiled_decoder": numba_enabled(),
         "environment": environment().model_dump(mode="json"),
@@ -118,19 +102,16 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
 
 def level(row: Row) -> str:
     """Which of `LEVELS` a case has."""
-    refused, failed = list(LEVELS)[5:]
+    *within, refused, failed = LEVELS
     if row.verdict is not Verdict.WITHIN:
         return failed if row.verdict is Verdict.FAIL else refused
-    ratio = row.outcome.ratio or 0.0
-    return list(LEVELS)[0 if ratio == 0 else 1 + sum(ratio >= limit for limit in (1e-3, 0.1, 0.5))]
+    return within[1 + bisect_right(_LIMITS, row.outcome.ratio) if row.outcome.ratio else 0]
 
 
 def row_text(row: Row) -> str:
     """A case and its result in a line."""
-    outcome = row.outcome
-    if outcome.error is None:
-        result = outcome.note
-    else:
+    outcome, result = row.outcome, row.outcome.note
+    if outcome.error is not None:
         result = f"error {short(outcome.error)} {row.case.unit}, bound {short(outcome.bound)}"
         result += f", {outcome.flagged:.0%} masked" if outcome.flagged else ""
     return f"{row.case.name}: {row.verdict.value}, {result}"
@@ -143,17 +124,13 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
     from matplotlib.patches import Patch, Rectangle
 
     grouped = families(rows)
-    lines = {
-        group: 2 + sum(math.ceil(len(members) / _ACROSS) for members in kinds.values())
-        for group, kinds in grouped.items()
-    }
+    lines = {group: 2 + sum(-(-len(part) // _ACROSS) for part in kinds.values()) for group, kinds in grouped.items()}
     figure = Figure(dpi=_DPI, facecolor="white")
     axes = figure.add_axes((0, 0, 1, 1))
     squares, ends = [], [_KEY, _KEY]  # the line where each column goes on
     for group, kinds in grouped.items():
-        column = (
-            0 if ends[0] - _KEY + lines[group] / 2 <= sum(lines.values()) / 2 else 1
-        )  # the left until it holds half
+        # The left column until it holds half.
+        column = int(ends[0] - _KEY + lines[group] / 2 > sum(lines.values()) / 2)
         left, y = column * _COLUMN + 0.3, ends[column]
         axes.text(left, y + 1.0, group, fontsize=11, fontweight="bold", va="center")
         y += 1.6
@@ -181,10 +158,9 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
 
 def report_page(rows: Sequence[Row], content: dict[str, Any], picture: bytes, squares: list[tuple[str, str]]) -> str:
     """The page as HTML without external resources."""
-    machine, hardware = content["environment"], content["environment"].get("hardware", {})
-    about = [f"{hardware.get('cpu', 'unknown processor')}, {hardware.get('cores', '?')} cores"]
-    about += [f"Python {machine.get('python', '?')}"]
-    about += [f"{name} {version}" for name, version in machine.get("packages", {}).items()]
+    machine, hardware = content["environment"], content["environment"]["hardware"]
+    about = [hardware["cpu"], f"{hardware['cores']} cores", f"Python {machine['python']}"]
+    about += [f"{name} {version}" for name, version in machine["packages"].items()]
     body = render(
         __package__, "stability.html", total=content["summary"]["all"], machine=", ".join(about), squares=squares,
         failed=[row for row in rows if row.verdict is Verdict.FAIL], picture=data_uri(picture), families=families(rows),
@@ -195,15 +171,14 @@ def report_page(rows: Sequence[Row], content: dict[str, Any], picture: bytes, sq
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write `PAGE`, `DATA` and `PICTURE` into ``folder``, which is made; their paths. Raises OSError."""
+    """Write the page, the data and the picture into ``folder``, which is made; their paths. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    content = document(rows)
-    picture, squares = heat_maps(rows)
+    content, (picture, squares) = document(rows), heat_maps(rows)
     files = {
-        PAGE: report_page(rows, content, picture, squares).encode("utf-8"),
-        DATA: (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"),
-        PICTURE: picture,
+        folder / "index.html": report_page(rows, content, picture, squares).encode("utf-8"),
+        folder / "stability.json": (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"),
+        folder / "stability.png": picture,
     }
-    for name, data in files.items():
-        write_atomically(folder / name, data)
-    return [folder / name for name in files]
+    for path, data in files.items():
+        write_atomically(path, data)
+    return list(files)

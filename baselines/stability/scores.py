@@ -2,11 +2,13 @@
 1e30 and beyond, of subnormals, of cancelling errors and of merged states."""
 
 import math
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, high_precision, worst, wrong
+from fpp_ml_bench.baselines.stability import cases
+from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, wide, worst, wrong
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import score
@@ -21,20 +23,16 @@ hundred million (Higham and Mary 2019). Where the numbers are all alike the wors
 RANDOM = LIKELY * math.sqrt(score.BLOCK)
 _TINY = 2.0**-149
 _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
-_SIDE = 100
 
 
 def depth_map(kind: str, low_mm: float, span_mm: float) -> Floats:
     """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm + span_mm``."""
     depth = np.zeros((24, 24))
-    if kind == "one pixel":
-        depth[7, 11] = low_mm
-    elif kind == "flat plane":
-        depth[4:20, 4:20] = low_mm
-    elif kind in ("full frame", "part"):
-        inside = np.s_[:, :] if kind == "full frame" else np.s_[3:21, 5:19]
-        shape = depth[inside].shape
-        depth[inside] = low_mm + span_mm * np.linspace(0, 1, shape[0] * shape[1]).reshape(shape)
+    inside = {"one pixel": np.s_[7:8, 11:12], "flat plane": np.s_[4:20, 4:20], "full frame": np.s_[:, :],
+              "part": np.s_[3:21, 5:19], "empty": np.s_[:0, :0]}[kind]  # fmt: skip
+    part = depth[inside]
+    sloped = kind in ("full frame", "part")
+    part[...] = low_mm + (span_mm * np.linspace(0, 1, part.size).reshape(part.shape) if sloped else 0.0)
     return depth
 
 
@@ -50,36 +48,37 @@ def round_trip(name: Normalisation, kind: str, low_mm: float, span_mm: float, st
     low, high = _range(depth)
     representation = normalise(depth, name, low, high)
     inside = object_mask(depth)
-    legal = np.isfinite(representation).all() and (representation[~inside] == 0).all()
-    if name == "individual":
-        legal &= bool((representation >= 0).all() and (representation <= 1).all())
-    if not legal:
+    individual = name == "individual"
+    between = (representation >= 0) & (representation <= 1)
+    if not (np.isfinite(representation) & (inside | (representation == 0)) & (between | (not individual))).all():
         return wrong("a representation that is not finite, not 0 outside or not in [0, 1]")
     if not inside.any():
         return worst(representation)
     exact = depth[inside].astype(np.float64)
-    if name == "individual":
+    if individual:
         bound = 4 * U32 * (exact - low) + 4 * U64 * exact + _TINY * (high - low)
     else:
         bound = 2 * U32 * exact + 2 * U64 * exact + _TINY * (1000.0 if name == "global" else 1.0)
     return worst(denormalise(representation, name, low, high)[inside] - exact, bound)
 
 
-NORMALISATION.family("range", "mm", name=NAMES, kind=("part",), low_mm=(1700.0,), stored=STORED, span_mm=SPANS)(
-    round_trip
-)
-NORMALISATION.family(
-    "depth_min = 0", "mm", name=NAMES, kind=("full frame",), low_mm=(0.0,), stored=STORED,
-    span_mm=(1e-30, 1e-6, 1.0, 1e6),
-)(round_trip)  # fmt: skip
-NORMALISATION.family(
-    "shape of the object", "mm", name=NAMES, low_mm=(1700.0,), span_mm=(200.0,), stored=("float32",),
-    kind=("flat plane", "one pixel", "full frame", "empty"),
-)(round_trip)  # fmt: skip
+_GRID = {"name": NAMES, "kind": ("part",), "low_mm": (1700.0,), "stored": STORED}
+_KINDS = ("flat plane", "one pixel", "full frame", "empty")
+for _family, _grid in {
+    "range": {**_GRID, "span_mm": SPANS},
+    "depth_min = 0": {**_GRID, "kind": ("full frame",), "low_mm": (0.0,), "span_mm": (1e-30, 1e-6, 1.0, 1e6)},
+    "shape of the object": {"name": NAMES, "low_mm": (1700.0,), "span_mm": (200.0,), "stored": ("float32",),
+                            "kind": _KINDS},
+}.items():  # fmt: skip
+    NORMALISATION.family(_family, "mm", **_grid)(round_trip)
 
 
-def _quotient_error(depth: NDArray, low: float, high: float) -> Outcome:
-    """The individual representation of the object against the quotient in 80-bit arithmetic, within 4 u32."""
+@NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
+def forward(low_mm: float, span_mm: float, kind: str = "part", stored: str = "") -> Outcome:
+    """(D - D_min) / (D_max - D_min) in float32; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value:
+    difference, range and quotient round once each"""
+    depth = depth_map(kind, low_mm, span_mm).astype(stored or "float32")
+    low, high = _range(depth) if stored else (low_mm + span_mm * 1e-9, low_mm + span_mm * (1 - 1e-9))
     inside = object_mask(depth)
     exact = (depth[inside].astype(np.longdouble) - low) / (np.longdouble(high) - low) if high > low else 0.0
     representation = normalise(depth, "individual", low, high)[inside]
@@ -87,36 +86,21 @@ def _quotient_error(depth: NDArray, low: float, high: float) -> Outcome:
     return worst(np.asarray(representation - exact, float), bound)
 
 
-@NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
-def forward(kind: str, low_mm: float, span_mm: float, stored: str) -> Outcome:
-    """(D - D_min) / (D_max - D_min) in float32; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value:
-    difference, range and quotient round once each"""
-    depth = depth_map(kind, low_mm, span_mm).astype(stored)
-    return _quotient_error(depth, *_range(depth))
-
-
-@NORMALISATION.family("range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3))
-def foreign_range(low_mm: float, span_mm: float) -> Outcome:
-    """individual depth with a range that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4
-    u32 of the value"""
-    depth = depth_map("part", low_mm, span_mm).astype(np.float32)
-    return _quotient_error(depth, low_mm + span_mm * 1e-9, low_mm + span_mm * (1 - 1e-9))
-
-
+NORMALISATION.family(
+    "range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3), about="individual depth with a range "
+    "that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value",
+)(forward)  # fmt: skip
 NORMALISATION.family(
     "subnormal range", "mm", name=("individual",), kind=("full frame",), low_mm=(0.0,), stored=("float64",),
     span_mm=(1e-40, 1e-60, 1e-300),
 )(round_trip)  # fmt: skip
 
 
-@NORMALISATION.family(
+NORMALISATION.family(
     "impossible range", "1", expects="refusal", refuses=ValueError,
-    low_mm=(1600.0, float("nan"), float("-inf")), high_mm=(1500.0, float("inf"), float("nan")),
-)  # fmt: skip
-def impossible_range(low_mm: float, high_mm: float) -> Outcome:
-    """depth with an invalid range; against there is no such representation; bound: must be refused"""
-    normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm)
-    return Outcome(0.0)
+    about="depth with an invalid range; against there is no such representation; bound: must be refused",
+    low_mm=(1600.0, math.nan, -math.inf), high_mm=(1500.0, math.inf, math.nan),
+)(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))  # fmt: skip
 
 
 @NORMALISATION.family(
@@ -138,16 +122,14 @@ def scored(kind: str, mode: str) -> Outcome:
 
 def _exact(*parts: tuple[Floats, int]) -> tuple[float, float]:
     """MAE and RMSE of arrays repeated so many times: exact sums (integers of 2^-1074) in 50 digits."""
-    mp = high_precision()
-    mp.prec = 2300  # every product of two float64, added without rounding
-    pixels = sum(array.size * times for array, times in parts)
-    absolute, squares = mp.mpf(0), mp.mpf(0)
+    digits = 700  # every product of two float64, added without rounding
+    pixels, absolute, squares = 0, 0, 0
     for array, times in parts:
         values, counts = np.unique(np.abs(array), return_counts=True)
-        for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-            absolute += mp.mpf(value) * (count * times)
-            squares += mp.mpf(value) ** 2 * (count * times)
-    return float(absolute / pixels), float(mp.sqrt(squares / pixels))
+        exact, weights = wide(values, digits), wide(counts * times, digits)
+        pixels += array.size * times
+        absolute, squares = absolute + weights @ exact, squares + weights @ exact**2
+    return float(absolute / pixels), float(cases.high_precision(digits).sqrt(squares / pixels))
 
 
 def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: float = RANDOM) -> Outcome:
@@ -161,6 +143,10 @@ def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: f
     return worst((measured - reference) / reference, operations * U64 + 2 * least)
 
 
+def _scored(errors: Floats, operations: float = RANDOM) -> Outcome:
+    return _compared(score.stats_of(errors), _exact((errors, 1)), operations)
+
+
 @METRICS.family("streamed pixels", "relative", scale_mm=(1e-30, 1.0, 1e30), pixels=(1e6, 1e8, 1e10))
 def streamed(pixels: float, scale_mm: float) -> Outcome:
     """MAE and RMSE of merged states of 10^6 px, 20 kinds of block; against exact sums; bound: 6 sqrt(9600 + 6 merges)
@@ -172,9 +158,7 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
     kinds = [levels[rng.integers(0, 64, _STREAM_BLOCK)] for _ in range(_STREAM_KINDS)]
     blocks = round(pixels / _STREAM_BLOCK)
     states = [score.stats_of(kind) for kind in kinds]
-    total = score.EMPTY
-    for number in range(blocks):
-        total = score.combine(total, states[number % _STREAM_KINDS])
+    total = reduce(score.combine, (states[number % _STREAM_KINDS] for number in range(blocks)), score.EMPTY)
     times = [blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)]
     if total.pixels != blocks * _STREAM_BLOCK:
         return wrong(f"{total.pixels} pixels counted, {blocks * _STREAM_BLOCK} streamed")
@@ -190,7 +174,7 @@ def magnitude(scale_mm: float) -> Outcome:
     """MAE and RMSE of 20,000 errors up to 999 x scale_mm; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
     in float64, random roundings; blocks are added exactly; squares above 1e308 refused"""
     errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000).astype(np.float64)
-    return _compared(score.stats_of(errors), _exact((errors, 1)))
+    return _scored(errors)
 
 
 @METRICS.family("mixed magnitudes", "relative", low_mm=(1e-30, 1e-6), high_mm=(1e-5, 1.0, 1e30))
@@ -199,7 +183,7 @@ def mixed(low_mm: float, high_mm: float) -> Outcome:
     in float64, random roundings; blocks are added exactly"""
     levels = np.logspace(math.log10(low_mm), math.log10(high_mm), 300)
     errors = np.random.default_rng(4).choice(levels, 30_000)
-    return _compared(score.stats_of(errors), _exact((errors, 1)))
+    return _scored(errors)
 
 
 @METRICS.family("one large error", "relative", large_mm=(1.0, 1.7e7, 1e8, 1e12, 1e16))
@@ -208,7 +192,7 @@ def one_large(large_mm: float) -> Outcome:
     case; blocks are added exactly"""
     errors = np.ones(10_000_000)  # summed naively in float32 the small ones vanish from 2^24 on
     errors[0] = large_mm
-    return _compared(score.stats_of(errors), _exact((errors, 1)), score.BLOCK)
+    return _scored(errors, score.BLOCK)
 
 
 @METRICS.family(
@@ -218,18 +202,17 @@ def one_large(large_mm: float) -> Outcome:
 def sample(scale_mm: float, stored: str) -> Outcome:
     """object and background MAE and RMSE of 100 x 100 px; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
     in float64, random roundings; blocks are added exactly"""
-    errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (_SIDE, _SIDE))
-    target = np.zeros((_SIDE, _SIDE), stored)
+    errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (100, 100))
+    target = np.zeros((100, 100), stored)
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
     scores = score.score_sample(prediction, target)
     outcomes = []
     for stats, where in ((scores.object, target > 0), (scores.background, ~(target > 0))):
         if where.any():
-            exact = prediction[where].astype(np.float64) - target[where]
-            outcomes.append(_compared(stats, _exact((exact, 1))))
-        else:  # a target of 1e-160 mm is 0 in float32
-            outcomes.append(Outcome(0.0) if stats == score.EMPTY else wrong())
+            outcomes.append(_compared(stats, _exact((prediction[where].astype(np.float64) - target[where], 1))))
+        elif stats != score.EMPTY:  # a target of 1e-160 mm is 0 in float32
+            return wrong()
     return max(outcomes, key=lambda outcome: outcome.ratio or 0.0)
 
 
@@ -237,24 +220,21 @@ def sample(scale_mm: float, stored: str) -> Outcome:
 def distribution(scale_mm: float) -> Outcome:
     """median, 95th percentile, largest, bias, shift-free MAE; against sorted values and exact sums; bound: gamma_9600
     mean |e| + 4 u"""
-    errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (_SIDE, _SIDE)).astype(np.float64)
-    target = np.full((_SIDE, _SIDE), 4096.0 * scale_mm)
+    errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (100, 100)).astype(np.float64)
+    target = np.full((100, 100), 4096.0 * scale_mm)
     prediction = target + errors
     measured = score.score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
-    size = np.sort(np.abs(exact))
-
-    def quantile(values: Floats, level: float) -> float:
-        place = level * (len(values) - 1)
-        low = int(place)
-        return float(values[low] + (values[low + 1] - values[low]) * (place - low))
-
-    median = quantile(exact, 0.5)
-    expected = [quantile(size, 0.5), quantile(size, 0.95), float(size[-1]), math.fsum(exact.tolist()) / exact.size,
-                math.fsum(np.abs(exact - median).tolist()) / exact.size]  # fmt: skip
+    size, last = np.sort(np.abs(exact)), exact.size - 1
+    median, middle, p95 = (
+        float(np.interp(level * last, np.arange(last + 1), values))
+        for values, level in ((exact, 0.5), (size, 0.5), (size, 0.95))
+    )
+    means = (math.fsum(values.tolist()) / exact.size for values in (exact, np.abs(exact - median)))
+    expected = np.array([middle, p95, size[-1], *means])
     computed = [measured.median_mm, measured.p95_mm, measured.max_mm, measured.bias_mm, measured.shift_free_mae_mm]
     bound = gamma(score.BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
-    return worst(np.array(computed, float) - np.array(expected), bound)
+    return worst(np.array(computed, float) - expected, bound)
 
 
 @METRICS.family("cancelling errors", "mm", large_mm=(1.0, 1e6, 1e12, 1e16))
@@ -279,9 +259,7 @@ def merged(order: str) -> Outcome:
     parts = [score.stats_of(errors) for errors in sized]
     whole = score.combine(*parts)
     if order == "one by one":
-        total = score.EMPTY
-        for part in parts:
-            total = score.combine(total, part)
+        total = reduce(score.combine, parts, score.EMPTY)
     else:
         level = parts[::-1]
         while len(level) > 1:
@@ -292,25 +270,17 @@ def merged(order: str) -> Outcome:
     return _compared(total, (whole.mae_mm, whole.rmse_mm), LIKELY * math.sqrt(6 * len(parts)))
 
 
-@METRICS.family(
-    "not a number", "mm", expects="refusal", refuses=PredictionError,
-    value=(float("nan"), float("inf"), float("-inf"), 1e300),
-)  # fmt: skip
-def not_a_number(value: float) -> Outcome:
-    """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
-    target = np.full((8, 8), 1800.0)
-    prediction = target.copy()
-    prediction[3, 4] = value
-    return Outcome(score.score_sample(prediction, target).overall.mae_mm)
+METRICS.family(
+    "not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, -math.inf, 1e300),
+    about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
+)(lambda value: score.score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))  # fmt: skip
 
 
 @METRICS.family("perfect and empty", "mm")
 def flawless() -> Outcome:
     """scores of a perfect prediction and of an empty set; against 0, and none; bound: exact"""
-    target = np.zeros((64, 64), np.float32)
-    target[10:40, 10:40] = 1234.567
-    scores = score.score_sample(target, target)
-    empty = score.score_sample(np.zeros((4, 4)), np.zeros((4, 4))).object
+    target = np.pad(np.full((30, 30), 1234.567, np.float32), 17)
+    scores, empty = score.score_sample(target, target), score.score_sample(*np.zeros((2, 4, 4))).object
     parts = scores.overall, scores.object, scores.background
     good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == score.EMPTY
     return Outcome(0.0) if good else wrong()
