@@ -59,8 +59,9 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     --------
     >>> import fpp_ml_bench as fpp
     >>> test = fpp.load_dataset("data/mini", "single_shot", split="test")
-    >>> test.with_format("numpy")[0]["frame_00"].dtype
-    dtype('uint8')
+    >>> row = test.with_format("numpy")[0]
+    >>> row["frame_00"].shape == row["depth"].shape
+    True
     """
     return storage.load_dataset(folder, config, split=split)
 
