@@ -1,16 +1,18 @@
 """``fpp-bench build``: generate the benchmark."""
 
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
+from __future__ import annotations
 
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+from fpp_ml_bench import optics
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.optics import CONFIGS
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.render import BuildSettings
-    from fpp_ml_bench.loaders.storage import Manifest
+from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."
 EXAMPLES = (
@@ -24,57 +26,49 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or one whose build was interrupted")
-    parser.add_argument("--preset", choices=("mini", "full"), default="mini", help="objects and size (default: mini)")
-    parser.add_argument("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
-    parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
-    parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
-                        help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
-    parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
-    parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
-    parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
-    parser.add_argument("--noise-sigma", type=float, default=1.0, metavar="GREY",
-                        help="sensor noise at mid-grey, grey levels of 255 (default: 1)")  # fmt: skip
-    parser.add_argument("--shadows", action="store_true", help="let objects cast shadows from the projector")
-    parser.add_argument("--mesh", type=Path, action="append", default=[], metavar="FILE",
-                        help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable")  # fmt: skip
-    parser.add_argument("--meshes", type=Path, metavar="LIST.yaml",
-                        help="meshes of yours with scale, pose and split")  # fmt: skip
+    add = parser.add_argument
+    add("out", type=Path, metavar="OUT", help="new folder, or one whose build was interrupted")
+    add("--preset", choices=("mini", "full"), default="mini", help="objects and size (default: mini)")
+    add("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
+    add("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
+    add("--placement", choices=("fixed", "varied"), default="fixed",
+        help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
+    add("--frames", choices=optics.CONFIGS, default="all", help="frames to store (default: all)")
+    add("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
+    add("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
+    add("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
+    add("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
+    add("--noise-sigma", type=float, default=1.0, metavar="GREY",
+        help="sensor noise at mid-grey, grey levels of 255 (default: 1)")  # fmt: skip
+    add("--shadows", action="store_true", help="let objects cast shadows from the projector")
+    add("--mesh", type=Path, action="append", default=[], metavar="FILE",
+        help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable")  # fmt: skip
+    add("--meshes", type=Path, metavar="LIST.yaml", help="meshes of yours with scale, pose and split")
     add_explain_options(parser)
 
 
-def settings_of(args: argparse.Namespace) -> "BuildSettings":
+def settings_of(args: argparse.Namespace) -> render.BuildSettings:
     """Build settings that the arguments ask for; raises `BuildError`, `MeshError` or `RigError`."""
-    from dataclasses import replace
-
-    from fpp_ml_bench.loaders.render import PRESETS, BuildSettings, read_mesh_list, single_mesh
-    from fpp_ml_bench.optics import bits_needed, load_rig, paper_rig
-
-    objects, size = PRESETS[args.preset]
+    objects, size = render.PRESETS[args.preset]
     if args.size is not None and not 1 <= args.size <= 8192:
         raise BuildError(f"--size {args.size}: expected 1 to 8192 px")
-    rig = paper_rig(args.size or size) if args.rig is None else load_rig(args.rig)
+    rig = optics.paper_rig(args.size or size) if args.rig is None else optics.load_rig(args.rig)
     if args.rig is not None and args.size is not None:
         rig = rig.scaled(args.size)
     if args.pitch is not None:
-        sequence = rig.sequence
+        sequence, bits = rig.sequence, {}
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
-            sequence = replace(
-                sequence,
-                bits_horizontal=max(
-                    sequence.bits_horizontal, bits_needed(rig.pattern_length("horizontal"), args.pitch)
-                ),
-                bits_vertical=max(sequence.bits_vertical, bits_needed(rig.pattern_length("vertical"), args.pitch)),
-            )
+            for direction in optics.DIRECTIONS:
+                needed = optics.bits_needed(rig.pattern_length(direction), args.pitch)
+                bits[f"bits_{direction}"] = max(getattr(sequence, f"bits_{direction}"), needed)
+        sequence = replace(sequence, **bits)
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
-    meshes = (read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(single_mesh, args.mesh))
+    meshes = (render.read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(render.single_mesh, args.mesh))
     if args.objects is not None:
         objects = tuple(name.strip() for name in args.objects.split(",") if name.strip())
     elif meshes:
         objects = ()
-    return BuildSettings(
+    return render.BuildSettings(
         rig=rig,
         objects=(*objects, *(mesh.name for mesh in meshes)),
         placement=args.placement,
@@ -87,52 +81,39 @@ def settings_of(args: argparse.Namespace) -> "BuildSettings":
 
 
 def run(args: argparse.Namespace) -> int:
-    with as_asked(args):
-        return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
-    from time import perf_counter
-
     from fpp_ml_bench.cli.console import progress_bar
-    from fpp_ml_bench.loaders.render import assembly_of, build
-    from fpp_ml_bench.loaders.sample import stored_frames
-    from fpp_ml_bench.machine import usable_cores
 
-    settings = settings_of(args)
-    workers = usable_cores() if args.workers is None else args.workers
-    if workers < 1:
-        raise BuildError(f"--workers {workers}: expected 1 or more")
-    assembly = assembly_of(settings)
-    rows = sum(len(plan.samples) for plan in assembly.plans)
-    frames = len(stored_frames(settings.rig.sequence, settings.stored))
-    steps: list[int] = []
-    started = perf_counter()
-    with progress_bar("building", rows, "images", frames) as advance:
+    with as_asked(args):
+        settings = settings_of(args)
+        workers = usable_cores() if args.workers is None else args.workers
+        if workers < 1:
+            raise BuildError(f"--workers {workers}: expected 1 or more")
+        rows = sum(len(plan.samples) for plan in render.assembly_of(settings).plans)
+        frames = len(stored_frames(settings.rig.sequence, settings.stored))
+        steps: list[int] = []
+        started = perf_counter()
+        with progress_bar("building", rows, "images", frames) as advance:
 
-        def count(finished: int) -> None:
-            steps.append(finished)
-            advance(finished)
+            def count(finished: int) -> None:
+                steps.append(finished)
+                advance(finished)
 
-        manifest = build(args.out, settings, workers, count)
-    seconds = perf_counter() - started
-    # The first step is what an interrupted run had left: it took no time now.
-    _summary(args.out, manifest, rows * frames, sum(steps[1:]) * frames, seconds)
-    from fpp_ml_bench.loaders.render import explain_build
-
-    explain(args, lambda: explain_build(manifest, settings))
+            manifest = render.build(args.out, settings, workers, count)
+        seconds = perf_counter() - started
+        # The first step is what an interrupted run had left: it took no time now.
+        _summary(args.out, manifest, rows * frames, sum(steps[1:]) * frames, seconds)
+        explain(args, lambda: render.explain_build(manifest, settings))
     return 0
 
 
-def _summary(out: Path, manifest: "Manifest", images: int, made: int, seconds: float) -> None:
+def _summary(out: Path, manifest: storage.Manifest, images: int, made: int, seconds: float) -> None:
     from fpp_ml_bench.cli.console import gigabytes, say_benchmark
-    from fpp_ml_bench.loaders.storage import ground_truth_summary
 
     size = sum(file.bytes for file in manifest.files)
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
     print(f"{out}: {parts} samples, {images:,} images, {gigabytes(size)}; {rate}")
-    for line in ground_truth_summary(manifest):
+    for line in storage.ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)
     print(f"next: fpp-bench info {out}")

@@ -3,7 +3,10 @@
 import argparse
 from pathlib import Path
 
+from fpp_ml_bench.cli import SPLITS
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns."
 EXAMPLES = (
@@ -15,30 +18,29 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
-    parser.add_argument("out", type=Path, metavar="OUT", help="new or empty folder; written completely or not at all")
-    parser.add_argument("--parquet", action="store_true", help="Parquet and a card, ready for the Hugging Face Hub")
-    parser.add_argument("--mat", action="store_true", help="the published tree: PNG fringes, .mat depth, raw scans")
-    parser.add_argument("--meshes", action="store_true", help="the objects' meshes as PLY (metres)")
-    parser.add_argument("--patterns", action="store_true", help="the projected patterns as PNG")
-    parser.add_argument("--split", choices=("train", "validation", "test", "all"), default="all",
-                        help="samples to export (default: all)")  # fmt: skip
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
+    add("out", type=Path, metavar="OUT", help="new or empty folder; written completely or not at all")
+    add("--parquet", action="store_true", help="Parquet and a card, ready for the Hugging Face Hub")
+    add("--mat", action="store_true", help="the published tree: PNG fringes, .mat depth, raw scans")
+    add("--meshes", action="store_true", help="the objects' meshes as PLY (metres)")
+    add("--patterns", action="store_true", help="the projected patterns as PNG")
+    add("--split", choices=SPLITS, default="all", help="samples to export (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Export. Raises FppBenchError for an unusable dataset, form or folder."""
     from fpp_ml_bench.cli.console import gigabytes, progress_bar
-    from fpp_ml_bench.loaders.storage import FORMS, SAMPLE_FORMS, DatasetFolder, chosen_splits, export
-    from fpp_ml_bench.machine import usable_cores
 
-    forms = [form for form in FORMS if getattr(args, form)]
+    forms = [form for form in storage.FORMS if getattr(args, form)]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
-    dataset = DatasetFolder(args.dataset)
-    splits = chosen_splits(dataset, args.split)
+    dataset = storage.DatasetFolder(args.dataset)
+    splits = storage.chosen_splits(dataset, args.split)
     samples = sum(len(dataset.samples(split)) for split in splits)
-    with progress_bar("exporting", samples * sum(form in SAMPLE_FORMS for form in forms), "samples") as advance:
-        export(dataset, args.out, forms, splits, usable_cores(), advance)
+    steps = samples * sum(form in storage.SAMPLE_FORMS for form in forms)
+    with progress_bar("exporting", steps, "samples") as advance:
+        storage.export(dataset, args.out, forms, splits, usable_cores(), advance)
     files = [path for path in args.out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{args.out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

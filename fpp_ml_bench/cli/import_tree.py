@@ -2,8 +2,13 @@
 
 import argparse
 from pathlib import Path
+from time import perf_counter
 
+from fpp_ml_bench import optics
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders import published
+from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Read a published tree (PNG fringes, .mat depth, raw scans) into the same dataset format as a build."
 EXAMPLES = (
@@ -19,39 +24,34 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("tree", type=Path, metavar="TREE", help="folder that holds training_datasets/")
-    parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or the folder of an interrupted import")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per processor)")
-    parser.add_argument("--rig", type=Path, metavar="FILE",
-                        help="rig that took the images, YAML or JSON (default: the paper's, scaled)")  # fmt: skip
-    parser.add_argument("--frame-order", default="auto", metavar="NAME",
-                        help="order of the raw scans' files (default: auto, determined from the images)")  # fmt: skip
+    add = parser.add_argument
+    add("tree", type=Path, metavar="TREE", help="folder that holds training_datasets/")
+    add("out", type=Path, metavar="OUT", help="new folder, or the folder of an interrupted import")
+    add("--workers", type=int, metavar="N", help="processes (default: one per processor)")
+    add("--rig", type=Path, metavar="FILE",
+        help="rig that took the images, YAML or JSON (default: the paper's, scaled)")  # fmt: skip
+    add("--frame-order", default="auto", metavar="NAME",
+        help="order of the raw scans' files (default: auto, determined from the images)")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Import, and print a summary. Raises FppBenchError for an unusable tree, rig or folder."""
-    from time import perf_counter
-
     from fpp_ml_bench.cli.console import gigabytes, progress_bar
-    from fpp_ml_bench.loaders.published import import_notes, import_tree, plan_import
-    from fpp_ml_bench.loaders.sample import stored_frames
-    from fpp_ml_bench.machine import usable_cores
-    from fpp_ml_bench.optics import load_rig
 
     workers = usable_cores() if args.workers is None else args.workers
     if workers < 1:
         raise BuildError(f"--workers {workers}: expected 1 or more")
-    plan = plan_import(args.tree, None if args.rig is None else load_rig(args.rig), args.frame_order)
+    plan = published.plan_import(args.tree, None if args.rig is None else optics.load_rig(args.rig), args.frame_order)
     sample_count = len(plan.tree.all_samples())
     images = len(stored_frames(plan.reader.rig.sequence, plan.assembly.manifest.stored))
     started = perf_counter()
     with progress_bar("importing", sample_count, "images", images) as advance:
-        manifest = import_tree(args.out, plan, workers, advance)
+        manifest = published.import_tree(args.out, plan, workers, advance)
     seconds = perf_counter() - started
     size = sum(file.bytes for file in manifest.files)
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     print(f"{args.out}: {parts} samples, {sample_count * images:,} images, {gigabytes(size)} in {seconds:.1f} s")
-    for note in import_notes(manifest):
+    for note in published.import_notes(manifest):
         print(f"  {note}")
     print(f"next: fpp-bench info {args.out}")
     return 0

@@ -1,11 +1,13 @@
 """``fpp-bench info``: what a dataset holds."""
 
 import argparse
+import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import SplitStatistics
+from fpp_ml_bench import optics
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.loaders import storage
 
 SUMMARY = "What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."
 EXAMPLES = ("fpp-bench info data/mini", "fpp-bench info data/mini --json | jq .splits")
@@ -17,35 +19,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    import json
-    from dataclasses import asdict
-
-    from fpp_ml_bench.constants import MM_PER_M
-    from fpp_ml_bench.loaders.storage import (
-        DatasetFolder,
-        benchmark_of,
-        benchmark_sentence,
-        split_statistics,
-        whole_statistics,
-    )
-    from fpp_ml_bench.optics import DIRECTIONS
-
-    opened = DatasetFolder(args.dataset)
-    benchmark = benchmark_of(opened.fingerprint)
-    statistics = split_statistics(opened.manifest)
+    opened = storage.DatasetFolder(args.dataset)
+    manifest, rig = opened.manifest, opened.rig
+    statistics = storage.split_statistics(manifest)
     if args.json:
+        benchmark = storage.benchmark_of(opened.fingerprint)
         content = {
             "path": str(opened.path),
             "fingerprint": opened.fingerprint,
             "benchmark": None if benchmark is None else {"name": benchmark.name, "version": benchmark.version},
-            "origin": opened.manifest.origin,
+            "origin": manifest.origin,
             "size": list(opened.size),
             "configs": list(opened.configs),
-            "bytes": sum(file.bytes for file in opened.manifest.files),
-            "settings": opened.manifest.settings,
-            "rig": opened.manifest.rig,
+            "bytes": sum(file.bytes for file in manifest.files),
+            "settings": manifest.settings,
+            "rig": manifest.rig,
             "splits": [asdict(split) for split in statistics],
-            "all": asdict(whole_statistics(opened.manifest)),
+            "all": asdict(storage.whole_statistics(manifest)),
             "samples": opened.splits,
         }
         print(json.dumps(content, indent=1, allow_nan=False))
@@ -53,59 +43,46 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from fpp_ml_bench.cli.console import gigabytes
+    from fpp_ml_bench.cli.console import gigabytes, millimetres
 
-    manifest, rig = opened.manifest, opened.rig
     groups: dict[str, int] = {}
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
     near, far = rig.working_range_mm
-    periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in DIRECTIONS)
+    periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in optics.DIRECTIONS)
     settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
     generator = manifest.generator
     height, width = opened.size
+    pitches = f"{rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g}"
     print(f"dataset         {opened.path}")
     print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
     print(f"fingerprint     {opened.fingerprint}")
-    print(f"benchmark       {benchmark_sentence(manifest)[1]}")
+    print(f"benchmark       {storage.benchmark_sentence(manifest)[1]}")
     print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    print(
-        f"fringes         pitch {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px; periods in range {periods}"
-    )
+    print(f"fringes         pitch {pitches} px; periods in range {periods}")
     print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
-    table = Table(
-        title="lengths in mm, means over samples; ground-truth error: decoded - exact depth", title_justify="left"
-    )
-    table.add_column("")
-    statistics = [*statistics, whole_statistics(manifest)]
-    for split in statistics:
-        table.add_column(split.split, justify="right")
-    for title, cells in _rows(statistics):
-        table.add_row(title, *cells)
-    Console().print(table)
-    return 0
-
-
-def _rows(statistics: "list[SplitStatistics]") -> list[tuple[str, list[str]]]:
-    """Lines of the table: a title and one cell a split."""
-    from fpp_ml_bench.cli.console import millimetres
 
     def share(value: float | None) -> str:
         return "-" if value is None else f"{100 * value:.2f}%"
 
-    return [
-        ("objects, samples", [f"{s.objects}, {s.samples}" for s in statistics]),
-        ("cover, mean", [share(s.cover_mean) for s in statistics]),
-        ("cover, least-most", [f"{100 * s.cover_min:.1f}-{100 * s.cover_max:.1f}%" for s in statistics]),
-        ("depth range, median", [f"{s.depth_range_median_mm:.0f}" for s in statistics]),
-        ("depth range, largest", [f"{s.depth_range_max_mm:.0f}" for s in statistics]),
-        ("ground-truth error, MAE", [millimetres(s.gt_mae_mm) for s in statistics]),
-        ("  RMSE", [millimetres(s.gt_rmse_mm) for s in statistics]),
-        ("  MAE inside (3 px from edges)", [millimetres(s.gt_interior_mae_mm) for s in statistics]),
-        ("  largest", [millimetres(s.gt_max_mm) for s in statistics]),
-        ("pixels without ground truth", [share(s.undecoded_share) for s in statistics]),
-    ]
+    title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
+    table = Table("", title=title, title_justify="left")
+    statistics = [*statistics, storage.whole_statistics(manifest)]
+    for split in statistics:
+        table.add_column(split.split, justify="right")
+    table.add_row("objects, samples", *(f"{s.objects}, {s.samples}" for s in statistics))
+    table.add_row("cover, mean", *(share(s.cover_mean) for s in statistics))
+    table.add_row("cover, least-most", *(f"{100 * s.cover_min:.1f}-{100 * s.cover_max:.1f}%" for s in statistics))
+    table.add_row("depth range, median", *(f"{s.depth_range_median_mm:.0f}" for s in statistics))
+    table.add_row("depth range, largest", *(f"{s.depth_range_max_mm:.0f}" for s in statistics))
+    table.add_row("ground-truth error, MAE", *(millimetres(s.gt_mae_mm) for s in statistics))
+    table.add_row("  RMSE", *(millimetres(s.gt_rmse_mm) for s in statistics))
+    table.add_row("  MAE inside (3 px from edges)", *(millimetres(s.gt_interior_mae_mm) for s in statistics))
+    table.add_row("  largest", *(millimetres(s.gt_max_mm) for s in statistics))
+    table.add_row("pixels without ground truth", *(share(s.undecoded_share) for s in statistics))
+    Console().print(table)
+    return 0

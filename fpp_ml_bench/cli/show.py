@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.loaders import storage
 
 SUMMARY = "One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."
 EXAMPLES = (
@@ -14,25 +15,23 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
-    parser.add_argument("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
-    parser.add_argument("--sheet", action="store_true", help="all objects and views on one sheet instead")
-    parser.add_argument("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)"
-    )
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    add("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
+    add("--sheet", action="store_true", help="all objects and views on one sheet instead")
+    add("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
+    add("--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)")
 
 
 def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
-    from fpp_ml_bench.loaders.storage import DatasetFolder
 
     if args.sheet == (args.sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json` lists the samples")
     out = args.out or Path("sheet.png" if args.sheet else f"{args.sample}.png")
     if out.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
-    dataset = DatasetFolder(args.dataset)
+    dataset = storage.DatasetFolder(args.dataset)
     if args.sheet:
         contact_sheet(dataset, args.split, out)
     else:

@@ -3,6 +3,9 @@
 import argparse
 from pathlib import Path
 
+from fpp_ml_bench.cli import CHECK_FAILED, OK
+from fpp_ml_bench.loaders import storage
+
 SUMMARY = "Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."
 EXAMPLES = ("fpp-bench verify data/mini", "fpp-bench verify data/mini && echo safe to train on")
 
@@ -12,14 +15,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
-    from fpp_ml_bench.loaders.storage import read_manifest, verify
 
-    manifest = read_manifest(args.dataset)
+    manifest = storage.read_manifest(args.dataset)
     files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:
-        findings = verify(args.dataset, advance)
+        findings = storage.verify(args.dataset, advance)
     for finding in findings:
         print(finding)
     size = gigabytes(sum(file.bytes for file in files))
