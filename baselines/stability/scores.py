@@ -252,7 +252,7 @@ def distribution(scale_mm: float) -> Outcome:
     median = quantile(exact, 0.5)
     expected = [quantile(size, 0.5), quantile(size, 0.95), float(size[-1]), math.fsum(exact.tolist()) / exact.size,
                 math.fsum(np.abs(exact - median).tolist()) / exact.size]  # fmt: skip
-    computed = [measured.median_mm, measured.p95_mm, measured.max_mm, measured.bias_mm, measured.shift_free_mae_mm]
+    computed = [measured[f"object_{name}_mm"] for name in ("median", "p95", "max", "bias", "shift_free_mae")]
     bound = gamma(score.BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
     return worst(np.array(computed, float) - np.array(expected), bound)
 

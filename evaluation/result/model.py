@@ -14,18 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
-from fpp_ml_bench.evaluation.result.parts import (
-    Bootstrap,
-    DatasetInfo,
-    Environment,
-    Headline,
-    Intervals,
-    Metrics,
-    ObjectResult,
-    Reliance,
-    SampleResult,
-    Timing,
-)
+from fpp_ml_bench.evaluation.result import parts
+from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, SampleResult
 from fpp_ml_bench.evaluation.schema import Count, SparseModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
@@ -45,22 +35,22 @@ class Result(SparseModel):
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
     created: str
     submission: Submission
-    dataset: DatasetInfo
+    dataset: parts.DatasetInfo
     target: Target
     mode: Mode
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
     edge_jump_mm: Annotated[float, Field(gt=0)]
     metrics: Metrics
-    intervals: Intervals
+    intervals: parts.Intervals
     median: Metrics
-    pooled: Headline
+    pooled: parts.Headline
     samples_without_object: Count
     samples_without_background: Count
-    per_object: list[ObjectResult] = Field(max_length=100_000)
+    per_object: list[parts.ObjectResult] = Field(max_length=100_000)
     per_sample: list[SampleResult] = Field(max_length=100_000)
-    bootstrap: Bootstrap
+    bootstrap: parts.Bootstrap
     seeds: dict[Text, Count]
-    environment: Environment
+    environment: parts.Environment
     reliance: Reliance | None = None
 
     @property
@@ -68,7 +58,7 @@ class Result(SparseModel):
         return self.submission.track
 
     @property
-    def timing(self) -> Timing | None:
+    def timing(self) -> parts.Timing | None:
         """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
         return self.submission.timing
 
@@ -110,14 +100,15 @@ def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
 
 def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     """Every key of `Result` that follows from the per-sample scores."""
-    rows, objects = [row.scores() for row in per_sample], [row.object for row in per_sample]
+    rows = [{key: getattr(row, key) for key in METRICS} for row in per_sample]
+    objects = [row.object for row in per_sample]
     inside = combine(*(row.stats("object") for row in per_sample))
     outside = combine(*(row.stats("background") for row in per_sample))
     intervals = intervals_over_objects(rows, objects, protocol.HEADLINE)
     return {
         "metrics": mean_over_samples(rows),
         "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
-        "median": median_over_samples(rows),
+        "median": over_samples(rows, statistics.median),
         "pooled": pooled(inside, outside),
         "samples_without_object": sum(row.object_pixels == 0 for row in per_sample),
         "samples_without_background": sum(row.background_pixels == 0 for row in per_sample),
@@ -126,7 +117,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
                 "object": name,
                 "samples": len(views := [row for row, owner in zip(rows, objects, strict=True) if owner == name]),
                 "metrics": mean_over_samples(views),
-                "spread": _over_samples(views, _deviation),
+                "spread": over_samples(views, _deviation),
             }
             for name in dict.fromkeys(objects)
         ],
@@ -142,15 +133,11 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
 
 def mean_over_samples(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each metric over the samples that have it (paper Section 5.3.2); None where no sample has."""
-    return _over_samples(rows, statistics.fmean)
+    return over_samples(rows, statistics.fmean)
 
 
-def median_over_samples(rows: Sequence[Scores]) -> Scores:
-    """Median of each metric over the samples that have it; None where no sample has."""
-    return _over_samples(rows, statistics.median)
-
-
-def _over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
+def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
+    """A statistic of each metric over the samples that have it; None where no sample has."""
     columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 
@@ -178,13 +165,14 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
     """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
     if row.object_pixels + row.background_pixels != pixels:
         raise ValueError(f"{row.sample}: object and background pixels do not add up to the image's {pixels}")
-    for name in ("object", "background"):
-        stats = row.stats(name)
-        if (stats.pixels == 0) != (stats.mae_mm is None) or (stats.pixels == 0) != (stats.rmse_mm is None):
+    sets = {name: row.stats(name) for name in ("object", "background")}
+    for name, stats in sets.items():
+        mae, rmse = stats.mae_mm, stats.rmse_mm
+        if not (stats.pixels == 0) == (mae is None) == (rmse is None):
             raise ValueError(f"{row.sample}: {name} scores must be null exactly when the set is empty")
-        if stats.mae_mm is not None and stats.rmse_mm is not None and stats.rmse_mm < stats.mae_mm * (1 - AGREES):
+        if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
             raise ValueError(f"{row.sample}: {name} RMSE is below its MAE, which no error has")
-    overall = combine(row.stats("object"), row.stats("background"))
+    overall = combine(*sets.values())
     if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
         raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
     names = ("mae", "median", "p95", "max", "bias", "shift_free_mae", "rmse")
@@ -218,7 +206,7 @@ def _check_reliance(reliance: Reliance, submission: Submission) -> None:
 def _check_same(name: str, stored: Any, computed: Any) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
     if isinstance(computed, Mapping):
-        if not isinstance(stored, Mapping) or set(stored) != set(computed):
+        if set(stored) != set(computed):
             raise ValueError(f"{name} does not hold the keys {', '.join(map(str, computed))}")
         for key in computed:
             _check_same(f"{name}.{key}", stored[key], computed[key])

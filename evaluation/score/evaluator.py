@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
@@ -33,7 +33,7 @@ Outcome = tuple[list[str], list[dict[str, Any]]]
 class Rules(NamedTuple):
     """How predictions are read and scored."""
 
-    size: tuple[int, int]
+    target: str
     units: Units
     png_mm_per_level: float | None
     mode: Mode
@@ -72,10 +72,10 @@ def evaluate(
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
-    rules = Rules(dataset.size, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
+    rules = Rules(target, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
     problems, rows = list(listing.problems), []
-    outcomes = _scored(folder, listing, rules, dataset, target) if units in get_args(Units) else ()
-    description: submission.Submission | None = None
+    outcomes = _scored(folder, listing, rules, dataset) if units in get_args(Units) else ()
+    description = None
     if content is not None:
         try:
             description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
@@ -87,13 +87,11 @@ def evaluate(
         problems += file_problems
         rows += file_rows
     if problems:
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        description_problems = [str(description_error)] if description_error else []
-        raise PredictionError(
-            f"{printable(str(folder), 500)} can't be scored, {count}:", description_problems + problems
-        )
-    if description_error or description is None:
-        raise description_error or SubmissionError(f"{printable(str(folder), 500)} has no description")
+        summary = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        lines = [str(description_error), *problems] if description_error else problems
+        raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
+    if description_error:
+        raise description_error
     benchmark = benchmark_of(dataset.fingerprint)
     return result.result_from_rows(
         [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
@@ -158,19 +156,17 @@ def _checked_submission(
     return description
 
 
-def _scored(
-    folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder, column: str
-) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order; its target is the dataset's ``column``.
+def _scored(folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder) -> Iterator[Outcome]:
+    """Problems and row of each sample that has a prediction, in order.
 
     Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
-    reader = submission.reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
+    reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, rules.png_mm_per_level)
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = dataset.target_mm(sample, column)
+            target = dataset.target_mm(sample, rules.target)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             raise DatasetError(
@@ -191,16 +187,7 @@ def _scored(
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
         return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 
-    pool = ThreadPoolExecutor(min(WORKERS, usable_cores()))
-    return _results(pool, [pool.submit(work, sample) for sample in listing.present])
-
-
-def _results(pool: ThreadPoolExecutor, futures: list[Future[Outcome]]) -> Iterator[Outcome]:
-    try:
-        for future in futures:
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, listing.present)
 
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")

@@ -17,14 +17,10 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, WITHIN, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, WITHIN, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
 
-KEYS = (
-    *HEADLINE, "object_valid_mae_mm", "object_missing_share", "object_median_mm", "object_p95_mm", "object_max_mm",
-    *WITHIN, "object_bias_mm", "object_valid_bias_mm", "object_shift_free_mae_mm",
-)  # fmt: skip
-
+KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION)
 SQUARES_VANISH = 1e-140
 """Errors below this have squares below the smallest normal float64."""
 
