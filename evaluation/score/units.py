@@ -12,8 +12,6 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 
 Depth = NDArray[np.floating[Any]]
-
-
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
 """Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
 
@@ -35,10 +33,8 @@ def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, un
         low, high = float(prediction.min()), float(prediction.max())
     largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
     if max(high, -low) > largest:
-        problems.append(
-            f"holds values up to {max(high, -low):.3g} {units} in magnitude; the limit is {largest:g}; write 0 where "
-            "nothing was measured"
-        )
+        values = f"values up to {max(high, -low):.3g} {units} in magnitude"
+        problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
     wrong_unit = _unit_problem(prediction, target_mm, units, high, target_max_mm)
     return [*problems, wrong_unit] if wrong_unit else problems
 
@@ -60,21 +56,16 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     if not depths.size:
         return None
     typical = float(np.median(depths))
+    median = f"its median over the object is {typical:.4g}"
     if units == "m" and typical > protocol.METRES_AT_MOST:
-        return (
-            f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
-            "mm in submission.yaml"
-        )
+        return f"does not look like metres: {median}; if it is in mm, declare units: mm in submission.yaml"
     if units == "m" and high < 1 and target_max_mm > protocol.MILLIMETRES_ABOVE:
-        return (
-            f"does not look like metres: its largest value is {high:.4g}, the target reaches "
-            f"{target_max_mm / MM_PER_M:.2f} m; if it is normalised, declare units: normalised in submission.yaml"
-        )
+        reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm / MM_PER_M:.2f} m"
+        advice = "if it is normalised, declare units: normalised in submission.yaml"
+        return f"does not look like metres: {reach}; {advice}"
     if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
-        return (
-            f"does not look like normalised depth: its median over the object is {typical:.4g}, the target's is at "
-            "most 1; if it is in m or mm, declare that in submission.yaml"
-        )
+        advice = "if it is in m or mm, declare that in submission.yaml"
+        return f"does not look like normalised depth: {median}, the target's is at most 1; {advice}"
     return None
 
 

@@ -77,10 +77,8 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
                 batch.validate(full=True)
                 stream.write_batch(batch)
                 if unpacked.tell() > largest:
-                    raise PredictionError(
-                        f"unpacks to more than {largest} bytes, which this split can't need; write one float32 map per "
-                        "sample"
-                    )
+                    too_large = f"unpacks to more than {largest} bytes, which this split can't need"
+                    raise PredictionError(f"{too_large}; write one float32 map per sample")
         return unpacked.getvalue()
     except (PredictionError, MemoryError):
         raise
@@ -91,9 +89,8 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
 
 def _check_columns(schema: pa.Schema) -> None:
     if sorted(schema.names) != ["depth", "sample"]:
-        raise PredictionError(
-            f"holds the columns {printable(', '.join(schema.names), 120)}; expected sample and depth: {_ADVICE}"
-        )
+        names = printable(", ".join(schema.names), 120)
+        raise PredictionError(f"holds the columns {names}; expected sample and depth: {_ADVICE}")
     if schema.field("sample").type not in (pa.string(), pa.large_string()):
         raise PredictionError(f"column sample: expected text, got {schema.field('sample').type}; {_ADVICE}")
     value = schema.field("depth").type
@@ -119,9 +116,8 @@ def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
     """The row of each sample; refuses a table of other samples."""
     rows = {name: row for row, name in enumerate(names)}
     problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
-    problems += [
-        f"holds {printable(name)}, which is no sample of this split" for name in rows if name not in set(samples)
-    ]
+    foreign = [name for name in rows if name not in set(samples)]
+    problems += [f"holds {printable(name)}, which is no sample of this split" for name in foreign]
     problems += [f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1]
     if problems:
         raise PredictionError(f"{'; '.join(problems[:20])}; write one row for each sample")
