@@ -86,9 +86,7 @@ def compare(first: Result, second: Result) -> Comparison:
         second=second.submission.name,
         fingerprint=first.dataset.fingerprint,
         split=first.dataset.split,
-        target=first.target,
-        track=first.track,
-        mode=first.mode,
+        **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
         sentence=sentence(*names, summaries[MAIN_KEY]),
         per_sample=paired,
@@ -135,21 +133,16 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     if not difference.lower and not difference.higher:
         return f"{second} and {first} have the same object MAE in all {difference.samples} samples."
     size = f"{millimetres(abs(difference.mean_mm))} mm"
-    word = "lower" if difference.mean_mm < 0 else "higher"
-    count = difference.lower if difference.mean_mm < 0 else difference.higher
+    word, count = ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
     views = f"{word} in {count} of {difference.samples} samples"
     if difference.interval is None:
-        return (
-            f"{second} has an object MAE {size} {word} than {first} on average, {views}; with one object there is no "
-            "interval, so nothing can be said beyond it."
-        )
+        no_interval = "with one object there is no interval, so nothing can be said beyond it"
+        return f"{second} has an object MAE {size} {word} than {first} on average, {views}; {no_interval}."
     between = f"{interval_text(difference.interval)} mm over {difference.objects} objects"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
     if difference.told_apart:
-        return (
-            f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {between}), "
-            f"{views}.{few_objects}"
-        )
+        by = f"by {size} on average (95% interval {between})"
+        return f"{second} has a {word} object MAE than {first}, {by}, {views}.{few_objects}"
     return (
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
         f"but the 95% interval, {between}, holds 0.{few_objects}"

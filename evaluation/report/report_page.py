@@ -103,10 +103,8 @@ def _chosen_panels(
 ) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
     """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
     if dataset.fingerprint != result.dataset.fingerprint:
-        raise DatasetError(
-            f"{dataset.path}: fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was "
-            "scored; give the dataset that the result names"
-        )
+        difference = f"fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was scored"
+        raise DatasetError(f"{dataset.path}: {difference}; give the dataset that the result names")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
     form = list_folder(folder, samples, result.dataset.split, {}).form
     reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
@@ -155,8 +153,6 @@ def sample_table(result: Result) -> str:
     """Scores of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
     keys = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm", "background_mae_mm", "object_missing_share")
     ordered = sorted(result.per_sample, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))
-    rows = [
-        [row.sample, *(_text(key, getattr(row, key)) for key in keys), row.prediction_sha256[:12]] for row in ordered
-    ]
+    rows = [[r.sample, *(_text(key, getattr(r, key)) for key in keys), r.prediction_sha256[:12]] for r in ordered]
     titles = ["Sample", *(_TITLES[key] for key in keys), "Prediction SHA-256"]
     return html_table("Every sample, the largest object MAE first; mm", titles, rows)

@@ -93,10 +93,8 @@ def parse_result(content: Any, path: Path) -> Result:
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version not in get_args(SchemaVersion):
         given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
-        raise SubmissionError(
-            f"{file}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}; "
-            "score the predictions again with this version's fpp-eval"
-        )
+        expected = f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}"
+        raise SubmissionError(f"{file}: {expected}; score the predictions again with this version's fpp-eval")
     return validate(Result, content, path, "result of fpp-eval")
 
 

@@ -72,11 +72,10 @@ class Result(SparseModel):
     @model_validator(mode="after")
     def _consistent(self) -> "Result":
         height, width = self.dataset.size
-        if len(self.per_sample) != self.dataset.samples:
-            raise ValueError(
-                f"per_sample holds {len(self.per_sample)} samples, dataset.samples says {self.dataset.samples}"
-            )
-        if len({row.sample for row in self.per_sample}) != len(self.per_sample):
+        count = len(self.per_sample)
+        if count != self.dataset.samples:
+            raise ValueError(f"per_sample holds {count} samples, dataset.samples says {self.dataset.samples}")
+        if len({row.sample for row in self.per_sample}) != count:
             raise ValueError("per_sample names a sample twice")
         if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
@@ -92,10 +91,8 @@ class Result(SparseModel):
 
 def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
     """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
-    per_sample = [SampleResult(**row) for row in rows]
-    return Result(
-        schema_version=protocol.RESULT_SCHEMA_VERSION, per_sample=per_sample, **_derived(per_sample), **fields
-    )
+    per_sample, version = [SampleResult(**row) for row in rows], protocol.RESULT_SCHEMA_VERSION
+    return Result(schema_version=version, per_sample=per_sample, **_derived(per_sample), **fields)
 
 
 def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
@@ -191,16 +188,13 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
 
 def _check_reliance(reliance: Reliance, submission: Submission) -> None:
     """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
-    weights = submission.settings.get("weights_sha256")
+    weights, units = submission.settings.get("weights_sha256"), submission.units
     if weights != reliance.weights_sha256:
-        raise ValueError(
-            f"reliance was measured on weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}; "
-            "measure it again"
-        )
-    if (reliance.units == "normalised") != (submission.units == "normalised"):
-        raise ValueError(
-            f"reliance is that of an answer in {reliance.units}, scored was one in {submission.units}; measure it again"
-        )
+        pair = f"weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}"
+        raise ValueError(f"reliance was measured on {pair}; measure it again")
+    if (reliance.units == "normalised") != (units == "normalised"):
+        pair = f"an answer in {reliance.units}, scored was one in {units}"
+        raise ValueError(f"reliance is that of {pair}; measure it again")
 
 
 def _check_same(name: str, stored: Any, computed: Any) -> None:
@@ -219,9 +213,9 @@ def _check_same(name: str, stored: Any, computed: Any) -> None:
         # A mean of signed values may cancel to rounding errors, which depend on the machine.
         if not same(stored, computed, rounding=1e-9 if name.endswith("bias_mm") else 0.0):
             raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+    elif stored != computed and name.startswith("samples_without_"):
+        raise ValueError(f"{name} is not the number of such samples, {computed}")
     elif stored != computed:
-        if name.startswith("samples_without_"):
-            raise ValueError(f"{name} is not the number of such samples, {computed}")
         raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
 
 

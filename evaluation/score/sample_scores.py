@@ -208,9 +208,8 @@ def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BA
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
     if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
-        )
+        expected = f"expected a prediction of the target's shape {target_mm.shape} (H, W)"
+        raise PredictionError(f"{expected}, got {prediction_mm.shape}")
     if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
     prediction, target = prediction_mm.ravel(), target_mm.ravel()

@@ -64,13 +64,11 @@ class DepthScores(Metric):
 
 
 def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
-    if prediction_mm.shape != target_mm.shape:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {tuple(target_mm.shape)}, got {tuple(prediction_mm.shape)}"
-        )
+    shape, given = tuple(target_mm.shape), tuple(prediction_mm.shape)
+    if given != shape:
+        raise PredictionError(f"expected a prediction of the target's shape {shape}, got {given}")
     if not (prediction_mm.is_floating_point() and target_mm.is_floating_point()):
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
-    shape = tuple(target_mm.shape)
     if target_mm.dim() == 4 and shape[1] == 1:
         prediction_mm, target_mm = prediction_mm[:, 0], target_mm[:, 0]
     if target_mm.dim() != 3 or target_mm[:1].numel() == 0:

@@ -90,17 +90,14 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     if not inside.any():
         if mode == "standard" and not values.any():
             return values, target_mm
-        raise DatasetError(
-            f"{sample}: the target holds no object, so normalised depth has no range to go back through; submit mm"
-        )
+        no_range = "the target holds no object, so normalised depth has no range to go back through"
+        raise DatasetError(f"{sample}: {no_range}; submit mm")
     low, high = (float(edge(target_mm[inside])) for edge in (np.min, np.max))
     if mode == "standard":
         depth = values.astype(np.float64) * (high - low) + low
         depth[values == 0] = 0.0
         return depth, target_mm
     if high == low:
-        raise DatasetError(
-            f"{sample}: the target is one flat plane, and individual normalisation divides by its range, 0; score it "
-            "with --mode standard"
-        )
+        flat = "the target is one flat plane, and individual normalisation divides by its range, 0"
+        raise DatasetError(f"{sample}: {flat}; score it with --mode standard")
     return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)

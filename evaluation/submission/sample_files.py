@@ -92,12 +92,8 @@ def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, 
     if dtype.hasobject:
         raise PredictionError("holds pickled Python objects, which are never opened; save a float32 array")
     if dtype.kind != "f" or dtype.itemsize not in (2, 4, 8):
-        why = {
-            "c": " (complex); save its real depth",
-            **dict.fromkeys(
-                "iu", ": whole numbers round depth, and wrap around where it does not fit; save as float32"
-            ),
-        }.get(dtype.kind, "; save as float32")
+        wrap = ": whole numbers round depth, and wrap around where it does not fit; save as float32"
+        why = {"c": " (complex); save its real depth", "i": wrap, "u": wrap}.get(dtype.kind, "; save as float32")
         raise PredictionError(f"expected float16, float32 or float64, got {printable(str(dtype), 80)}{why}")
     if tuple(shape) != tuple(size):
         raise PredictionError(f"expected shape {tuple(size)} (H, W), got {_shape_text(shape)}; predict at that size")

@@ -60,10 +60,9 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
             chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
             total, values = sum(c.total_uncompressed_size for c in chunks), sum(c.num_values for c in chunks)
             if total > largest or values > most_values:
-                raise PredictionError(
-                    f"would unpack to {total} bytes and {values} values, expected at most {largest} and "
-                    f"{most_values} for this split; write one float32 map per sample"
-                )
+                limit = f"expected at most {largest} and {most_values} for this split"
+                sizes = f"{total} bytes and {values} values"
+                raise PredictionError(f"would unpack to {sizes}, {limit}; write one float32 map per sample")
             schema, batches = file.schema_arrow, file.iter_batches(_ROWS_AT_ONCE, use_threads=False)
         else:
             # An IPC file is an IPC stream between a mark and a footer.
@@ -97,11 +96,9 @@ def _check_columns(schema: pa.Schema) -> None:
     while (inner := _item_type(value)) is not None:
         value = inner
     if value not in _FLOATS or value == schema.field("depth").type:
-        depth_type = printable(str(schema.field("depth").type), 80)
-        raise PredictionError(
-            f"column depth: expected lists of float16, float32 or float64, got {depth_type}; whole numbers wrap "
-            f"around, other types are not depth: {_ADVICE}"
-        )
+        given = f"got {printable(str(schema.field('depth').type), 80)}"
+        why = "whole numbers wrap around, other types are not depth"
+        raise PredictionError(f"column depth: expected lists of float16, float32 or float64, {given}; {why}: {_ADVICE}")
 
 
 def _item_type(value: pa.DataType) -> pa.DataType | None:
