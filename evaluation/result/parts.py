@@ -141,10 +141,8 @@ class DatasetInfo(SparseModel):
         actual = benchmarks.benchmark_of(self.fingerprint)
         if claimed != actual:
             expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""
-            raise ValueError(
-                f"benchmark says {claim[0]} version {claim[1]}, but fingerprint {self.fingerprint[:16]} is "
-                f"{actual.title if actual else 'not that benchmark'}{expected}"
-            )
+            found = f"fingerprint {self.fingerprint[:16]} is {actual.title if actual else 'not that benchmark'}"
+            raise ValueError(f"benchmark says {claim[0]} version {claim[1]}, but {found}{expected}")
         return self
 
     @property

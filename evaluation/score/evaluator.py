@@ -200,10 +200,8 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
             "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
         )
     if scored.dataset.fingerprint != dataset.fingerprint:
-        return [
-            f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, "
-            f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
-        ]
+        here = f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
+        return [f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, {here}"]
     again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
     names = ("dataset.size", "dataset.samples", "edge_jump_mm")
     pairs = [(name, attrgetter(name)(scored), attrgetter(name)(again), "recomputed") for name in names]

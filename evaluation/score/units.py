@@ -47,10 +47,9 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     """
     if units == "mm":
         if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
-            return (
-                f"looks like metres or normalised depth: its largest value is {high:.4g}, the target reaches "
-                f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
-            )
+            reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm:.0f} mm"
+            advice = "convert it to mm, or declare units: m or normalised in submission.yaml"
+            return f"looks like metres or normalised depth: {reach}; {advice}"
         return None
     depths = values[object_mask(target_mm) & (values > 0)]
     if not depths.size:

@@ -69,15 +69,9 @@ def settings_of(args: argparse.Namespace) -> render.BuildSettings:
     elif meshes:
         objects = ()
     return render.BuildSettings(
-        rig=rig,
-        objects=(*objects, *(mesh.name for mesh in meshes)),
-        placement=args.placement,
-        stored=args.frames,
-        seed=args.seed,
-        noise_sigma_grey=args.noise_sigma,
-        shadows=args.shadows,
-        user_meshes=meshes,
-    )
+        rig=rig, objects=(*objects, *(mesh.name for mesh in meshes)), user_meshes=meshes, placement=args.placement,
+        stored=args.frames, seed=args.seed, noise_sigma_grey=args.noise_sigma, shadows=args.shadows,
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:

@@ -140,11 +140,9 @@ def _carry_out(
     bytes_of = {status: [change.bytes for change in planned if change.status == status] for status in _SIGNS}
     counts = [f"{len(sizes)} {status} ({gigabytes(sum(sizes))})" for status, sizes in bytes_of.items() if sizes]
     print(f"{len(planned)} files: {', '.join(counts)}")
-    if all(change.status == "unchanged" for change in planned):
-        print("Nothing to send: the Hub has all files.")
-        return 0
-    if args.dry_run:
-        print("Dry run: nothing was sent.")
+    nothing = all(change.status == "unchanged" for change in planned)
+    if nothing or args.dry_run:
+        print("Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent.")
         return 0
     with progress_bar("sending", sum(bytes_of["new"] + bytes_of["changed"]), "bytes") as advance:
         url = hub.send(publication, planned, remote, private, advance)
