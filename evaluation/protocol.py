@@ -39,13 +39,14 @@ WITHIN_MM = (1, 2, 5, 10)
 WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
 SIGNED = ("object_bias_mm", "object_valid_bias_mm")
 """The only scores that may be negative: the others are magnitudes or shares."""
-SPREAD_OF_ERROR = (
+DISTRIBUTION = (
     "object_median_mm", "object_p95_mm", "object_max_mm", *WITHIN, *SIGNED, "object_shift_free_mae_mm",
-    "object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share",
 )  # fmt: skip
-"""How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset."""
+"""How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset
+(the MAE once the median error has been subtracted)."""
+WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share")
 
-METRICS = HEADLINE + BESIDE + SPREAD_OF_ERROR
+METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND
 HIGHER_IS_BETTER = WITHIN
 
 LARGEST_MM = 1e30

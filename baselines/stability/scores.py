@@ -232,7 +232,7 @@ def distribution(scale_mm: float) -> Outcome:
     )
     means = (math.fsum(values.tolist()) / exact.size for values in (exact, np.abs(exact - median)))
     expected = np.array([middle, p95, size[-1], *means])
-    computed = [measured.median_mm, measured.p95_mm, measured.max_mm, measured.bias_mm, measured.shift_free_mae_mm]
+    computed = [measured[f"object_{name}_mm"] for name in ("median", "p95", "max", "bias", "shift_free_mae")]
     bound = gamma(score.BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
     return worst(np.array(computed, float) - expected, bound)
 

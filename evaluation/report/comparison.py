@@ -5,6 +5,7 @@ own intervals overlap.
 """
 
 import statistics
+from operator import attrgetter
 from typing import Annotated
 
 from pydantic import Field
@@ -12,7 +13,7 @@ from pydantic import Field
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
-from fpp_ml_bench.evaluation.result import Interval, Result
+from fpp_ml_bench.evaluation.result import Interval, Result, ends
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text
 from fpp_ml_bench.evaluation.score import caution, object_interval
 from fpp_ml_bench.files import printable
@@ -44,8 +45,7 @@ class Difference(StrictModel):
     @property
     def interval(self) -> tuple[float, float] | None:
         """The interval in mm; None where there is none."""
-        low, high = self.interval_mm
-        return None if low is None or high is None else (low, high)
+        return ends(self.interval_mm)
 
     @property
     def told_apart(self) -> bool:
@@ -86,9 +86,7 @@ def compare(first: Result, second: Result) -> Comparison:
         second=second.submission.name,
         fingerprint=first.dataset.fingerprint,
         split=first.dataset.split,
-        target=first.target,
-        track=first.track,
-        mode=first.mode,
+        **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
         sentence=sentence(*names, summaries[MAIN_KEY]),
         per_sample=paired,
@@ -100,14 +98,10 @@ def _check_same_data(first: Result, second: Result) -> None:
     lines = []
     if a.fingerprint != b.fingerprint or (a.benchmark and b.benchmark and a.benchmark != b.benchmark):
         lines.append(f"dataset: {printable(a.identity)} against {printable(b.identity)}")
-    pairs = {
-        "split": (a.split, b.split),
-        "target": (first.target, second.target),
-        "track": (first.track, second.track),
-        "mode": (first.mode, second.mode),
-        "protocol": (first.protocol_version, second.protocol_version),
-    }
-    lines += [f"{key}: {one} against {other}" for key, (one, other) in pairs.items() if one != other]
+    rules = {"split": "dataset.split", "target": "target", "track": "track", "mode": "mode"}
+    for title, key in {**rules, "protocol": "protocol_version"}.items():
+        one, other = attrgetter(key)(first), attrgetter(key)(second)
+        lines += [f"{title}: {one} against {other}"] if one != other else []
     samples = [sorted((row.sample, row.object_pixels) for row in result.per_sample) for result in (first, second)]
     if samples[0] != samples[1]:
         lines.append("samples: the samples differ")
@@ -139,22 +133,17 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     if not difference.lower and not difference.higher:
         return f"{second} and {first} have the same object MAE in all {difference.samples} samples."
     size = f"{millimetres(abs(difference.mean_mm))} mm"
-    word = "lower" if difference.mean_mm < 0 else "higher"
-    count = difference.lower if difference.mean_mm < 0 else difference.higher
+    word, count = ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
     views = f"{word} in {count} of {difference.samples} samples"
     if difference.interval is None:
-        return (
-            f"{second} has an object MAE {size} {word} than {first} on average, {views}; with one object there is no "
-            "interval, so nothing can be said beyond it."
-        )
-    ends = f"{interval_text(difference.interval)} mm over {difference.objects} objects"
+        no_interval = "with one object there is no interval, so nothing can be said beyond it"
+        return f"{second} has an object MAE {size} {word} than {first} on average, {views}; {no_interval}."
+    between = f"{interval_text(difference.interval)} mm over {difference.objects} objects"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
     if difference.told_apart:
-        return (
-            f"{second} has a {word} object MAE than {first}, by {size} on average (95% interval {ends}), "
-            f"{views}.{few_objects}"
-        )
+        by = f"by {size} on average (95% interval {between})"
+        return f"{second} has a {word} object MAE than {first}, {by}, {views}.{few_objects}"
     return (
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
-        f"but the 95% interval, {ends}, holds 0.{few_objects}"
+        f"but the 95% interval, {between}, holds 0.{few_objects}"
     )

@@ -112,27 +112,18 @@ def sample_panels(
     either = inside | predicted
     ends = f"{low:.0f}", f"{high:.0f} mm"
     limit = f"{millimetres(clip)} mm"
+    truth, prediction = _levels(target_mm, inside, low, high), _levels(prediction_mm, predicted, low, high)
+    absolute, signed = _levels(np.abs(error_mm), either, 0.0, clip), _levels(error_mm, either, -clip, clip)
+    same_scale = f"predicted depth on the same scale; {predicted.mean():.1%} of the image is predicted as object"
+    clipped = f"absolute error, clipped at its 95th percentile over the object, {limit}"
+    near_far = f"prediction minus truth, blue too near, red too far, clipped at {limit}"
     return [
         Panel("Fringe", np.maximum(_subsampled(fringe), 1), "gray", f"{sample}: the captured fringe image"),
-        Panel(
-            "Truth", _levels(target_mm, inside, low, high), "viridis",
-            f"{sample}: true depth, {ends[0]} to {ends[1]}", *ends,
-        ),
-        Panel(
-            "Prediction", _levels(prediction_mm, predicted, low, high), "viridis",
-            f"{sample}: predicted depth on the same scale; {predicted.mean():.1%} of the image is predicted as object",
-            *ends,
-        ),
-        Panel(
-            "Absolute error", _levels(np.abs(error_mm), either, 0.0, clip), "magma",
-            f"{sample}: absolute error, clipped at its 95th percentile over the object, {limit}", "0", limit,
-        ),
-        Panel(
-            "Signed error", _levels(error_mm, either, -clip, clip), "coolwarm",
-            f"{sample}: prediction minus truth, blue too near, red too far, clipped at {limit}",
-            f"-{limit}", f"+{limit}",
-        ),
-    ]  # fmt: skip
+        Panel("Truth", truth, "viridis", f"{sample}: true depth, {ends[0]} to {ends[1]}", *ends),
+        Panel("Prediction", prediction, "viridis", f"{sample}: {same_scale}", *ends),
+        Panel("Absolute error", absolute, "magma", f"{sample}: {clipped}", "0", limit),
+        Panel("Signed error", signed, "coolwarm", f"{sample}: {near_far}", f"-{limit}", f"+{limit}"),
+    ]
 
 
 def _subsampled(image: NDArray) -> NDArray:

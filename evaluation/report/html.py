@@ -4,19 +4,14 @@ A page contains its style, script and pictures. Its Content-Security-Policy allo
 the given hashes: the page sends no request, and an injected script can't run.
 """
 
-from __future__ import annotations
-
 import hashlib
 import html
 from base64 import b64encode
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from fpp_ml_bench.files import NAME_LIMIT, printable
-
-if TYPE_CHECKING:
-    import jinja2
 
 
 def millimetres(value: float | None) -> str:
@@ -85,7 +80,7 @@ def render(package: str, template: str, **values: object) -> str:
 
 
 @cache
-def _environment(package: str) -> jinja2.Environment:
+def _environment(package: str) -> Any:  # a jinja2.Environment
     import jinja2  # plain `fpp-eval` writes no HTML
 
     environment = jinja2.Environment(

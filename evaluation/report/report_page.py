@@ -6,13 +6,13 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
+from fpp_ml_bench.errors import DatasetError, PredictionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, sheet_png
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, page, percent, render, signed
-from fpp_ml_bench.evaluation.result import Result, SampleResult
+from fpp_ml_bench.evaluation.result import Result, SampleResult, write_file
 from fpp_ml_bench.evaluation.score import scored_pair
 from fpp_ml_bench.evaluation.submission import list_folder, reader_for
-from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 REPORT_FILE = "index.html"
@@ -72,22 +72,15 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
         sample_table=Markup(sample_table(result)),
     )
     path = Path(out) / REPORT_FILE
-    _write(path, page(f"{result.submission.name}: report", body).encode("utf-8"))
+    write_file(page(f"{result.submission.name}: report", body).encode("utf-8"), path, new_folder=True)
     return path
 
 
 def write_sheet(result: Result, dataset: DatasetFolder, predictions_folder: str | Path, path: Path) -> None:
     """One PNG of the best, the median and the worst sample, five panels each. Raises what `write_report` raises."""
     chosen = _chosen_panels(result, dataset, Path(predictions_folder))
-    _write(path, sheet_png([panels for place, _, panels in chosen if place in _ON_SHEET]))
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
-    except OSError as error:
-        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+    sheet = sheet_png([panels for place, _, panels in chosen if place in _ON_SHEET])
+    write_file(sheet, path, new_folder=True)
 
 
 def chosen_samples(rows: Iterable[SampleResult]) -> list[tuple[str, SampleResult]]:
@@ -110,10 +103,8 @@ def _chosen_panels(
 ) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
     """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
     if dataset.fingerprint != result.dataset.fingerprint:
-        raise DatasetError(
-            f"{dataset.path}: fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was "
-            "scored; give the dataset that the result names"
-        )
+        difference = f"fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was scored"
+        raise DatasetError(f"{dataset.path}: {difference}; give the dataset that the result names")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
     form = list_folder(folder, samples, result.dataset.split, {}).form
     reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
@@ -125,9 +116,8 @@ def _chosen_panels(
         except PredictionError as error:
             raise PredictionError(f"{reader.named(row.sample)}: {error}") from None
         if digest != row.prediction_sha256:
-            raise PredictionError(
-                f"{reader.named(row.sample)}: is not the file that was scored; score the folder again"
-            )
+            named = reader.named(row.sample)
+            raise PredictionError(f"{named}: is not the file that was scored; score the folder again")
         target_mm = dataset.target_mm(row.sample, result.target)
         prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample)
         try:
@@ -151,14 +141,10 @@ def score_table(result: Result) -> str:
     """Every score of a result: mean over samples with its interval, median over samples, pooled over pixels."""
     rows = []
     for key, title in _TITLES.items():
+        mean, median = (_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
+        interval = interval_text(result.intervals.of(key)) if key in HEADLINE else ""
         pooled = getattr(result.pooled, key, None)
-        rows.append([
-            title,
-            _text(key, getattr(result.metrics, key)),
-            interval_text(result.intervals.of(key)) if hasattr(result.intervals, key) else "",
-            _text(key, getattr(result.median, key)),
-            "" if pooled is None else _text(key, pooled),
-        ])  # fmt: skip
+        rows.append([title, mean, interval, median, "" if pooled is None else _text(key, pooled)])
     caption = "Scores in mm. Mean, its 95% interval over objects, and median over samples; pooled over all pixels"
     return html_table(caption, ("Score", "Mean", "95% interval", "Median", "Pooled"), rows)
 
@@ -167,8 +153,6 @@ def sample_table(result: Result) -> str:
     """Scores of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
     keys = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm", "background_mae_mm", "object_missing_share")
     ordered = sorted(result.per_sample, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))
-    rows = [
-        [row.sample, *(_text(key, getattr(row, key)) for key in keys), row.prediction_sha256[:12]] for row in ordered
-    ]
+    rows = [[r.sample, *(_text(key, getattr(r, key)) for key in keys), r.prediction_sha256[:12]] for r in ordered]
     titles = ["Sample", *(_TITLES[key] for key in keys), "Prediction SHA-256"]
     return html_table("Every sample, the largest object MAE first; mm", titles, rows)

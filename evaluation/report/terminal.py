@@ -5,20 +5,16 @@ Every text from a submission is shown as plain text, never as markup.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from fpp_ml_bench.evaluation import report
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, percent, seconds, signed
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import caution
 from fpp_ml_bench.files import printable
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.report.comparison import Comparison
 
 WORST = 5
 
@@ -30,10 +26,6 @@ def _table(first: str, titles: list[str], **options: str) -> Table:
     for title in titles:
         table.add_column(title, justify="right", no_wrap=True)
     return table
-
-
-def _interval(ends: tuple[float, float] | None) -> str:
-    return interval_text(ends, between="..")
 
 
 def result_table(result: Result) -> Group:
@@ -65,12 +57,8 @@ def _scores(result: Result) -> Table:
         cells = []
         for key in (f"{pixels}_{error}_mm" for error in errors):
             mean, median = (millimetres(getattr(part, key)) for part in (result.metrics, result.median))
-            headline = pixels in PIXEL_SETS
-            interval, pooled = (
-                (_interval(result.intervals.of(key)), millimetres(getattr(result.pooled, key)))
-                if headline
-                else ("", "")
-            )
+            interval = interval_text(result.intervals.of(key), "..") if pixels in PIXEL_SETS else ""
+            pooled = millimetres(getattr(result.pooled, key)) if pixels in PIXEL_SETS else ""
             cells += [mean, interval, median, pooled]
         table.add_row(title, *cells, style="bold" if pixels == "object" else None)
     return table
@@ -103,9 +91,8 @@ def _notes(result: Result) -> Text:
         lines.append("Oracle mask: the method was given which pixels of the scored samples are object.")
     if few_objects := caution(len(result.per_object)):
         lines.append(few_objects)
-    time = f"{seconds(submission.seconds_per_sample)} s ({submission.seconds_source})"
-    if submission.seconds_per_sample is None:
-        time = "unknown time"
+    known = submission.seconds_per_sample is not None
+    time = f"{seconds(submission.seconds_per_sample)} s ({submission.seconds_source})" if known else "unknown time"
     lines.append(f"Frames used: {len(submission.frames_used)}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
@@ -123,7 +110,7 @@ def _worst(result: Result) -> Table | None:
     return table
 
 
-def comparison_table(compared: Comparison) -> Group:
+def comparison_table(compared: report.Comparison) -> Group:
     """The comparison as rich tables."""
     titles = ["Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"]
     table = _table("Error", titles, caption="mm; mean of second - first over samples, 95% interval over objects")
@@ -131,7 +118,7 @@ def comparison_table(compared: Comparison) -> Group:
         pixels, error = key.removesuffix("_mm").split("_")
         counts = (row.lower, row.higher, row.samples, row.objects)
         table.add_row(
-            f"{pixels} {error.upper()}", signed(row.mean_mm), _interval(row.interval), *map(str, counts),
+            f"{pixels} {error.upper()}", signed(row.mean_mm), interval_text(row.interval, ".."), *map(str, counts),
             style="bold" if row.told_apart else None,
         )  # fmt: skip
     title = Text(

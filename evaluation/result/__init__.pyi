@@ -5,6 +5,7 @@ from .file import read_json as read_json
 from .file import read_result as read_result
 from .file import result_content as result_content
 from .file import result_json as result_json
+from .file import write_file as write_file
 from .file import write_json as write_json
 from .file import write_result as write_result
 from .model import Result as Result
@@ -24,3 +25,4 @@ from .parts import SampleResult as SampleResult
 from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
 from .parts import dataset_identity as dataset_identity
+from .parts import ends as ends

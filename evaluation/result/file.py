@@ -41,14 +41,21 @@ def result_json(result: Result) -> bytes:
 
 
 def write_result(result: Result, path: Path) -> None:
-    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
-    write_json(result_content(result), path)
+    """Write the result as `write_file` does."""
+    write_file(result_json(result), path)
 
 
 def write_json(content: Any, path: Path) -> None:
-    """Write plain ``content`` as JSON to ``path``, as `write_result` does."""
+    """Write plain ``content`` as JSON, as `write_file` does."""
+    write_file(_json_bytes(content), path)
+
+
+def write_file(content: bytes, path: Path, new_folder: bool = False) -> None:
+    """Write ``path`` in one step: a reader sees the old file or the new one. SubmissionError where it can't be."""
     try:
-        write_atomically(path, _json_bytes(content))
+        if new_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
 
@@ -86,12 +93,9 @@ def parse_result(content: Any, path: Path) -> Result:
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version not in get_args(SchemaVersion):
         given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
-        raise SubmissionError(
-            f"{file}: expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}; "
-            "score the predictions again with this version's fpp-eval"
-        )
-    result: Result = validate(Result, content, path, "result of fpp-eval")
-    return result
+        expected = f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}"
+        raise SubmissionError(f"{file}: {expected}; score the predictions again with this version's fpp-eval")
+    return validate(Result, content, path, "result of fpp-eval")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -112,7 +116,9 @@ def json_schema(name: str) -> dict[str, Any]:
 
     It lists the keys and what each may hold. Whether averages follow from the samples is checked on reading.
     """
-    models = {"result": Result, "submission": submission.Submission, "comparison": report.Comparison}
+    models: dict[str, type[pydantic.BaseModel]] = {
+        "result": Result, "submission": submission.Submission, "comparison": report.Comparison,
+    }  # fmt: skip
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"fpp-ml-bench {name}, schema version {RESULT_SCHEMA_VERSION}",
@@ -169,7 +175,6 @@ def checkout_commit(folder: Path) -> str | None:
 @cache
 def _scoring_code() -> str:
     """SHA-256 over the source files that compute scores, 64 hex digits."""
-    digest = hashlib.sha256()
-    for path in (_EVALUATION / "protocol.py", *sorted((_EVALUATION / "score").glob("*.py")), Path(depth.__file__)):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
+    files = (_EVALUATION / "protocol.py", *sorted((_EVALUATION / "score").glob("*.py")), Path(depth.__file__))
+    content = (path.name.encode() + b"\0" + path.read_bytes() + b"\0" for path in files)
+    return hashlib.sha256(b"".join(content)).hexdigest()

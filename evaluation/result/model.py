@@ -14,18 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
-from fpp_ml_bench.evaluation.result.parts import (
-    Bootstrap,
-    DatasetInfo,
-    Environment,
-    Headline,
-    Intervals,
-    Metrics,
-    ObjectResult,
-    Reliance,
-    SampleResult,
-    Timing,
-)
+from fpp_ml_bench.evaluation.result import parts
+from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, SampleResult
 from fpp_ml_bench.evaluation.schema import Count, SparseModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
@@ -45,22 +35,22 @@ class Result(SparseModel):
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
     created: str
     submission: Submission
-    dataset: DatasetInfo
+    dataset: parts.DatasetInfo
     target: Target
     mode: Mode
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
     edge_jump_mm: Annotated[float, Field(gt=0)]
     metrics: Metrics
-    intervals: Intervals
+    intervals: parts.Intervals
     median: Metrics
-    pooled: Headline
+    pooled: parts.Headline
     samples_without_object: Count
     samples_without_background: Count
-    per_object: list[ObjectResult] = Field(max_length=100_000)
+    per_object: list[parts.ObjectResult] = Field(max_length=100_000)
     per_sample: list[SampleResult] = Field(max_length=100_000)
-    bootstrap: Bootstrap
+    bootstrap: parts.Bootstrap
     seeds: dict[Text, Count]
-    environment: Environment
+    environment: parts.Environment
     reliance: Reliance | None = None
 
     @property
@@ -68,7 +58,7 @@ class Result(SparseModel):
         return self.submission.track
 
     @property
-    def timing(self) -> Timing | None:
+    def timing(self) -> parts.Timing | None:
         """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
         return self.submission.timing
 
@@ -82,11 +72,10 @@ class Result(SparseModel):
     @model_validator(mode="after")
     def _consistent(self) -> "Result":
         height, width = self.dataset.size
-        if len(self.per_sample) != self.dataset.samples:
-            raise ValueError(
-                f"per_sample holds {len(self.per_sample)} samples, dataset.samples says {self.dataset.samples}"
-            )
-        if len({row.sample for row in self.per_sample}) != len(self.per_sample):
+        count = len(self.per_sample)
+        if count != self.dataset.samples:
+            raise ValueError(f"per_sample holds {count} samples, dataset.samples says {self.dataset.samples}")
+        if len({row.sample for row in self.per_sample}) != count:
             raise ValueError("per_sample names a sample twice")
         if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
@@ -102,22 +91,21 @@ class Result(SparseModel):
 
 def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
     """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
-    per_sample = [SampleResult(**row) for row in rows]
-    return Result(
-        schema_version=protocol.RESULT_SCHEMA_VERSION, per_sample=per_sample, **_derived(per_sample), **fields
-    )
+    per_sample, version = [SampleResult(**row) for row in rows], protocol.RESULT_SCHEMA_VERSION
+    return Result(schema_version=version, per_sample=per_sample, **_derived(per_sample), **fields)
 
 
 def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     """Every key of `Result` that follows from the per-sample scores."""
-    rows, objects = [row.scores() for row in per_sample], [row.object for row in per_sample]
+    rows = [{key: getattr(row, key) for key in METRICS} for row in per_sample]
+    objects = [row.object for row in per_sample]
     inside = combine(*(row.stats("object") for row in per_sample))
     outside = combine(*(row.stats("background") for row in per_sample))
     intervals = intervals_over_objects(rows, objects, protocol.HEADLINE)
     return {
         "metrics": mean_over_samples(rows),
         "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
-        "median": median_over_samples(rows),
+        "median": over_samples(rows, statistics.median),
         "pooled": pooled(inside, outside),
         "samples_without_object": sum(row.object_pixels == 0 for row in per_sample),
         "samples_without_background": sum(row.background_pixels == 0 for row in per_sample),
@@ -126,7 +114,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
                 "object": name,
                 "samples": len(views := [row for row, owner in zip(rows, objects, strict=True) if owner == name]),
                 "metrics": mean_over_samples(views),
-                "spread": _over_samples(views, _deviation),
+                "spread": over_samples(views, _deviation),
             }
             for name in dict.fromkeys(objects)
         ],
@@ -142,15 +130,11 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
 
 def mean_over_samples(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each metric over the samples that have it (paper Section 5.3.2); None where no sample has."""
-    return _over_samples(rows, statistics.fmean)
+    return over_samples(rows, statistics.fmean)
 
 
-def median_over_samples(rows: Sequence[Scores]) -> Scores:
-    """Median of each metric over the samples that have it; None where no sample has."""
-    return _over_samples(rows, statistics.median)
-
-
-def _over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
+def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
+    """A statistic of each metric over the samples that have it; None where no sample has."""
     columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 
@@ -178,13 +162,14 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
     """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
     if row.object_pixels + row.background_pixels != pixels:
         raise ValueError(f"{row.sample}: object and background pixels do not add up to the image's {pixels}")
-    for name in ("object", "background"):
-        stats = row.stats(name)
-        if (stats.pixels == 0) != (stats.mae_mm is None) or (stats.pixels == 0) != (stats.rmse_mm is None):
+    sets = {name: row.stats(name) for name in ("object", "background")}
+    for name, stats in sets.items():
+        mae, rmse = stats.mae_mm, stats.rmse_mm
+        if not (stats.pixels == 0) == (mae is None) == (rmse is None):
             raise ValueError(f"{row.sample}: {name} scores must be null exactly when the set is empty")
-        if stats.mae_mm is not None and stats.rmse_mm is not None and stats.rmse_mm < stats.mae_mm * (1 - AGREES):
+        if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
             raise ValueError(f"{row.sample}: {name} RMSE is below its MAE, which no error has")
-    overall = combine(row.stats("object"), row.stats("background"))
+    overall = combine(*sets.values())
     if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
         raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
     names = ("mae", "median", "p95", "max", "bias", "shift_free_mae", "rmse")
@@ -203,22 +188,19 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
 
 def _check_reliance(reliance: Reliance, submission: Submission) -> None:
     """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
-    weights = submission.settings.get("weights_sha256")
+    weights, units = submission.settings.get("weights_sha256"), submission.units
     if weights != reliance.weights_sha256:
-        raise ValueError(
-            f"reliance was measured on weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}; "
-            "measure it again"
-        )
-    if (reliance.units == "normalised") != (submission.units == "normalised"):
-        raise ValueError(
-            f"reliance is that of an answer in {reliance.units}, scored was one in {submission.units}; measure it again"
-        )
+        pair = f"weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}"
+        raise ValueError(f"reliance was measured on {pair}; measure it again")
+    if (reliance.units == "normalised") != (units == "normalised"):
+        pair = f"an answer in {reliance.units}, scored was one in {units}"
+        raise ValueError(f"reliance is that of {pair}; measure it again")
 
 
 def _check_same(name: str, stored: Any, computed: Any) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
     if isinstance(computed, Mapping):
-        if not isinstance(stored, Mapping) or set(stored) != set(computed):
+        if set(stored) != set(computed):
             raise ValueError(f"{name} does not hold the keys {', '.join(map(str, computed))}")
         for key in computed:
             _check_same(f"{name}.{key}", stored[key], computed[key])
@@ -231,9 +213,9 @@ def _check_same(name: str, stored: Any, computed: Any) -> None:
         # A mean of signed values may cancel to rounding errors, which depend on the machine.
         if not same(stored, computed, rounding=1e-9 if name.endswith("bias_mm") else 0.0):
             raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+    elif stored != computed and name.startswith("samples_without_"):
+        raise ValueError(f"{name} is not the number of such samples, {computed}")
     elif stored != computed:
-        if name.startswith("samples_without_"):
-            raise ValueError(f"{name} is not the number of such samples, {computed}")
         raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
 
 

@@ -1,10 +1,10 @@
 """The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.protocol import METRICS
 from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
@@ -12,6 +12,12 @@ from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+
+
+def ends(interval: Sequence[float | None]) -> tuple[float, float] | None:
+    """The two ends; None where there is no interval."""
+    low, high = interval
+    return None if low is None or high is None else (low, high)
 
 
 class Headline(StrictModel):
@@ -61,9 +67,6 @@ class SampleResult(Metrics):
     object_pixels: Count
     background_pixels: Count
 
-    def scores(self) -> dict[str, float | None]:
-        return {key: getattr(self, key) for key in METRICS}
-
     def stats(self, pixels: str) -> ErrorStats:
         """Errors of the ``object`` or the ``background`` set."""
         count = getattr(self, f"{pixels}_pixels")
@@ -94,8 +97,7 @@ class Intervals(StrictModel):
 
     def of(self, key: str) -> tuple[float, float] | None:
         """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
-        low, high = getattr(self, key, (None, None))
-        return None if low is None or high is None else (low, high)
+        return ends(getattr(self, key, (None, None)))
 
 
 class Bootstrap(StrictModel):
@@ -139,10 +141,8 @@ class DatasetInfo(SparseModel):
         actual = benchmarks.benchmark_of(self.fingerprint)
         if claimed != actual:
             expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""
-            raise ValueError(
-                f"benchmark says {claim[0]} version {claim[1]}, but fingerprint {self.fingerprint[:16]} is "
-                f"{actual.title if actual else 'not that benchmark'}{expected}"
-            )
+            found = f"fingerprint {self.fingerprint[:16]} is {actual.title if actual else 'not that benchmark'}"
+            raise ValueError(f"benchmark says {claim[0]} version {claim[1]}, but {found}{expected}")
         return self
 
     @property
@@ -235,36 +235,22 @@ class RelianceParts(StrictModel):
     the same, allowing whole periods.
     """
 
-    follows_phase: Share | None
-    follows_light: Share | None
-    follows_both: Share | None
-    follows_constant: Share | None
-    change_outline: NonNegative | None
-    change_no_fringe_inside: NonNegative | None
-    change_no_fringe_outside: NonNegative | None
-    change_other_direction: NonNegative | None
-    change_other_pitch: NonNegative | None
-    answered_no_fringe_inside: Share | None
-    answered_no_fringe_outside: Share | None
-    order_free_follows_phase: Share | None
-    order_free_change_outline: NonNegative | None
+    follows_phase: Annotated[Share | None, "follows the phase, within the object, brightness unchanged"]
+    follows_light: Annotated[Share | None, "follows the brightness, phase unchanged"]
+    follows_both: Annotated[Share | None, "follows a moved surface as it would be photographed"]
+    follows_constant: Annotated[Share | None, "follows the phase when all of the object moves"]
+    change_outline: Annotated[NonNegative | None, "changes with another outline"]
+    change_no_fringe_inside: Annotated[NonNegative | None, "changes without fringes inside the object"]
+    change_no_fringe_outside: Annotated[NonNegative | None, "changes without fringes outside the object"]
+    change_other_direction: Annotated[NonNegative | None, "changes with fringes of the other direction"]
+    change_other_pitch: Annotated[NonNegative | None, "changes with fringes of another pitch"]
+    answered_no_fringe_inside: Annotated[Share | None, "share answered without fringes inside"]
+    answered_no_fringe_outside: Annotated[Share | None, "share answered without fringes outside"]
+    order_free_follows_phase: Annotated[Share | None, "follows the phase, whole periods aside"]
+    order_free_change_outline: Annotated[NonNegative | None, "changes with another outline, whole periods aside"]
 
 
-PART_TITLES = {
-    "follows_phase": "follows the phase, within the object, brightness unchanged",
-    "follows_light": "follows the brightness, phase unchanged",
-    "follows_both": "follows a moved surface as it would be photographed",
-    "follows_constant": "follows the phase when all of the object moves",
-    "change_outline": "changes with another outline",
-    "change_no_fringe_inside": "changes without fringes inside the object",
-    "change_no_fringe_outside": "changes without fringes outside the object",
-    "change_other_direction": "changes with fringes of the other direction",
-    "change_other_pitch": "changes with fringes of another pitch",
-    "answered_no_fringe_inside": "share answered without fringes inside",
-    "answered_no_fringe_outside": "share answered without fringes outside",
-    "order_free_follows_phase": "follows the phase, whole periods aside",
-    "order_free_change_outline": "changes with another outline, whole periods aside",
-}
+PART_TITLES: dict[str, str] = {name: field.metadata[0] for name, field in RelianceParts.model_fields.items()}
 """Each part in words."""
 
 
@@ -290,10 +276,9 @@ class Reliance(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Reliance":
-        low, high = self.interval
-        if (low is None) != (high is None):
+        if self.interval.count(None) == 1:
             raise ValueError("interval: expected two numbers or two nulls")
-        if low is not None and high is not None and not 0 <= low <= high <= 1:
+        if (interval := ends(self.interval)) and not 0 <= interval[0] <= interval[1] <= 1:
             raise ValueError("interval: expected 0 <= low <= high <= 1")
         if self.objects > self.samples:
             raise ValueError("objects is above samples")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
+from operator import attrgetter
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple, get_args
@@ -33,7 +34,7 @@ Outcome = tuple[list[str], list[dict[str, Any]]]
 class Rules(NamedTuple):
     """How predictions are read and scored."""
 
-    size: tuple[int, int]
+    target: str
     units: Units
     png_mm_per_level: float | None
     mode: Mode
@@ -72,10 +73,10 @@ def evaluate(
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
-    rules = Rules(dataset.size, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
+    rules = Rules(target, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
     problems, rows = list(listing.problems), []
-    outcomes = _scored(folder, listing, rules, dataset, target) if units in get_args(Units) else ()
-    description: submission.Submission | None = None
+    outcomes = _scored(folder, listing, rules, dataset) if units in get_args(Units) else ()
+    description = None
     if content is not None:
         try:
             description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
@@ -87,13 +88,11 @@ def evaluate(
         problems += file_problems
         rows += file_rows
     if problems:
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        description_problems = [str(description_error)] if description_error else []
-        raise PredictionError(
-            f"{printable(str(folder), 500)} can't be scored, {count}:", description_problems + problems
-        )
-    if description_error or description is None:
-        raise description_error or SubmissionError(f"{printable(str(folder), 500)} has no description")
+        summary = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        lines = [str(description_error), *problems] if description_error else problems
+        raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
+    if description_error:
+        raise description_error
     benchmark = benchmark_of(dataset.fingerprint)
     return result.result_from_rows(
         [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
@@ -120,10 +119,9 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     """The split's samples; refuses arguments that name no folder, target, mode or sample."""
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    if target not in protocol.TARGETS:
-        raise DatasetError(f"expected target {' or '.join(protocol.TARGETS)}, got {printable(target)!r}")
-    if mode not in protocol.MODES:
-        raise DatasetError(f"expected mode {' or '.join(protocol.MODES)}, got {printable(mode)!r}")
+    for name, given, known in (("target", target, protocol.TARGETS), ("mode", mode, protocol.MODES)):
+        if given not in known:
+            raise DatasetError(f"expected {name} {' or '.join(known)}, got {printable(given)!r}")
     if target == "depth_exact" and not dataset.has_exact:
         raise DatasetError(f"{dataset.path}: has no depth_exact (published data has decoded depth only); use depth")
     samples = dataset.samples(split)
@@ -137,45 +135,37 @@ def _checked_submission(
 ) -> submission.Submission:
     """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
     description = submission.check_submission(folder, content)
-    file = printable(str(folder / submission.SUBMISSION_FILE), 500)
     outside = [index for index in description.frames_used if index >= frames]
     if outside:
-        raise SubmissionError(
-            f"{file}: frames_used: expected indices from 0 to {frames - 1} of "
-            f"this dataset's sequence, got {printable(str(outside), 100)}"
-        )
-    if (form == ".png") != (description.png_mm_per_level is not None):
-        raise SubmissionError(
-            f"{file}: png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
-            if form == ".png"
-            else f"{file}: png_mm_per_level is given, but the predictions are {form}; remove the key"
-        )
-    if mode == "paper-individual" and description.units != "normalised":
-        raise SubmissionError(
-            f"{file}: --mode paper-individual scores normalised depth (units: normalised), these are in "
-            f"{description.units}; score them with --mode standard"
-        )
-    return description
+        expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
+        problem = f"frames_used: {expected}, got {printable(str(outside), 100)}"
+    elif form == ".png" and description.png_mm_per_level is None:
+        problem = "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
+    elif form != ".png" and description.png_mm_per_level is not None:
+        problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
+    elif mode == "paper-individual" and description.units != "normalised":
+        scored = "--mode paper-individual scores normalised depth (units: normalised)"
+        problem = f"{scored}, these are in {description.units}; score them with --mode standard"
+    else:
+        return description
+    raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
 
 
-def _scored(
-    folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder, column: str
-) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order; its target is the dataset's ``column``.
+def _scored(folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder) -> Iterator[Outcome]:
+    """Problems and row of each sample that has a prediction, in order.
 
     Work begins with this call, in threads, before the first outcome is taken from the iterator.
     """
-    reader = submission.reader_for(listing.form, folder, listing.present, rules.size, rules.png_mm_per_level)
+    reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, rules.png_mm_per_level)
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = dataset.target_mm(sample, column)
+            target = dataset.target_mm(sample, rules.target)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
-            raise DatasetError(
-                f"{sample}: the target depth holds NaN, infinite or negative values; run: fpp-bench verify"
-            )
+            bad = "NaN, infinite or negative values"
+            raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
         try:
             values, digest = reader.read(sample)
             problems = value_problems(values, target, high, rules.units)
@@ -191,16 +181,7 @@ def _scored(
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
         return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 
-    pool = ThreadPoolExecutor(min(WORKERS, usable_cores()))
-    return _results(pool, [pool.submit(work, sample) for sample in listing.present])
-
-
-def _results(pool: ThreadPoolExecutor, futures: list[Future[Outcome]]) -> Iterator[Outcome]:
-    try:
-        for future in futures:
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, listing.present)
 
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
@@ -219,22 +200,15 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
             "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
         )
     if scored.dataset.fingerprint != dataset.fingerprint:
-        return [
-            f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, "
-            f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
-        ]
+        here = f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
+        return [f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, {here}"]
     again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
+    names = ("dataset.size", "dataset.samples", "edge_jump_mm")
+    pairs = [(name, attrgetter(name)(scored), attrgetter(name)(again), "recomputed") for name in names]
     described, description = scored.submission.model_dump(), again.submission.model_dump()
-    pairs = [
-        ("dataset.size", scored.dataset.size, again.dataset.size, "recomputed"),
-        ("dataset.samples", scored.dataset.samples, again.dataset.samples, "recomputed"),
-        ("edge_jump_mm", scored.edge_jump_mm, again.edge_jump_mm, "recomputed"),
-        *(
-            (f"submission.{key}", described.get(key), description.get(key), f"in {submission.SUBMISSION_FILE}")
-            for key in dict.fromkeys((*described, *description))
-            if key not in _TIME_KEYS
-        ),
-    ]
+    for key in dict.fromkeys((*described, *description)):
+        pair = (None, None) if key in _TIME_KEYS else (described.get(key), description.get(key))
+        pairs.append((f"submission.{key}", *pair, f"in {submission.SUBMISSION_FILE}"))
     problems = [
         f"{name}: {_value_text(stored)} in the result, {_value_text(value)} {origin}"
         for name, stored, value, origin in pairs
@@ -284,11 +258,8 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     depth_mm = dataset.target_mm(median, target)
     skipped = len(samples) * depth_mm.size - sum(boxes.values())
     unread_bytes = len(samples) * (frames + (depths - read) * depth_mm.itemsize) * depth_mm.size
-    seconds = saved_by(
-        lambda: object_near_edges(depth_mm, (edge_band_px, protocol.WIDE_BAND_PX)),
-        depth_mm.size - boxes[median],
-        skipped,
-    )
+    bands = (edge_band_px, protocol.WIDE_BAND_PX)
+    seconds = saved_by(lambda: object_near_edges(depth_mm, bands), depth_mm.size - boxes[median], skipped)
     lines = [
         LeftOut(
             "columns that no score needs", "images", len(samples) * read, len(samples) * (frames + depths - read),

@@ -12,14 +12,14 @@ RMSE is never 0 by underflow.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, METRICS, WIDE_BAND_PX, WITHIN, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, METRICS, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 
 BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
@@ -134,22 +134,11 @@ def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> 
     return _stats_of_sums(pixels, absolute, squares, errors_outside)
 
 
-class Distribution(NamedTuple):
-    """The object's error in mm beyond its mean: order statistics of |e|, shares of pixels, signed means.
-
-    All None for an empty object. ``shift_free_mae_mm`` is the MAE after the median of e has been subtracted.
-    """
-
-    median_mm: float | None = None
-    p95_mm: float | None = None
-    max_mm: float | None = None
-    within: tuple[float | None, ...] = (None,) * len(WITHIN_MM)
-    bias_mm: float | None = None
-    valid_bias_mm: float | None = None
-    shift_free_mae_mm: float | None = None
-
-
 _EDGE, _WIDE, _MISSING = 1, 2, 4
+_SETS = (
+    *PIXEL_SETS, "object_interior", "object_edge", "object_valid", "object_interior_valid", "object_wide_band",
+    "object_wide_interior",
+)  # fmt: skip
 
 
 def _zones(bits: int, value: int) -> property:
@@ -159,15 +148,15 @@ def _zones(bits: int, value: int) -> property:
 
 @dataclass(frozen=True, slots=True)
 class SampleScores:
-    """Scores of one sample: statistics of the background and of the object's zones.
+    """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
 
     A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every score of the object is a union of zones.
+    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones.
     """
 
     background: ErrorStats
     zones: dict[int, ErrorStats]
-    distribution: Distribution
+    distribution: dict[str, float | None]
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
@@ -186,28 +175,17 @@ class SampleScores:
 
     def metrics(self) -> dict[str, float | None]:
         """The keys of ``protocol.METRICS``; None where the pixel set is empty."""
-        whole, interior, spread = self.object, self.interior, self.distribution
-        sets = {
-            "overall": self.overall,
-            "object": whole,
-            "background": self.background,
-            "object_interior": interior,
-            "object_edge": self.edge,
-            "object_valid": self.valid,
-            "object_interior_valid": self.interior_valid,
-            "object_wide_band": self.wide_band,
-            "object_wide_interior": self.wide_interior,
-        }
+        sets: dict[str, ErrorStats] = {name: getattr(self, name.removeprefix("object_")) for name in _SETS}
+        whole, interior = sets["object"].pixels, sets["object_interior"].pixels
         values: dict[str, float | None] = {
-            "object_edge_share": _share(self.edge.pixels, whole.pixels),
-            "object_missing_share": _share(self.missing, whole.pixels),
-            "object_interior_missing_share": _share(interior.pixels - self.interior_valid.pixels, interior.pixels),
-            "object_wide_band_share": _share(self.wide_band.pixels, whole.pixels),
+            "object_edge_share": _share(sets["object_edge"].pixels, whole),
+            "object_missing_share": _share(self.missing, whole),
+            "object_interior_missing_share": _share(interior - sets["object_interior_valid"].pixels, interior),
+            "object_wide_band_share": _share(sets["object_wide_band"].pixels, whole),
         }
         for name, stats in sets.items():
             values |= {f"{name}_mae_mm": stats.mae_mm, f"{name}_rmse_mm": stats.rmse_mm}
-        values |= {f"object_{name}": value for name, value in spread._asdict().items() if name != "within"}
-        values |= dict(zip(WITHIN, spread.within, strict=True))
+        values |= self.distribution
         return {key: values[key] for key in METRICS}
 
 
@@ -230,9 +208,8 @@ def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BA
     ErrorStats(pixels=2, mae_mm=2.0, rmse_mm=2.0)
     """
     if prediction_mm.shape != target_mm.shape or target_mm.ndim != 2 or target_mm.size == 0:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {target_mm.shape} (H, W), got {prediction_mm.shape}"
-        )
+        expected = f"expected a prediction of the target's shape {target_mm.shape} (H, W)"
+        raise PredictionError(f"{expected}, got {prediction_mm.shape}")
     if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
     prediction, target = prediction_mm.ravel(), target_mm.ravel()
@@ -244,7 +221,7 @@ def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BA
         raise PredictionError(NOT_FINITE)
     background = _background_stats(prediction, target, index)
     if not index.size:
-        return SampleScores(background, {}, Distribution())
+        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION))
     missing = depths <= 0
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
@@ -255,24 +232,19 @@ def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BA
     return SampleScores(background, zones, _distribution(errors, missing))
 
 
-def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> Distribution:
+def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float | None]:
+    """The keys of `DISTRIBUTION`, in its order."""
     magnitude = np.abs(errors)
-    within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
+    within = [np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM]
     largest = float(magnitude.max())
     median, p95 = _quantiles(magnitude, 0.5, 0.95)
     signed = errors.copy()
     offset = _quantiles(signed, 0.5)[0]
     np.subtract(errors, offset, out=signed)
     np.abs(signed, out=signed)
-    return Distribution(
-        median_mm=median,
-        p95_mm=p95,
-        max_mm=largest,
-        within=within,
-        bias_mm=mean_of(errors),
-        valid_bias_mm=mean_of(errors[~missing] if missing.any() else errors),
-        shift_free_mae_mm=mean_of(signed),
-    )
+    valid_bias = mean_of(errors[~missing] if missing.any() else errors)
+    values = (median, p95, largest, *within, mean_of(errors), valid_bias, mean_of(signed))
+    return dict(zip(DISTRIBUTION, values, strict=True))
 
 
 def _quantiles(values: Errors, *levels: float) -> list[float]:

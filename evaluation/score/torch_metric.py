@@ -17,14 +17,10 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, WITHIN, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, WITHIN, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
 
-KEYS = (
-    *HEADLINE, "object_valid_mae_mm", "object_missing_share", "object_median_mm", "object_p95_mm", "object_max_mm",
-    *WITHIN, "object_bias_mm", "object_valid_bias_mm", "object_shift_free_mae_mm",
-)  # fmt: skip
-
+KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION)
 SQUARES_VANISH = 1e-140
 """Errors below this have squares below the smallest normal float64."""
 
@@ -68,13 +64,11 @@ class DepthScores(Metric):
 
 
 def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
-    if prediction_mm.shape != target_mm.shape:
-        raise PredictionError(
-            f"expected a prediction of the target's shape {tuple(target_mm.shape)}, got {tuple(prediction_mm.shape)}"
-        )
+    shape, given = tuple(target_mm.shape), tuple(prediction_mm.shape)
+    if given != shape:
+        raise PredictionError(f"expected a prediction of the target's shape {shape}, got {given}")
     if not (prediction_mm.is_floating_point() and target_mm.is_floating_point()):
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
-    shape = tuple(target_mm.shape)
     if target_mm.dim() == 4 and shape[1] == 1:
         prediction_mm, target_mm = prediction_mm[:, 0], target_mm[:, 0]
     if target_mm.dim() != 3 or target_mm[:1].numel() == 0:

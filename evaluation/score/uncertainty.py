@@ -109,9 +109,7 @@ def ranks_with_ties(values: Sequence[float | None], intervals: Sequence[Interval
     >>> ranks_with_ties([1.0, 1.2, 3.0, None], [(0.8, 1.3), (1.1, 1.4), (2.5, 3.5), None])
     [1, 1, 3, None]
     """
-    spans = [
-        None if value is None else (interval if interval is not None else (value, value))
-        for value, interval in zip(values, intervals, strict=True)
-    ]
+    pairs = zip(values, intervals, strict=True)
+    spans = [None if value is None else interval or (value, value) for value, interval in pairs]
     ends = [span[1] for span in spans if span is not None]
     return [None if span is None else 1 + sum(end < span[0] for end in ends) for span in spans]

@@ -12,8 +12,6 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 
 Depth = NDArray[np.floating[Any]]
-
-
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
 """Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
 
@@ -35,10 +33,8 @@ def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, un
         low, high = float(prediction.min()), float(prediction.max())
     largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
     if max(high, -low) > largest:
-        problems.append(
-            f"holds values up to {max(high, -low):.3g} {units} in magnitude; the limit is {largest:g}; write 0 where "
-            "nothing was measured"
-        )
+        values = f"values up to {max(high, -low):.3g} {units} in magnitude"
+        problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
     wrong_unit = _unit_problem(prediction, target_mm, units, high, target_max_mm)
     return [*problems, wrong_unit] if wrong_unit else problems
 
@@ -51,30 +47,24 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     """
     if units == "mm":
         if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
-            return (
-                f"looks like metres or normalised depth: its largest value is {high:.4g}, the target reaches "
-                f"{target_max_mm:.0f} mm; convert it to mm, or declare units: m or normalised in submission.yaml"
-            )
+            reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm:.0f} mm"
+            advice = "convert it to mm, or declare units: m or normalised in submission.yaml"
+            return f"looks like metres or normalised depth: {reach}; {advice}"
         return None
     depths = values[object_mask(target_mm) & (values > 0)]
     if not depths.size:
         return None
     typical = float(np.median(depths))
+    median = f"its median over the object is {typical:.4g}"
     if units == "m" and typical > protocol.METRES_AT_MOST:
-        return (
-            f"does not look like metres: its median over the object is {typical:.4g}; if it is in mm, declare units: "
-            "mm in submission.yaml"
-        )
+        return f"does not look like metres: {median}; if it is in mm, declare units: mm in submission.yaml"
     if units == "m" and high < 1 and target_max_mm > protocol.MILLIMETRES_ABOVE:
-        return (
-            f"does not look like metres: its largest value is {high:.4g}, the target reaches "
-            f"{target_max_mm / MM_PER_M:.2f} m; if it is normalised, declare units: normalised in submission.yaml"
-        )
+        reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm / MM_PER_M:.2f} m"
+        advice = "if it is normalised, declare units: normalised in submission.yaml"
+        return f"does not look like metres: {reach}; {advice}"
     if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
-        return (
-            f"does not look like normalised depth: its median over the object is {typical:.4g}, the target's is at "
-            "most 1; if it is in m or mm, declare that in submission.yaml"
-        )
+        advice = "if it is in m or mm, declare that in submission.yaml"
+        return f"does not look like normalised depth: {median}, the target's is at most 1; {advice}"
     return None
 
 
@@ -99,17 +89,14 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     if not inside.any():
         if mode == "standard" and not values.any():
             return values, target_mm
-        raise DatasetError(
-            f"{sample}: the target holds no object, so normalised depth has no range to go back through; submit mm"
-        )
+        no_range = "the target holds no object, so normalised depth has no range to go back through"
+        raise DatasetError(f"{sample}: {no_range}; submit mm")
     low, high = (float(edge(target_mm[inside])) for edge in (np.min, np.max))
     if mode == "standard":
         depth = values.astype(np.float64) * (high - low) + low
         depth[values == 0] = 0.0
         return depth, target_mm
     if high == low:
-        raise DatasetError(
-            f"{sample}: the target is one flat plane, and individual normalisation divides by its range, 0; score it "
-            "with --mode standard"
-        )
+        flat = "the target is one flat plane, and individual normalisation divides by its range, 0"
+        raise DatasetError(f"{sample}: {flat}; score it with --mode standard")
     return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)

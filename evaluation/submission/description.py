@@ -44,10 +44,9 @@ class Submission(SparseModel):
         if len(set(self.frames_used)) != len(self.frames_used):
             raise ValueError("frames_used names a frame twice")
         if self.units == "normalised" and not self.uses_ground_truth_range:
-            raise ValueError(
-                "units: normalised needs uses_ground_truth_range: true, for normalised depth only becomes mm through "
-                "the range of the very samples it is scored on; submit mm for the metric track"
-            )
+            why = "normalised depth only becomes mm through the range of the very samples it is scored on"
+            needs = "units: normalised needs uses_ground_truth_range: true"
+            raise ValueError(f"{needs}, for {why}; submit mm for the metric track")
         if self.png_mm_per_level is not None and self.units != "mm":
             raise ValueError("png_mm_per_level gives PNG levels in mm, so units must be mm")
         if self.seconds_per_sample is not None and (self.seconds_source is None or self.hardware is None):

@@ -24,10 +24,10 @@ def read_plain(folder: Path) -> dict[Any, Any]:
     """Keys and values of a predictions folder's ``submission.yaml``, their meaning unchecked; else SubmissionError."""
     path = folder / SUBMISSION_FILE
     if path.is_symlink() or not path.is_file():
+        found = "a symbolic link" if path.is_symlink() else "none"
         raise SubmissionError(
-            f"expected a file {printable(str(path), 500)} that describes the predictions, found "
-            f"{'a symbolic link' if path.is_symlink() else 'none'}; "
-            "fpp-bench predict writes one, PROTOCOL.md lists its keys"
+            f"expected a file {printable(str(path), 500)} that describes the predictions, found {found}; fpp-bench "
+            "predict writes one, PROTOCOL.md lists its keys"
         )
     return read_plain_file(path, "'name: My method'")
 
@@ -77,9 +77,8 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     try:
         names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
-        raise PredictionError(
-            f"the predictions folder {printable(str(folder))} can't be read: {error.strerror}"
-        ) from None
+        name = printable(str(folder))
+        raise PredictionError(f"the predictions folder {name} can't be read: {error.strerror}") from None
     counts = {suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE}
     form = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
     if counts[form] == 0:
@@ -125,15 +124,12 @@ def reader_for(
 
         maps = depth_maps(folder / form, samples, size)
         return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
-    if form == ".mat":
-        read = _mat_reader(size)
-    else:
-        memory = local()
-        read = {
-            ".npy": lambda path: read_npy(path, size, memory),
-            ".npz": lambda path: read_npz(path, size),
-            ".png": lambda path: read_png(path, size, png_mm_per_level),
-        }[form]
+    memory = local()
+    read = _mat_reader(size) if form == ".mat" else {
+        ".npy": lambda path: read_npy(path, size, memory),
+        ".npz": lambda path: read_npz(path, size),
+        ".png": lambda path: read_png(path, size, png_mm_per_level),
+    }[form]  # fmt: skip
     return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
 
 

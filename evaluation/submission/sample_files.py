@@ -91,15 +91,10 @@ def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, 
     """Refuse anything but a real float map of ``size``: objects, complex numbers, whole numbers, other shapes."""
     if dtype.hasobject:
         raise PredictionError("holds pickled Python objects, which are never opened; save a float32 array")
-    if dtype.kind == "c":
-        raise PredictionError(f"expected float16, float32 or float64, got {dtype} (complex); save its real depth")
-    if dtype.kind in "iu":
-        raise PredictionError(
-            f"expected float16, float32 or float64, got {dtype}: whole numbers round depth, and wrap around where it "
-            "does not fit; save as float32"
-        )
     if dtype.kind != "f" or dtype.itemsize not in (2, 4, 8):
-        raise PredictionError(f"expected float16, float32 or float64, got {printable(str(dtype), 80)}; save as float32")
+        wrap = ": whole numbers round depth, and wrap around where it does not fit; save as float32"
+        why = {"c": " (complex); save its real depth", "i": wrap, "u": wrap}.get(dtype.kind, "; save as float32")
+        raise PredictionError(f"expected float16, float32 or float64, got {printable(str(dtype), 80)}{why}")
     if tuple(shape) != tuple(size):
         raise PredictionError(f"expected shape {tuple(size)} (H, W), got {_shape_text(shape)}; predict at that size")
 
@@ -128,9 +123,8 @@ def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
     except PredictionError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, RuntimeError) as error:
-        raise PredictionError(
-            f"is no .npz archive, or damaged ({printable(str(error), 80)}); write it with np.savez"
-        ) from None
+        reason = printable(str(error), 80)
+        raise PredictionError(f"is no .npz archive, or damaged ({reason}); write it with np.savez") from None
     return array, hashlib.sha256(content).hexdigest()
 
 
@@ -146,14 +140,11 @@ def _unpacked(archive: zipfile.ZipFile, largest: int) -> bytes:
     if not member.filename.endswith(".npy"):
         raise PredictionError(f"holds {name}, expected one .npy array; write it with np.savez")
     if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
-        raise PredictionError(
-            f"{name} is encrypted or packed in an unusual way; write it with np.savez or np.savez_compressed"
-        )
+        advice = "write it with np.savez or np.savez_compressed"
+        raise PredictionError(f"{name} is encrypted or packed in an unusual way; {advice}")
     if member.file_size > largest:
-        raise PredictionError(
-            f"{name} would unpack to {member.file_size} bytes, expected at most {largest} for a map of this size; "
-            "save one float32 map"
-        )
+        expected = f"expected at most {largest} for a map of this size; save one float32 map"
+        raise PredictionError(f"{name} would unpack to {member.file_size} bytes, {expected}")
     with archive.open(member) as stream:
         content = stream.read(largest + 1)
     if len(content) > largest:
@@ -185,10 +176,8 @@ def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> t
     except (OSError, SyntaxError, ValueError):
         raise PredictionError(f"can't be decoded as a 16-bit grey PNG; {_PNG_ADVICE}") from None
     if levels.max() == PNG_LEVELS:
-        raise PredictionError(
-            f"reaches level {PNG_LEVELS}, where depth above {PNG_LEVELS * mm_per_level:g} mm is cut off; use a larger "
-            "png_mm_per_level"
-        )
+        cut_off = f"where depth above {PNG_LEVELS * mm_per_level:g} mm is cut off"
+        raise PredictionError(f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level")
     return levels.astype(np.float64) * mm_per_level, hashlib.sha256(content).hexdigest()
 
 
@@ -200,10 +189,8 @@ def _png_problem(content: bytes, size: tuple[int, int]) -> str | None:
     if (height, width) != size:
         return f"expected shape {size} (H, W), got ({height}, {width}); predict at that size"
     if bits != 16 or colour != 0 or interlaced:
-        return (
-            f"has {bits} bits per channel, colour type {colour}, interlacing {interlaced}; expected 16, 0 and 0: "
-            + _PNG_ADVICE
-        )
+        kind = f"{bits} bits per channel, colour type {colour}, interlacing {interlaced}"
+        return f"has {kind}; expected 16, 0 and 0: {_PNG_ADVICE}"
     kinds: list[bytes] = []
     packed: list[bytes] = []
     offset = len(_PNG_SIGNATURE)

@@ -60,10 +60,9 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
             chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
             total, values = sum(c.total_uncompressed_size for c in chunks), sum(c.num_values for c in chunks)
             if total > largest or values > most_values:
-                raise PredictionError(
-                    f"would unpack to {total} bytes and {values} values, expected at most {largest} and "
-                    f"{most_values} for this split; write one float32 map per sample"
-                )
+                limit = f"expected at most {largest} and {most_values} for this split"
+                sizes = f"{total} bytes and {values} values"
+                raise PredictionError(f"would unpack to {sizes}, {limit}; write one float32 map per sample")
             schema, batches = file.schema_arrow, file.iter_batches(_ROWS_AT_ONCE, use_threads=False)
         else:
             # An IPC file is an IPC stream between a mark and a footer.
@@ -77,10 +76,8 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
                 batch.validate(full=True)
                 stream.write_batch(batch)
                 if unpacked.tell() > largest:
-                    raise PredictionError(
-                        f"unpacks to more than {largest} bytes, which this split can't need; write one float32 map per "
-                        "sample"
-                    )
+                    too_large = f"unpacks to more than {largest} bytes, which this split can't need"
+                    raise PredictionError(f"{too_large}; write one float32 map per sample")
         return unpacked.getvalue()
     except (PredictionError, MemoryError):
         raise
@@ -91,20 +88,17 @@ def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
 
 def _check_columns(schema: pa.Schema) -> None:
     if sorted(schema.names) != ["depth", "sample"]:
-        raise PredictionError(
-            f"holds the columns {printable(', '.join(schema.names), 120)}; expected sample and depth: {_ADVICE}"
-        )
+        names = printable(", ".join(schema.names), 120)
+        raise PredictionError(f"holds the columns {names}; expected sample and depth: {_ADVICE}")
     if schema.field("sample").type not in (pa.string(), pa.large_string()):
         raise PredictionError(f"column sample: expected text, got {schema.field('sample').type}; {_ADVICE}")
     value = schema.field("depth").type
     while (inner := _item_type(value)) is not None:
         value = inner
     if value not in _FLOATS or value == schema.field("depth").type:
-        depth_type = printable(str(schema.field("depth").type), 80)
-        raise PredictionError(
-            f"column depth: expected lists of float16, float32 or float64, got {depth_type}; whole numbers wrap "
-            f"around, other types are not depth: {_ADVICE}"
-        )
+        given = f"got {printable(str(schema.field('depth').type), 80)}"
+        why = "whole numbers wrap around, other types are not depth"
+        raise PredictionError(f"column depth: expected lists of float16, float32 or float64, {given}; {why}: {_ADVICE}")
 
 
 def _item_type(value: pa.DataType) -> pa.DataType | None:
@@ -119,9 +113,8 @@ def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
     """The row of each sample; refuses a table of other samples."""
     rows = {name: row for row, name in enumerate(names)}
     problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
-    problems += [
-        f"holds {printable(name)}, which is no sample of this split" for name in rows if name not in set(samples)
-    ]
+    foreign = [name for name in rows if name not in set(samples)]
+    problems += [f"holds {printable(name)}, which is no sample of this split" for name in foreign]
     problems += [f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1]
     if problems:
         raise PredictionError(f"{'; '.join(problems[:20])}; write one row for each sample")

@@ -7,14 +7,16 @@ Only the module of the command that runs is imported, and such a module imports 
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import FppBenchError
 
 OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+SPLITS = ("train", "validation", "test", "all")
+Command = ModuleType | SimpleNamespace
 
 EXTRAS = {
     "train": ("torch", "torchmetrics", "accelerate", "safetensors"),
@@ -59,7 +61,7 @@ def _formatter(prog: str) -> argparse.HelpFormatter:
     return argparse.RawDescriptionHelpFormatter(prog, max_help_position=30, width=110)
 
 
-def parser_for(command: ModuleType, prog: str) -> argparse.ArgumentParser:
+def parser_for(command: Command, prog: str) -> argparse.ArgumentParser:
     """Argument parser of one command module."""
     parser = argparse.ArgumentParser(
         prog=prog,
@@ -72,39 +74,33 @@ def parser_for(command: ModuleType, prog: str) -> argparse.ArgumentParser:
     return parser
 
 
-def run_command(command: ModuleType, prog: str, argv: Sequence[str]) -> int:
-    """Parse ``argv`` and run the command; expected errors become a message and an exit status."""
+def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
+    """Parse ``argv`` and run the command; an error of this package, an unreadable file or Ctrl-C becomes a message."""
     args = parser_for(command, prog).parse_args(argv)
-    return guarded(lambda: command.run(args), prog)
-
-
-def guarded(run: Callable[[], int], prog: str) -> int:
-    """Exit status of ``run``; an error of this package, an unreadable file or Ctrl-C becomes a message."""
     try:
-        return run()
+        return int(command.run(args))
     except FppBenchError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _refused(prog, error)
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)
         if extra is None:
             raise
-        print(
-            f"{prog}: error: this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'",
-            file=sys.stderr,
-        )
-        return BAD_INPUT
+        return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
     except BrokenPipeError:
         # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
         sys.stdout = None  # type: ignore[assignment]
         return BAD_INPUT
     except OSError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _refused(prog, error)
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         return INTERRUPTED
+
+
+def _refused(prog: str, problem: object) -> int:
+    print(f"{prog}: error: {problem}", file=sys.stderr)
+    return BAD_INPUT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,16 +123,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
     args, unknown = parser.parse_known_args(arguments)
     if unknown and unknown[0] == arguments[0]:
-        print(
-            f"fpp-bench: error: unknown option {arguments[0]!r} before a command; see fpp-bench --help", file=sys.stderr
-        )
-        return BAD_INPUT
+        return _refused("fpp-bench", f"unknown option {arguments[0]!r} before a command; see fpp-bench --help")
     if args.command is not None:
         from difflib import get_close_matches
 
         matches = get_close_matches(args.command, COMMANDS, n=1)
         hint = f"; did you mean {matches[0]!r}?" if matches else f"; there are {', '.join(COMMANDS)}"
-        print(f"fpp-bench: error: unknown command {args.command!r}{hint}", file=sys.stderr)
-        return BAD_INPUT
+        return _refused("fpp-bench", f"unknown command {args.command!r}{hint}")
     parser.print_help(sys.stderr if not arguments else sys.stdout)
     return BAD_INPUT

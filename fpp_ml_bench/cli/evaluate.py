@@ -3,12 +3,11 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
-from typing import NamedTuple, cast
+from types import SimpleNamespace
 
-from fpp_ml_bench.cli import CHECK_FAILED, OK, run_command
+from fpp_ml_bench.cli import CHECK_FAILED, OK, SPLITS, run_command
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import report, result, score
@@ -29,43 +28,23 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    parser.add_argument(
-        "folder",
-        type=Path,
-        metavar="DIR",
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR",
         help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
         "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
-        "every problem is listed by file, and then no JSON is written",
-    )
-    parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
-    parser.add_argument(
-        "--split",
-        choices=("train", "validation", "test", "all"),
-        default="test",
-        help="samples to score (default: test)",
-    )
-    parser.add_argument(
-        "--target",
-        choices=TARGETS,
-        default=TARGETS[0],
+        "every problem is listed by file, and then no JSON is written")  # fmt: skip
+    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
+    add("--split", choices=SPLITS, default="test", help="samples to score (default: test)")
+    add("--target", choices=TARGETS, default=TARGETS[0],
         help="depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
-    )
-    parser.add_argument(
-        "--edge-band",
-        type=_band,
-        default=EDGE_BAND_PX,
-        metavar="PX",
-        help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=MODES,
-        default=MODES[0],
+    )  # fmt: skip
+    add("--edge-band", type=_band, default=EDGE_BAND_PX, metavar="PX",
+        help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})")  # fmt: skip
+    add("--mode", choices=MODES, default=MODES[0],
         help="standard: mm, object where depth is above 0 (default); paper-individual: the paper's rule for its "
-        "individually normalised rows, for units: normalised only, never ranked with the others",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
-    parser.add_argument("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
+        "individually normalised rows, for units: normalised only, never ranked with the others")  # fmt: skip
+    add("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
+    add("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
     add_explain_options(parser)
 
 
@@ -78,81 +57,53 @@ def _band(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Score, write the JSON if requested, print the table. Raises FppBenchError for anything that can't be scored."""
     with as_asked(args):
-        return _run(args)
+        prepare_process()
+        _check_outputs(args.json, args.report, args.folder)
+        dataset = storage.DatasetFolder(args.dataset)
+        scored = score.evaluate(
+            args.folder, dataset, args.split, args.target, args.edge_band, args.mode,
+            while_scoring=lambda: report.result_table,
+        )  # fmt: skip
+        if args.json is not None:
+            result.write_result(scored, args.json)
+        from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
 
-
-def _run(args: argparse.Namespace) -> int:
-    prepare_process()
-    if args.json is not None:
-        _check_output(args.json, args.folder)
-    if args.report is not None:
-        _check_report(args.report, args.folder)
-    dataset = storage.DatasetFolder(args.dataset)
-    scored = score.evaluate(
-        args.folder,
-        dataset,
-        args.split,
-        args.target,
-        args.edge_band,
-        args.mode,
-        while_scoring=lambda: report.result_table,
-    )
-    if args.json is not None:
-        result.write_result(scored, args.json)
-    from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
-
-    show(report.result_table(scored))
-    if args.report is not None:
-        report.write_report(scored, dataset, args.folder, args.report)
-    for written in (args.json, args.report):
-        if written is not None:
-            print(f"Written: {written}")
-    has_expected_bytes, sentence = storage.benchmark_sentence(dataset.manifest)
-    if not has_expected_bytes:
-        print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
-    explain(args, lambda: score.explain_eval(dataset, args.split, args.target, args.edge_band))
+        show(report.result_table(scored))
+        if args.report is not None:
+            report.write_report(scored, dataset, args.folder, args.report)
+        for written in (args.json, args.report):
+            if written is not None:
+                print(f"Written: {written}")
+        has_expected_bytes, sentence = storage.benchmark_sentence(dataset.manifest)
+        if not has_expected_bytes:
+            print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
+        explain(args, lambda: score.explain_eval(dataset, args.split, args.target, args.edge_band))
     return OK
 
 
-def _check_output(path: Path, folder: Path) -> None:
-    """Refuse, before any work, a JSON file that can't be written or would be an extra file among the predictions."""
-    if path.is_dir():
-        raise SubmissionError(f"--json {path}: expected a file to write, found a folder")
-    if not path.absolute().parent.is_dir():
-        raise SubmissionError(f"--json {path}: the folder {path.parent} does not exist; make it first")
-    if path.absolute().parent.resolve() == folder.resolve():
-        raise SubmissionError(
-            f"--json {path}: is inside the predictions folder, where it would be an extra file; move it out"
-        )
-
-
-def _check_report(path: Path, folder: Path) -> None:
-    if path.is_file():
-        raise SubmissionError(f"--report {path}: expected a folder to write into, found a file")
-    if path.resolve().is_relative_to(folder.resolve()):
-        raise SubmissionError(
-            f"--report {path}: is inside the predictions folder, where it would be an extra file; move it"
-        )
-
-
-class Subcommand(NamedTuple):
-    """What `run_command` needs of a command."""
-
-    SUMMARY: str
-    EXAMPLES: tuple[str, ...]
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
+def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
+    """Refuse, before any work, what can't be written or would be an extra file among the predictions."""
+    inside = "is inside the predictions folder, where it would be an extra file; move it"
+    if file is not None:
+        if file.is_dir():
+            raise SubmissionError(f"--json {file}: expected a file to write, found a folder")
+        if not file.absolute().parent.is_dir():
+            raise SubmissionError(f"--json {file}: the folder {file.parent} does not exist; make it first")
+        if file.absolute().parent.resolve() == folder.resolve():
+            raise SubmissionError(f"--json {file}: {inside} out")
+    if page is not None:
+        if page.is_file():
+            raise SubmissionError(f"--report {page}: expected a folder to write into, found a file")
+        if page.resolve().is_relative_to(folder.resolve()):
+            raise SubmissionError(f"--report {page}: {inside}")
 
 
 def _compare_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
-    parser.add_argument(
-        "second",
-        type=Path,
-        metavar="B.json",
-        help="a result of another method on the same data, split, target and track",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
+    add = parser.add_argument
+    add("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
+    add("second", type=Path, metavar="B.json",
+        help="a result of another method on the same data, split, target and track")  # fmt: skip
+    add("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
 
 
 def _compare(args: argparse.Namespace) -> int:
@@ -168,12 +119,9 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _schema_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "file",
-        nargs="?",
-        choices=("result", "submission", "comparison"),
-        default="result",
+        "file", nargs="?", choices=("result", "submission", "comparison"), default="result",
         help="result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
-    )
+    )  # fmt: skip
 
 
 def _schema(args: argparse.Namespace) -> int:
@@ -208,25 +156,23 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 SUBCOMMANDS = {
-    "compare": Subcommand(
-        "Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence.",
-        ("fpp-eval compare a.json b.json", "fpp-eval compare a.json b.json --json difference.json"),
-        _compare_arguments,
-        _compare,
+    "compare": SimpleNamespace(
+        SUMMARY="Compare two results of the same samples: paired differences, their 95% intervals, and a plain "
+        "sentence.",
+        EXAMPLES=("fpp-eval compare a.json b.json", "fpp-eval compare a.json b.json --json difference.json"),
+        add_arguments=_compare_arguments, run=_compare,
     ),
-    "verify": Subcommand(
-        "Score the predictions again and say whether the result is verified (exit status 0) or not (1).",
-        ("fpp-eval verify result.json predictions --dataset data/mini",),
-        _verify_arguments,
-        _verify,
+    "verify": SimpleNamespace(
+        SUMMARY="Score the predictions again and say whether the result is verified (exit status 0) or not (1).",
+        EXAMPLES=("fpp-eval verify result.json predictions --dataset data/mini",),
+        add_arguments=_verify_arguments, run=_verify,
     ),
-    "schema": Subcommand(
-        "Print the JSON Schema (2020-12) of result.json or of submission.yaml.",
-        ("fpp-eval schema > result.schema.json", "fpp-eval schema submission"),
-        _schema_arguments,
-        _schema,
+    "schema": SimpleNamespace(
+        SUMMARY="Print the JSON Schema (2020-12) of result.json or of submission.yaml.",
+        EXAMPLES=("fpp-eval schema > result.schema.json", "fpp-eval schema submission"),
+        add_arguments=_schema_arguments, run=_schema,
     ),
-}
+}  # fmt: skip
 """First words that select a subcommand. A folder of such a name is given as ./compare."""
 
 
@@ -234,5 +180,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``fpp-eval``: exit status 0, 1 where ``verify`` finds a difference, 2 with the error on stderr."""
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in SUBCOMMANDS:
-        return run_command(cast(ModuleType, SUBCOMMANDS[words[0]]), f"fpp-eval {words[0]}", words[1:])
+        return run_command(SUBCOMMANDS[words[0]], f"fpp-eval {words[0]}", words[1:])
     return run_command(sys.modules[__name__], "fpp-eval", words)

@@ -1,17 +1,16 @@
 """``fpp-bench publish``: the dataset, the leaderboard's page or results on the Hugging Face Hub."""
 
+from __future__ import annotations
+
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from fpp_ml_bench import leaderboard, loaders
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.hub import Hub, Kind, Publication, Remote
 
 SUMMARY = "Publish a dataset, the leaderboard's page or results on the Hugging Face Hub; sends only what changed."
 EXAMPLES = (
@@ -27,43 +26,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
 
-    dataset = _part(kinds, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
-    dataset.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
-    dataset.add_argument("--private", action="store_true", help="make the repository private if it is new")
-    dataset.add_argument("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
-    dataset.add_argument(
-        "--staging", type=Path, metavar="DIR",
+    add = _part(kinds, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
+    add("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
+    add("--private", action="store_true", help="make the repository private if it is new")
+    add("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
+    add("--staging", type=Path, metavar="DIR",
         help="put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
     )  # fmt: skip
 
-    page = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
-    page.add_argument(
-        "results", type=Path, nargs="*", metavar="RESULT.json",
-        help="result or row files, or folders of them (default: the rows shipped with the package)",
-    )  # fmt: skip
-    page.add_argument("--page", type=Path, metavar="DIR", help="an existing page instead of results")
-    page.add_argument("--private", action="store_true", help="make the Space private if it is new")
-    page.add_argument("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")
+    add = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
+    add("results", type=Path, nargs="*", metavar="RESULT.json",
+        help="result or row files, or folders of them (default: the rows shipped with the package)")  # fmt: skip
+    add("--page", type=Path, metavar="DIR", help="an existing page instead of results")
+    add("--private", action="store_true", help="make the Space private if it is new")
+    add("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")
 
-    results = _part(kinds, "results", "results as .eval_results/*.yaml of a model's repository", adopt=False)
-    results.add_argument("results", type=Path, nargs="+", metavar="RESULT.json", help="result files of fpp-eval")
-    results.add_argument(
-        "--dataset-repo", required=True, metavar="OWNER/NAME", help="published dataset that the results were scored on"
-    )
-    results.add_argument("--source-url", metavar="URL", help="https address where the results come from")
+    add = _part(kinds, "results", "results as .eval_results/*.yaml of a model's repository", adopt=False)
+    add("results", type=Path, nargs="+", metavar="RESULT.json", help="result files of fpp-eval")
+    add("--dataset-repo", required=True, metavar="OWNER/NAME", help="published dataset that the results were scored on")
+    add("--source-url", metavar="URL", help="https address where the results come from")
 
 
-def _part(kinds: "argparse._SubParsersAction", name: str, summary: str, adopt: bool = True) -> argparse.ArgumentParser:
-    part: argparse.ArgumentParser = kinds.add_parser(
-        name, help=summary, description=f"Publish {summary}.", allow_abbrev=False
-    )
-    part.add_argument("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
-    part.add_argument("--dry-run", action="store_true", help="print what would change and send nothing")
+def _part(
+    kinds: argparse._SubParsersAction, name: str, summary: str, adopt: bool = True
+) -> Callable[..., argparse.Action]:
+    add = kinds.add_parser(name, help=summary, description=f"Publish {summary}.", allow_abbrev=False).add_argument
+    add("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
+    add("--dry-run", action="store_true", help="print what would change and send nothing")
     if adopt:
-        part.add_argument(
-            "--adopt", action="store_true", help="publish into a repository that was not filled by this command"
-        )
-    return part
+        add("--adopt", action="store_true", help="publish into a repository that was not filled by this command")
+    return add  # type: ignore[no-any-return]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     return steps[args.what](args, loaders.hub.Hub())
 
 
-def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
+def _dataset(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
     from fpp_ml_bench.cli.console import progress_bar
 
     dataset = loaders.DatasetFolder(args.dataset)
@@ -86,9 +78,8 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
     with loaders.hub_dataset.staging_folder(args.staging, dataset.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                publication = loaders.hub_dataset.stage_dataset(
-                    dataset, args.repo, folder, texts, usable_cores(), advance
-                )
+                stage = loaders.hub_dataset.stage_dataset
+                publication = stage(dataset, args.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some space, or give a "
@@ -97,7 +88,7 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, remote)
 
 
-def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
+def _leaderboard(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
     if args.page is not None and args.results:
         raise PublishError("expected result files or --page, got both; give one of them")
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
@@ -108,7 +99,7 @@ def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, _remote(args, hub, "space"))
 
 
-def _results(args: argparse.Namespace, hub: "Hub") -> int:
+def _results(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
     remote = _remote(args, hub, "model")
     dataset = hub.state("dataset", args.dataset_repo)
     about = hub.mark("dataset", args.dataset_repo, dataset)
@@ -118,7 +109,7 @@ def _results(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, remote)
 
 
-def _remote(args: argparse.Namespace, hub: "Hub", kind: "Kind") -> "Remote":
+def _remote(args: argparse.Namespace, hub: loaders.hub.Hub, kind: loaders.hub.Kind) -> loaders.hub.Remote:
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if args.dry_run else hub.check_token()
     remote = hub.state(kind, args.repo)
@@ -131,7 +122,9 @@ def _remote(args: argparse.Namespace, hub: "Hub", kind: "Kind") -> "Remote":
     return remote
 
 
-def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication", remote: "Remote") -> int:
+def _carry_out(
+    args: argparse.Namespace, hub: loaders.hub.Hub, publication: loaders.hub.Publication, remote: loaders.hub.Remote
+) -> int:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
     from fpp_ml_bench.cli.console import gigabytes, progress_bar
 
@@ -147,11 +140,9 @@ def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication",
     bytes_of = {status: [change.bytes for change in planned if change.status == status] for status in _SIGNS}
     counts = [f"{len(sizes)} {status} ({gigabytes(sum(sizes))})" for status, sizes in bytes_of.items() if sizes]
     print(f"{len(planned)} files: {', '.join(counts)}")
-    if all(change.status == "unchanged" for change in planned):
-        print("Nothing to send: the Hub has all files.")
-        return 0
-    if args.dry_run:
-        print("Dry run: nothing was sent.")
+    nothing = all(change.status == "unchanged" for change in planned)
+    if nothing or args.dry_run:
+        print("Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent.")
         return 0
     with progress_bar("sending", sum(bytes_of["new"] + bytes_of["changed"]), "bytes") as advance:
         url = hub.send(publication, planned, remote, private, advance)

@@ -1,11 +1,14 @@
 """``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical bounds."""
 
+from __future__ import annotations
+
 import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from fpp_ml_bench.baselines import stability
+from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.errors import StabilityError
 
 SUMMARY = "Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds."
@@ -19,23 +22,17 @@ _GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics",
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--group", action="append", choices=_GROUPS, metavar="GROUP",
-        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write index.html, stability.json and stability.png here"
-    )
-    parser.add_argument("--json", action="store_true", help="print the run as JSON instead of a table")
-    parser.add_argument(
-        "--quick", action="store_true", help="leave out the case that needs gigabytes (10 million triangles)"
-    )
-    parser.add_argument("--list", action="store_true", help="list the cases and their bounds, and run none")
+    add = parser.add_argument
+    add("--group", action="append", choices=_GROUPS, metavar="GROUP",
+        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)")  # fmt: skip
+    add("--out", type=Path, metavar="DIR", help="write index.html, stability.json and stability.png here")
+    add("--json", action="store_true", help="print the run as JSON instead of a table")
+    add("--quick", action="store_true", help="leave out the case that needs gigabytes (10 million triangles)")
+    add("--list", action="store_true", help="list the cases and their bounds, and run none")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the cases; 1 if any FAILs."""
-    from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import progress_bar, show
 
     groups = [group for group in _GROUPS if group in (args.group or _GROUPS)]
@@ -43,8 +40,7 @@ def run(args: argparse.Namespace) -> int:
         raise StabilityError(f"--out {args.out}: expected a folder or a new path, got a file")
     cases = stability.all_cases(groups, quick=args.quick)
     if args.list:
-        _list(cases)
-        return OK
+        return _list(cases)
     with progress_bar("stability", len(cases), "cases") as advance:
         rows = stability.run_cases(cases, lambda _: advance(1))
     written = [] if args.out is None else stability.write_report(rows, args.out)
@@ -57,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     return CHECK_FAILED if any(row.verdict is stability.Verdict.FAIL for row in rows) else OK
 
 
-def _show(rows: "Sequence[stability.Row]") -> None:
+def _show(rows: Sequence[stability.Row]) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -78,7 +74,7 @@ def _show(rows: "Sequence[stability.Row]") -> None:
             show(Text(f"FAIL {row.case.group}: {row.case.name}: {row.against}"))
 
 
-def _list(cases: "Sequence[stability.Case]") -> None:
+def _list(cases: Sequence[stability.Case]) -> int:
     from rich.text import Text
 
     from fpp_ml_bench.cli.console import show
@@ -90,3 +86,4 @@ def _list(cases: "Sequence[stability.Case]") -> None:
         show(Text(f"{group}: {family} ({1 + len(others)}): {case.computes}; against {case.reference}"))
         show(Text(f"    bound: {case.predicts}"))
     show(Text(f"{len(cases)} cases"))
+    return OK
