@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench import __version__
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.mat_files import read_matrix, read_scalar
+from fpp_ml_bench.loaders.published.files import read_grey_png, read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
-from fpp_ml_bench.loaders.published.png import read_grey_png
 from fpp_ml_bench.loaders.published.tree import (
     INFO_VARIABLES,
     VARIABLES,

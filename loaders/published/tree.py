@@ -12,7 +12,7 @@ from pathlib import Path
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.png import read_png_size
+from fpp_ml_bench.loaders.published.files import read_png_size
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"

@@ -10,14 +10,13 @@ import numpy as np
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import GENERATED, Assembly, Manifest, Progress, ShardPlan, assemble, plan_shards
+from fpp_ml_bench.loaders.storage import MESH_FOLDER, Assembly, Manifest, Progress, ShardPlan
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
-
-MESH_FOLDER = "meshes"
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,14 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
             if user_splits.get(name, split_of(name)) == split
         }
         if objects:
-            plans += plan_shards(split, objects)
+            plans += storage.plan_shards(split, objects)
     return plans
 
 
 def assembly_of(settings: BuildSettings) -> Assembly:
     """What there is to do for a build, and its manifest so far."""
     manifest = Manifest(
-        origin=GENERATED,
+        origin=storage.GENERATED,
         generator={"name": "fpp-ml-bench", "version": __version__},
         settings=settings.describe(),
         rig=settings.rig.to_dict(),
@@ -76,7 +75,7 @@ def build(folder: Path, settings: BuildSettings, workers: int, progress: Progres
 
     Raises `BuildError` (folder in use, other settings, disk full) and `MeshError` (an object does not fit).
     """
-    return assemble(folder, assembly_of(settings), workers, progress)
+    return storage.assemble(folder, assembly_of(settings), workers, progress)
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
@@ -84,7 +83,7 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
 
     Raises `BuildError` for a dataset of an earlier version, which counted something else.
     """
-    if manifest.origin != GENERATED:
+    if manifest.origin != storage.GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
     if any("shadow_rays" not in row for row in rows):
