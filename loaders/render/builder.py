@@ -46,26 +46,19 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
     user_splits = {mesh.name: mesh.split for mesh in settings.user_meshes}
     plans = []
     for split in SPLITS:
-        objects = {
-            name: [(sample_name(name, view), name, view) for view in VIEWS]
-            for name in settings.objects
-            if user_splits.get(name, split_of(name)) == split
-        }
-        if objects:
+        names = [name for name in settings.objects if user_splits.get(name, split_of(name)) == split]
+        if names:
+            objects = {name: [(sample_name(name, view), name, view) for view in VIEWS] for name in names}
             plans += storage.plan_shards(split, objects)
     return plans
 
 
 def assembly_of(settings: BuildSettings) -> Assembly:
     """What there is to do for a build, and its manifest so far."""
+    rig, generator = settings.rig, {"name": "fpp-ml-bench", "version": __version__}
+    size = rig.camera.height, rig.camera.width
     manifest = Manifest(
-        origin=storage.GENERATED,
-        generator={"name": "fpp-ml-bench", "version": __version__},
-        settings=settings.describe(),
-        rig=settings.rig.to_dict(),
-        size=(settings.rig.camera.height, settings.rig.camera.width),
-        stored=settings.stored,
-        exact=True,
+        storage.GENERATED, generator, settings.describe(), rig.to_dict(), size, settings.stored, exact=True
     )
     return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 

@@ -55,10 +55,8 @@ class Assembly:
 
     def key(self) -> dict[str, Any]:
         """Settings that must be equal for a run to resume in this folder."""
-        content = asdict(self.manifest)
-        return {
-            name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
-        }
+        names = ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
+        return {name: getattr(self.manifest, name) for name in names}
 
     def writer(self, folder: Path, scratch: Path) -> ShardWriter:
         """The writer of this dataset's shards."""
@@ -67,18 +65,16 @@ class Assembly:
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset. Returns the manifest at the end.
+    """Write or finish the dataset, and return its manifest.
 
-    ``progress`` is called with numbers of finished rows: first the rows of an interrupted run, then each new row. It is
-    not called when the dataset is already finished.
-
+    ``progress`` is called with numbers of finished rows, first those of an interrupted run; not for a finished dataset.
     Raises `BuildError` when the folder is in use, holds other files, or can't be written.
     """
     try:
         with writing(folder) as scratch:
             if (folder / MANIFEST).exists():
                 manifest = DatasetFolder(folder).manifest  # every file is there, in full length
-                _compare(folder, {key: asdict(manifest)[key] for key in assembly.key()}, assembly.key())
+                _compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
                 return manifest
             return _assemble(folder, scratch, assembly, workers, progress)
     except OSError as error:

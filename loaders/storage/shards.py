@@ -24,17 +24,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.sample import (
-    DATA_GROUP,
-    DEPTH,
-    DEPTH_EXACT,
-    LABELS,
-    RANGE,
-    Row,
-    features,
-    group_columns,
-    stored_groups,
-)
+from fpp_ml_bench.loaders import sample as layout
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.optics import Sequence
 
@@ -85,7 +76,7 @@ class DirectFile:
             pending.result()
 
     def flush(self) -> None:
-        """Does nothing: full blocks are written at once, and `close` writes the rest."""
+        """Does nothing, but pyarrow calls it."""
 
     def close(self) -> None:
         """Write the rest and wait until everything is on the disk."""
@@ -171,9 +162,9 @@ def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> l
     count = max(1, len(names) // OBJECTS_PER_SHARD)
     plans, first_row = [], 0
     for index, chunk in enumerate(np.array_split(np.arange(len(names)), count)):
-        samples = tuple(sample for i in chunk for sample in objects[names[i]])
-        plans.append(ShardPlan(split, index, count, first_row, samples))
-        first_row += len(samples)
+        rows = tuple(sample for i in chunk for sample in objects[names[i]])
+        plans.append(ShardPlan(split, index, count, first_row, rows))
+        first_row += len(rows)
     return plans
 
 
@@ -183,8 +174,7 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
     Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
     metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
     """
-    fields = []
-    described = features(columns, size)
+    fields, described = [], layout.features(columns, size)
     types = {"string": pa.string(), "float32": pa.float32(), "uint8": pa.uint8()}
     for name, feature in described.items():
         kind = types[feature["dtype"]]
@@ -210,9 +200,9 @@ class ShardWriter:
         self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
     ) -> None:
         self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
-        self._groups = stored_groups(sequence, stored)
+        self._groups = layout.stored_groups(sequence, stored)
         self._schemas = {
-            group: arrow_schema(group_columns(sequence, group, frames, exact), size)
+            group: arrow_schema(layout.group_columns(sequence, group, frames, exact), size)
             for group, frames in self._groups.items()
         }
         self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
