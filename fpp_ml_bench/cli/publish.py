@@ -3,15 +3,12 @@
 import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from fpp_ml_bench import leaderboard, loaders
+from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.hub import Hub, Kind, Publication, Remote
 
 SUMMARY = "Publish a dataset, the leaderboard's page or results on the Hugging Face Hub; sends only what changed."
 EXAMPLES = (
@@ -24,45 +21,37 @@ _SIGNS = {"new": "+", "changed": "~", "deleted": "-", "unchanged": " "}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
     kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
 
     dataset = _part(kinds, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
     dataset.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
     dataset.add_argument("--private", action="store_true", help="make the repository private if it is new")
     dataset.add_argument("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
-    dataset.add_argument(
-        "--staging", type=Path, metavar="DIR",
-        help="put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
-    )  # fmt: skip
+    kept = "put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)"
+    dataset.add_argument("--staging", type=Path, metavar="DIR", help=kept)
 
     page = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
-    page.add_argument(
-        "results", type=Path, nargs="*", metavar="RESULT.json",
-        help="result or row files, or folders of them (default: the rows shipped with the package)",
-    )  # fmt: skip
+    rows = "result or row files, or folders of them (default: the rows shipped with the package)"
+    page.add_argument("results", type=Path, nargs="*", metavar="RESULT.json", help=rows)
     page.add_argument("--page", type=Path, metavar="DIR", help="an existing page instead of results")
     page.add_argument("--private", action="store_true", help="make the Space private if it is new")
     page.add_argument("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")
 
     results = _part(kinds, "results", "results as .eval_results/*.yaml of a model's repository", adopt=False)
     results.add_argument("results", type=Path, nargs="+", metavar="RESULT.json", help="result files of fpp-eval")
-    results.add_argument(
-        "--dataset-repo", required=True, metavar="OWNER/NAME", help="published dataset that the results were scored on"
-    )
+    results.add_argument("--dataset-repo", required=True, metavar="OWNER/NAME",
+                         help="published dataset that the results were scored on")  # fmt: skip
     results.add_argument("--source-url", metavar="URL", help="https address where the results come from")
 
 
 def _part(kinds: "argparse._SubParsersAction", name: str, summary: str, adopt: bool = True) -> argparse.ArgumentParser:
-    part: argparse.ArgumentParser = kinds.add_parser(
-        name, help=summary, description=f"Publish {summary}.", allow_abbrev=False
-    )
+    description = f"Publish {summary}."
+    part: argparse.ArgumentParser = kinds.add_parser(name, help=summary, description=description, allow_abbrev=False)
     part.add_argument("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
     part.add_argument("--dry-run", action="store_true", help="print what would change and send nothing")
     if adopt:
-        part.add_argument(
-            "--adopt", action="store_true", help="publish into a repository that was not filled by this command"
-        )
+        adopting = "publish into a repository that was not filled by this command"
+        part.add_argument("--adopt", action="store_true", help=adopting)
     return part
 
 
@@ -75,9 +64,7 @@ def run(args: argparse.Namespace) -> int:
     return steps[args.what](args, loaders.hub.Hub())
 
 
-def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
-    from fpp_ml_bench.cli.console import progress_bar
-
+def _dataset(args: argparse.Namespace, hub: "loaders.hub.Hub") -> int:
     dataset = loaders.DatasetFolder(args.dataset)
     licence = loaders.hub_dataset.dataset_licence(dataset, args.license)
     remote = _remote(args, hub, "dataset")
@@ -86,9 +73,8 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
     with loaders.hub_dataset.staging_folder(args.staging, dataset.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                publication = loaders.hub_dataset.stage_dataset(
-                    dataset, args.repo, folder, texts, usable_cores(), advance
-                )
+                stage = loaders.hub_dataset.stage_dataset
+                publication = stage(dataset, args.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some space, or give a "
@@ -97,7 +83,7 @@ def _dataset(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, remote)
 
 
-def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
+def _leaderboard(args: argparse.Namespace, hub: "loaders.hub.Hub") -> int:
     if args.page is not None and args.results:
         raise PublishError("expected result files or --page, got both; give one of them")
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
@@ -108,7 +94,7 @@ def _leaderboard(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, _remote(args, hub, "space"))
 
 
-def _results(args: argparse.Namespace, hub: "Hub") -> int:
+def _results(args: argparse.Namespace, hub: "loaders.hub.Hub") -> int:
     remote = _remote(args, hub, "model")
     dataset = hub.state("dataset", args.dataset_repo)
     about = hub.mark("dataset", args.dataset_repo, dataset)
@@ -118,7 +104,7 @@ def _results(args: argparse.Namespace, hub: "Hub") -> int:
         return _carry_out(args, hub, publication, remote)
 
 
-def _remote(args: argparse.Namespace, hub: "Hub", kind: "Kind") -> "Remote":
+def _remote(args: argparse.Namespace, hub: "loaders.hub.Hub", kind: "loaders.hub.Kind") -> "loaders.hub.Remote":
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if args.dry_run else hub.check_token()
     remote = hub.state(kind, args.repo)
@@ -131,10 +117,11 @@ def _remote(args: argparse.Namespace, hub: "Hub", kind: "Kind") -> "Remote":
     return remote
 
 
-def _carry_out(args: argparse.Namespace, hub: "Hub", publication: "Publication", remote: "Remote") -> int:
+def _carry_out(
+    args: argparse.Namespace, hub: "loaders.hub.Hub", publication: "loaders.hub.Publication",
+    remote: "loaders.hub.Remote",
+) -> int:  # fmt: skip
     """Print what changes and send it, unless nothing changes or this is a dry run."""
-    from fpp_ml_bench.cli.console import gigabytes, progress_bar
-
     private = getattr(args, "private", False)
     loaders.hub.check_replaceable(publication, remote, getattr(args, "adopt", False))
     planned = loaders.hub.changes(publication, remote)

@@ -57,9 +57,8 @@ def assembly_of(settings: BuildSettings) -> Assembly:
     """What there is to do for a build, and its manifest so far."""
     rig, generator = settings.rig, {"name": "fpp-ml-bench", "version": __version__}
     size = rig.camera.height, rig.camera.width
-    manifest = Manifest(
-        storage.GENERATED, generator, settings.describe(), rig.to_dict(), size, settings.stored, exact=True
-    )
+    described, stored = settings.describe(), settings.stored
+    manifest = Manifest(storage.GENERATED, generator, described, rig.to_dict(), size, stored, exact=True)
     return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 
 
@@ -108,10 +107,8 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     decoded = frames - 2
     if settings.shadows:  # a ray for every pixel of the image would be all of them
         rays = sum(row["shadow_rays"] for row in rows)
-        background = account(
-            "shadow rays past the object's box", "rays", rays, all_px, empty_scene,
-            view_px - row["shadow_rays"],
-        )  # fmt: skip
+        past = view_px - row["shadow_rays"]
+        background = account("shadow rays past the object's box", "rays", rays, all_px, empty_scene, past)
     else:
         background = account("empty background again", "pixels", view_px, all_px, empty_scene, view_px)
         background = replace(background, rule=f"{rule}; lit once a process, one process assumed")

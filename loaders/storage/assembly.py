@@ -59,7 +59,6 @@ class Assembly:
         return {name: getattr(self.manifest, name) for name in names}
 
     def writer(self, folder: Path, scratch: Path) -> ShardWriter:
-        """The writer of this dataset's shards."""
         content = self.manifest
         return ShardWriter(folder, scratch, content.sequence, content.stored, content.exact, content.size)
 
@@ -265,16 +264,14 @@ def _end_with_parent() -> None:
 @contextmanager
 def _single_threaded_algebra() -> Iterator[None]:
     """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
-    previous = {name: os.environ.get(name) for name in THREAD_COUNTS}
+    previous = {name: os.environ[name] for name in THREAD_COUNTS if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:
         yield
     finally:
-        for name, value in previous.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in THREAD_COUNTS:
+            os.environ.pop(name, None)
+        os.environ.update(previous)
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:

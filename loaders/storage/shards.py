@@ -87,7 +87,7 @@ class DirectFile:
             for block in range(_BLOCKS):
                 self._wait(block)
             if self._filled:
-                _set_direct(self._descriptor, False)  # the rest is not a whole number of disk blocks
+                _use_cache(self._descriptor)  # the rest is not a whole number of disk blocks
                 _write_block(self._descriptor, memoryview(self._blocks[self._current])[: self._filled])
             os.fdatasync(self._descriptor)
         finally:
@@ -112,10 +112,8 @@ def _open_for_writing(path: Path) -> int:
         return os.open(path, flags, 0o644)
 
 
-def _set_direct(descriptor: int, direct: bool) -> None:
-    mode = getattr(os, "O_DIRECT", 0)
-    flags = fcntl.fcntl(descriptor, fcntl.F_GETFL)
-    fcntl.fcntl(descriptor, fcntl.F_SETFL, flags | mode if direct else flags & ~mode)
+def _use_cache(descriptor: int) -> None:
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) & ~getattr(os, "O_DIRECT", 0))
 
 
 def _write_block(descriptor: int, view: memoryview) -> None:
@@ -126,7 +124,7 @@ def _write_block(descriptor: int, view: memoryview) -> None:
             direct = fcntl.fcntl(descriptor, fcntl.F_GETFL) & getattr(os, "O_DIRECT", 0)
             if error.errno != errno.EINVAL or not direct:
                 raise
-            _set_direct(descriptor, False)  # a file system that opens for direct writes and then refuses them
+            _use_cache(descriptor)  # a file system that opens for direct writes and then refuses them
             continue
         view = view[done:]
 
@@ -227,10 +225,9 @@ class ShardWriter:
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
-            raise BuildError(
-                f"{self._folder / plan.path(DATA_GROUP)}: can't be written ({reason}); free some space or choose "
-                "another disk, then run the same command again: it resumes"
-            ) from error
+            where = self._folder / plan.path(DATA_GROUP)
+            advice = "free some space or choose another disk, then run the same command again: it resumes"
+            raise BuildError(f"{where}: can't be written ({reason}); {advice}") from error
         finally:
             for path in temporary.values():
                 path.unlink(missing_ok=True)
@@ -240,14 +237,11 @@ class ShardWriter:
         self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
     ) -> tuple[list[dict[str, Any]], dict[str, DirectFile]]:
         with ThreadPoolExecutor(1) as thread, ExitStack() as files:
-            sinks: dict[str, DirectFile] = {}
+            sinks, writers = {}, {}
             for group, path in paths.items():
                 sinks[group] = DirectFile(path, thread)
                 files.callback(sinks[group].close)
-            writers = {
-                group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
-                for group, sink in sinks.items()
-            }
+                writers[group] = pa.ipc.new_stream(pa.PythonFile(sinks[group], mode="w"), self._schemas[group])
             described = []
             data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
@@ -261,9 +255,7 @@ class ShardWriter:
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
                 for group, frames in self._groups.items():
-                    images: dict[str, Any] = {
-                        self._sequence.frames[index].column: row.frames[index] for index in frames
-                    }
+                    images: dict[str, Any] = {self._sequence.frames[i].column: row.frames[i] for i in frames}
                     if group != DATA_GROUP:
                         batch = [self._checked(image, column)[None] for column, image in images.items()]
                         writers[group].write_batch(_record_batch(batch, self._schemas[group]))
@@ -337,7 +329,6 @@ def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, f
         raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
     inside = depth_mm[object_mask(depth_mm)]
     if inside.size == 0:
-        raise BuildError(
-            f"sample {sample!r}: its depth map has no pixel above 0 mm; expected an object in the working range"
-        )
+        expected = "expected an object in the working range"
+        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm; {expected}")
     return float(inside.min()), float(inside.max())

@@ -1,11 +1,9 @@
 """The 50 ground-truth objects of the benchmark, as procedural watertight meshes.
 
-``object_mesh(name)`` is all there is to call. Every builder draws its object in millimetres at its real size, in a pose
-that shows it to the camera of the first view; the table below says which builder, and how much larger than life the
-object stands in the scene. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all;
-ours follow that and depart from it where the paper's image statistics need it: every view covers 3 to 40% of the image
-and a tenth on average, half the views span less than about 80 mm in depth, and nothing leaves 1.5 to 2.1 m.
-Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
+Each is drawn in millimetres at its real size, in a pose that shows it to the camera of the first view, and enlarged.
+The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all; ours depart from it where
+its image statistics need it: a view covers 3 to 40% of the image and a tenth on average, half the views span less
+than about 80 mm in depth. Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
 """
 
 import difflib
@@ -21,7 +19,6 @@ from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
 __all__ = ["ENLARGED", "object_mesh"]
 
 SLIVER_MM = 1e-2  # edges shorter than this are collapsed: booleans leave slivers there, and no pixel sees one
-
 FINAL_GRID_MM = 2.0**-8  # of the finished mesh: two hundred to a pixel, and coarse enough to leave no sliver
 
 ENLARGED: dict[str, float] = {
@@ -41,11 +38,9 @@ _DRAWN = {**vars(containers), **vars(household), **vars(tools)}
 
 
 def object_mesh(name: str) -> trimesh.Trimesh:
-    """Mesh of one of the 50 objects, at the size it has in the scene.
+    """Mesh of one of the 50 objects at the size it has in the scene: metres, z up, watertight, centred at the origin.
 
-    Metres, z up, outward faces, watertight. The bounding box is centred at the origin and the turning axis is z; the
-    camera of the first view looks along +x. The same name gives the same bytes at every call. Raises
-    :class:`MeshError` for a name that is not one of ``constants.OBJECTS``. Source: own.
+    The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an unknown name.
     """
     if name not in ENLARGED:
         near = difflib.get_close_matches(name, ENLARGED, n=3, cutoff=0.4)
