@@ -73,10 +73,8 @@ def lighting_candles() -> Solid:
 
 def _candle(radius: float, height: float) -> Solid:
     """Candle with a molten pool, runs of wax, a wick and a flame."""
-    body = cut(
-        lathe([(radius, 0), (radius, height - 1), (radius - 1, height)], segments=96),
-        lathe([(radius - 7, height - 7), (radius - 3, height - 2), (radius - 3, height + 4)], segments=96),
-    )
+    pool = lathe([(radius - 7, height - 7), (radius - 3, height - 2), (radius - 3, height + 4)], segments=96)
+    body = cut(lathe([(radius, 0), (radius, height - 1), (radius - 1, height)], segments=96), pool)
     runs = []
     for k in range(5):
         angle = 1.11 + 1.31 * k + 0.03 * height
@@ -92,11 +90,8 @@ def duct_tape() -> Solid:
     """Roll of tape, 128 x 50 mm, on a cardboard core, its end lifted; stood on edge with the hole to the viewer."""
     turns = lathe([(64, 0), (64, 50)], 0.6)
     core = cut(rod((0, 0, -0.6), (0, 0, 50.6), 41), rod((0, 0, -2), (0, 0, 53), 38))
-    windings = [
-        cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r))
-        for r in range(45, 63, 4)
-        for z in (-0.7, 49.1)
-    ]
+    rings = [(r, z) for r in range(45, 63, 4) for z in (-0.7, 49.1)]
+    windings = [cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r)) for r, z in rings]
     bent = np.linspace(-1.4, 0.15, 24)
     reach = 64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2
     end = stroke(np.stack([reach * np.cos(bent), reach * np.sin(bent)], axis=1), 1.4).extrude(50)
@@ -127,9 +122,8 @@ def banana() -> Solid:
 
 def marker() -> Solid:
     """Felt marker, 18 x 132 mm, its cap off at the writing end: stepped barrel, chisel tip, end plug."""
-    barrel = lathe(
-        [(7.6, 0), (8.6, 1), (8.6, 3), (9, 4), (9, 84), (8.4, 86), (8.4, 94), (5.6, 100), (5.2, 116), (3.4, 120)]
-    )
+    side = [(7.6, 0), (8.6, 1), (8.6, 3), (9, 4), (9, 84), (8.4, 86), (8.4, 94), (5.6, 100), (5.2, 116), (3.4, 120)]
+    barrel = lathe(side)
     tip = cut(rod((0, 0, 118), (0, 0, 131), 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
     label = wrapped(rectangle(52, 64), 9, 44, 0.3)
     words = wrapped(text_section("MARKER", 54).rotate(90), 9.2, 44, 0.6)
@@ -279,10 +273,9 @@ def open_book() -> Solid:
     cover = rectangle(155, 3.4, 1.2, (76, -1.6)).extrude(215).translate((0, 0, -5))
     right = union(pages.extrude(205), sheet.extrude(205), cover).rotate((0, 0, spread))
     inked = pages.offset(0.9)
-    text = [
-        (inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))).extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread))
-        for z, width in ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
-    ]
+    lines = ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
+    drawn = [(z, inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))) for z, width in lines]
+    text = [line.extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread)) for z, line in drawn]
     spine = rod((0, -1.5, -5), (0, -1.5, 210), 4)
     left = union(pages.extrude(205), cover).rotate((0, 0, spread)).mirror((1, 0, 0))
     printed = [line.mirror((1, 0, 0)) for line in text]

@@ -88,10 +88,8 @@ def boxcutter() -> Solid:
     slot = rectangle(8, 104, 3.5, (2, -4))
     body = union(plate(handle, 13, 2.5), plate(rectangle(22, 26, 3, (0, -74)), 15, 2))
     body = cut(body, plate(slot, 8).translate((0, 0, 8)))
-    slider = union(
-        plate(rectangle(13, 26, 3, (2, 22)), 6, 1).translate((0, 0, 7)),
-        *(block(13, 1.6, 2.4, 0, (2, y, 10)) for y in (15, 19, 23, 27, 31)),
-    )
+    teeth = [block(13, 1.6, 2.4, 0, (2, y, 10)) for y in (15, 19, 23, 27, 31)]
+    slider = union(plate(rectangle(13, 26, 3, (2, 22)), 6, 1).translate((0, 0, 7)), *teeth)
     blade = plate(polygon([(-9, 40), (9, 40), (9, 104), (-9, 122)]), 2.0)
     scores = [place(block(26, 1.2, 3, 0), (0, y, 1.6), (0, 0, -35)) for y in (66, 77, 88, 99)]
     backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
@@ -112,12 +110,10 @@ def paint_brush() -> Solid:
     handle = _handle([(11.5, 0), (14.0, 22), (13.0, 44), (8.0, 90), (6.4, 130), (5.2, 155), (4.0, 162)])
     ferrule = loft([(-6, 24, 22, 2), (2, 25, 23, 2), (20, 32, 17, 2.4), (38, 36, 14, 2.8)], smooth=4, sides=64)
     crimps = [place(ring(12.6, 1.2), (0, y, 0), (90, 0, 0)) for y in (0.5, 5.5)]
-    bristles = loft(
-        [(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)], smooth=5, sides=96
-    )
-    furrows = [
-        place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x in range(-15, 16, 5) for s in (-1, 1)
-    ]
+    levels = [(36, 35, 13, 2.8), (55, 41, 13, 2.6), (72, 40, 9, 2.4), (82, 33, 5, 2.2), (87, 22, 2.5, 2)]
+    bristles = loft(levels, smooth=5, sides=96)
+    spots = [(x, s) for x in range(-15, 16, 5) for s in (-1, 1)]
+    furrows = [place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x, s in spots]
     tuft = cut(laid(union(ferrule, bristles)), *furrows)
     return place(facing(union(handle, tuft, *crimps)), turn=(3, 0, 3))
 
@@ -134,9 +130,8 @@ def paint_brush_large() -> Solid:
     handle = union(plate(polygon(outline), 14), plate(polygon(outline).offset(-5), 19))
     handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
     tuft = laid(loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5))
-    furrows = [
-        place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x in range(-45, 46, 6) for s in (-1, 1)
-    ]
+    spots = [(x, s) for x in range(-45, 46, 6) for s in (-1, 1)]
+    furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x, s in spots]
     return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(4, -2, 4))
 
 
