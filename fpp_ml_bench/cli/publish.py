@@ -5,7 +5,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fpp_ml_bench import leaderboard, loaders
-from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
@@ -65,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _dataset(args: argparse.Namespace, hub: "loaders.hub.Hub") -> int:
+    from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
+
     dataset = loaders.DatasetFolder(args.dataset)
     licence = loaders.hub_dataset.dataset_licence(dataset, args.license)
     remote = _remote(args, hub, "dataset")
@@ -122,6 +123,8 @@ def _carry_out(
     remote: "loaders.hub.Remote",
 ) -> int:  # fmt: skip
     """Print what changes and send it, unless nothing changes or this is a dry run."""
+    from fpp_ml_bench.cli.console import gigabytes, progress_bar
+
     private = getattr(args, "private", False)
     loaders.hub.check_replaceable(publication, remote, getattr(args, "adopt", False))
     planned = loaders.hub.changes(publication, remote)
