@@ -1,13 +1,7 @@
-"""What the leaderboard puts on the Hub: the benchmark's registration, its page, and results.
+"""What the leaderboard puts on the Hub: the tasks in a dataset's repository, the page as a static Space, results.
 
-A dataset's repository registers the benchmark's tasks; the page becomes a static Space; results become
-``.eval_results/*.yaml`` of a model's repository, from which the Hub fills its benchmark table.
-
-The Hub ranks by the greatest value and knows no unit. So an error becomes a score between 0 and 100,
-
-    score = 100 / (1 + object MAE / 10 mm),
-
-which falls strictly with the error (0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1); the millimetres are in the notes.
+The Hub ranks by the greatest value and knows no unit. So an error becomes a score that falls strictly with it,
+100 / (1 + object MAE / 10 mm): 0 mm: 100; 1 mm: 90.9; 10 mm: 50; 100 mm: 9.1. The millimetres are in the notes.
 Own definition; 10 mm is the widest tolerance that this benchmark counts pixels within.
 """
 
@@ -129,12 +123,8 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
         {"id": task.id, "config": CONFIGS[0] if task.single_shot else widest, "split": SPLIT}
         for task in TASKS if task.single_shot or widest != CONFIGS[0]
     ]  # fmt: skip
-    evaluation = {
-        "name": NAME,
-        "description": f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}.",
-        "evaluation_framework": FRAMEWORK,
-        "tasks": tasks,
-    }
+    description = f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}."
+    evaluation = {"name": NAME, "description": description, "evaluation_framework": FRAMEWORK, "tasks": tasks}
     splits = []
     for split in dataset.splits:
         samples = dataset.manifest.samples[split]
@@ -154,8 +144,7 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
 def write_page_of(results: Sequence[Path], folder: Path) -> None:
     """Write the page of result and row files, or of the rows shipped with the package where none are named.
 
-    Nothing is looked for in the current folder: what gets published is named. Raises SubmissionError for a file that is
-    no sound result.
+    Nothing is looked for in the current folder. Raises SubmissionError for a file that is no sound result.
     """
     rows = expand(results) if results else shipped_rows()
     settings = None if results else shipped_tradeoff()
@@ -186,18 +175,12 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
     head: dict[str, Any] = {
-        "title": "FPP-ML-Bench leaderboard",
-        "emoji": "📐",
-        "colorFrom": "blue",
-        "colorTo": "gray",
-        "sdk": "static",
-        "app_file": INDEX,
-        "pinned": False,
-        "license": "mit",
+        "title": "FPP-ML-Bench leaderboard", "emoji": "📐", "colorFrom": "blue", "colorTo": "gray", "sdk": "static",
+        "app_file": INDEX, "pinned": False, "license": "mit",
         "short_description": "Depth from one fringe image: error and run time",
         "tags": ["leaderboard", "depth-estimation", "structured-light", "fpp-ml-bench"],
         **({"datasets": [dataset_repo]} if dataset_repo is not None else {}),
-    }
+    }  # fmt: skip
     body = f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
     (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode())
     (folder / MARK).write_bytes(mark_bytes("leaderboard"))
@@ -261,10 +244,8 @@ def _notes(result: Result) -> str:
     metrics, submission = result.metrics, result.submission
     ends = result.intervals.of("object_mae_mm")
     interval = f" (95% interval {millimetres(ends[0])} to {millimetres(ends[1])})" if ends is not None else ""
-    frames = len(submission.frames_used)
-    time = ""
-    if submission.seconds_per_sample is not None:
-        time = f"; {submission.seconds_per_sample:.4g} s per sample, {submission.seconds_source}"
+    frames, seconds = len(submission.frames_used), submission.seconds_per_sample
+    time = "" if seconds is None else f"; {seconds:.4g} s per sample, {submission.seconds_source}"
     missing = percent(metrics.object_missing_share)
     return (
         f"{SCORE_TEXT}. Object MAE {millimetres(metrics.object_mae_mm)} mm{interval}, RMSE "

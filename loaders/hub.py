@@ -1,10 +1,8 @@
 """A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it.
 
-Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small file), so that a
-dry run can tell what would change; a file that the repository already has is never sent again.
-
-Every error of the Hub's client (no token, no network, 401, 403, 404, 5xx) becomes a `PublishError` that says what to
-do. The client reads ``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
+Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small one), so a dry run
+can tell what would change. Every error of the client becomes a `PublishError` that says what to do; the client reads
+``HF_ENDPOINT``, ``HF_TOKEN`` and ``HF_HUB_OFFLINE`` itself.
 """
 
 import json
@@ -19,13 +17,7 @@ from typing import Any, Literal
 
 import yaml
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
-from huggingface_hub.errors import (
-    HfHubHTTPError,
-    HTTPError,
-    LocalTokenNotFoundError,
-    OfflineModeIsEnabled,
-    RepositoryNotFoundError,
-)
+from huggingface_hub import errors as hub_errors
 from huggingface_hub.hf_api import RepoFile
 from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils.sha import git_hash
@@ -39,8 +31,6 @@ Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
-_HUB_OWN = frozenset({".gitattributes", "README.md"})
-"""Files of a repository that was just made on the Hub's web page."""
 _BATCH_BYTES, _BATCH_FILES = 1 << 26, 64
 """Files are sent before the commit in batches of about this size, for the progress bar."""
 _REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
@@ -95,8 +85,7 @@ class Change:
 
 def yaml_text(content: Any, allow_unicode: bool = False) -> str:
     """YAML as the Hub's files have it: in the order given, lines of at most 110 characters."""
-    text: str = yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode)
-    return text
+    return str(yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode))
 
 
 def mark_bytes(publishes: str, **about: Any) -> bytes:
@@ -122,13 +111,9 @@ def changes(publication: Publication, remote: Remote) -> list[Change]:
     Reads every staged file once. Other files of the repository outside ``owned`` stay as they are.
     """
     staged = staged_files(publication.folder)
-    planned = [
-        Change(_status(path, remote.files.get(name)), name, path.stat().st_size) for name, path in staged.items()
-    ]
-    planned += [
-        Change("deleted", name, stored.size)
-        for name, stored in remote.files.items() if name not in staged and name.startswith(publication.owned)
-    ]  # fmt: skip
+    planned = [Change(_status(at, remote.files.get(name)), name, at.stat().st_size) for name, at in staged.items()]
+    gone = (name for name in remote.files if name not in staged and name.startswith(publication.owned))
+    planned += [Change("deleted", name, remote.files[name].size) for name in gone]
     return sorted(planned, key=lambda change: change.path)
 
 
@@ -147,7 +132,7 @@ def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> 
     """Refuse, with `PublishError`, to write into a repository that this command did not fill, unless ``adopt``."""
     if adopt or publication.kind == "model" or not remote.exists:
         return
-    foreign = sorted(set(remote.files) - _HUB_OWN)
+    foreign = sorted(set(remote.files) - {".gitattributes", "README.md"})  # of one just made on the Hub's web page
     if foreign and MARK not in remote.files:
         named = ", ".join(printable(name, 80) for name in foreign[:3])
         raise PublishError(
@@ -201,7 +186,7 @@ class Hub:
         with self._explained(f"reading {kind} {repo}"):
             try:
                 info = self._api.repo_info(repo, repo_type=kind)
-            except RepositoryNotFoundError as error:
+            except hub_errors.RepositoryNotFoundError as error:
                 # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
                 if error.response.status_code == 401 and get_token():
                     raise
@@ -234,9 +219,8 @@ class Hub:
     ) -> str:  # fmt: skip
         """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
 
-        All files become visible together, with the commit. An interrupted run, started again, sends only what is
-        missing. ``sent`` is called with the bytes of each batch. Raises `PublishError`, also after a commit by someone
-        else meanwhile.
+        All files become visible together; a run after an interrupted one sends only what is missing. ``sent`` is
+        called with the bytes of each batch. Raises `PublishError`, also after a commit by someone else meanwhile.
         """
         repo, kind = publication.repo, publication.kind
         if not remote.exists:
@@ -244,10 +228,8 @@ class Hub:
                 sdk = "static" if kind == "space" else None
                 self._api.create_repo(repo, repo_type=kind, private=private or None, space_sdk=sdk)
         with self._explained(f"sending to {kind} {repo}"):
-            additions = [
-                CommitOperationAdd(change.path, publication.folder / change.path)
-                for change in changes if change.status in ("new", "changed")
-            ]  # fmt: skip
+            to_send = [change.path for change in changes if change.status in ("new", "changed")]
+            additions = [CommitOperationAdd(path, publication.folder / path) for path in to_send]
             for batch in _batches(additions):
                 self._api.preupload_lfs_files(repo, batch, repo_type=kind, free_memory=False)
                 sent(sum(addition.upload_info.size for addition in batch))
@@ -262,19 +244,16 @@ class Hub:
     def _explained(self, doing: str) -> Iterator[None]:
         try:
             yield
-        except OfflineModeIsEnabled as error:
+        except hub_errors.OfflineModeIsEnabled as error:
             raise PublishError(f"{doing}: HF_HUB_OFFLINE is set, so nothing may be sent; unset it") from error
-        except LocalTokenNotFoundError as error:
+        except hub_errors.LocalTokenNotFoundError as error:
             raise PublishError(f"{doing}: no token; run 'hf auth login' or set HF_TOKEN") from error
-        except HfHubHTTPError as error:
+        except hub_errors.HfHubHTTPError as error:
             status, said = error.response.status_code, " ".join((error.server_message or "").split())
-            answer = _ANSWERS.get(status, f"the Hub refused ({status})")
-            if status >= 500:
-                answer = (
-                    f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
-                )
+            fault = f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
+            answer = _ANSWERS.get(status, f"the Hub refused ({status})") if status < 500 else fault
             raise PublishError(f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}") from error
-        except HTTPError as error:
+        except hub_errors.HTTPError as error:
             raise PublishError(
                 f"{doing}: {self.endpoint} can't be reached ({printable(str(error)) or type(error).__name__}); check "
                 "the network and HF_ENDPOINT, then run the same command again: it sends only what is missing"

@@ -14,16 +14,9 @@ import pyarrow
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DatasetError, PublishError
 from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, yaml_text
-from fpp_ml_bench.loaders.storage import (
-    MESH_FOLDER,
-    RIG_FILE,
-    DatasetFolder,
-    columns,
-    data_shards,
-    data_version,
-    write_shard,
-)
+from fpp_ml_bench.loaders.storage import MESH_FOLDER, RIG_FILE, DatasetFolder
 from fpp_ml_bench.optics import save_rig
 
 NAME = "FPP-ML-Bench"
@@ -63,12 +56,10 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
 
 
 def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
-    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data without
-    it."""
-    if license_id is None and dataset.manifest.origin != "generated":
-        raise PublishError(
-            f"{dataset.path}: {dataset.manifest.origin} data; say under which --license it may be shared"
-        )
+    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data."""
+    origin = dataset.manifest.origin
+    if license_id is None and origin != storage.GENERATED:
+        raise PublishError(f"{dataset.path}: {origin} data; say under which --license it may be shared")
     licence = license_id or "mit"
     if not _LICENCE.fullmatch(licence):
         raise PublishError(f"--license: expected an identifier like mit or cc-by-4.0, got {licence!r}")
@@ -79,7 +70,7 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
     rows = sum(len(samples) for samples in dataset.splits.values())
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
-    for name, shard in data_shards(dataset).items():
+    for name, shard in storage.data_shards(dataset).items():
         files[shard.split].append(name)
     head = {
         "license": licence,
@@ -91,10 +82,10 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
             {
                 "config_name": config,
                 **({"default": True} if config == dataset.configs[0] else {}),
-                "version": data_version(dataset.fingerprint),
+                "version": storage.data_version(dataset.fingerprint),
                 # Files by name, not by pattern: a stray file can never join the data.
                 "data_files": [{"split": split, "path": list(paths)} for split, paths in files.items()],
-                "columns": columns(dataset, config),
+                "columns": storage.columns(dataset, config),
             }
             for config in dataset.configs
         ],
@@ -106,17 +97,16 @@ def stage_dataset(
     dataset: DatasetFolder, repo: str, folder: Path, texts: Mapping[str, str], threads: int = 1,
     row_done: Callable[[int], None] = lambda rows: None,
 ) -> Publication:  # fmt: skip
-    """Write everything that is published of ``dataset`` into ``folder``, and ``texts`` by file name (the card, and what
-    others know of the data); the same dataset gives the same bytes.
+    """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
 
-    Parquet files that are already there are kept; see `staging_folder` for when they are. Raises `DatasetError` for a
-    damaged dataset, ``OSError`` when a file can't be written.
+    Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
+    ``OSError`` when a file can't be written.
     """
-    for name, shard in data_shards(dataset).items():
+    for name, shard in storage.data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
-            write_shard(dataset, shard, folder / name, threads, row_done)
+            storage.write_shard(dataset, shard, folder / name, threads, row_done)
     for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
         source = dataset.path / mesh.path
         if not source.is_file() or file_hash(source) != mesh.xxh3_128:

@@ -30,10 +30,9 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     for number, (title, image, colours, low, high) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)
-        if colours == _GREY:
-            axes.imshow(image, cmap=colours, vmin=low, vmax=high)
-        else:
-            drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+        nearest = {} if colours == _GREY else {"interpolation": "nearest"}
+        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, **nearest)
+        if colours != _GREY:
             bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
             bar.set_label("mm", fontsize=8)
             bar.ax.tick_params(labelsize=7)
@@ -111,12 +110,11 @@ def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
     lines = -(-len(objects) // columns)
     width = len(VIEWS) * _TILE_PX
     sheet = np.full((lines * line_px, columns * width + 8), 255, dtype=np.uint8)
-    samples_in_split = set(samples)
     for number, name in enumerate(objects):
         top, left = (number // columns) * line_px, (number % columns) * (width + 8)
         for view_number, view in enumerate(VIEWS):
             sample = sample_name(name, view)
-            if sample not in samples_in_split:
+            if sample not in samples:
                 continue
             tile = cv2.resize(dataset.frame(sample, index), (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
             column = left + view_number * _TILE_PX

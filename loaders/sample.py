@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.optics import CONFIGS, Sequence
 
 DATA_GROUP = "data"
@@ -87,12 +86,11 @@ def group_columns(sequence: Sequence, group: str, frames: tuple[int, ...], exact
 
 def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
     """The columns as ``datasets.Features`` writes them in JSON; ``size`` is (H, W)."""
-    return {name: _feature(name, size) for name in columns}
-
-
-def _feature(name: str, size: tuple[int, int]) -> dict[str, Any]:
-    if name in LABELS or name in RANGE:
-        return {"dtype": "string" if name in LABELS else "float32", "_type": "Value"}
-    if name in (DEPTH, DEPTH_EXACT) or name.startswith("frame_"):
-        return {"shape": list(size), "dtype": "uint8" if name.startswith("frame_") else "float32", "_type": "Array2D"}
-    raise DatasetError(f"unknown column {name!r}")
+    described: dict[str, dict[str, Any]] = {}
+    for name in columns:
+        if name in LABELS or name in RANGE:
+            described[name] = {"dtype": "string" if name in LABELS else "float32", "_type": "Value"}
+        else:
+            kind = "uint8" if name.startswith("frame_") else "float32"
+            described[name] = {"shape": list(size), "dtype": kind, "_type": "Array2D"}
+    return described

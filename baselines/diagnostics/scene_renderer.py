@@ -18,7 +18,7 @@ from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage import MESH_FOLDER, DatasetFolder
 from fpp_ml_bench.optics import Direction, Rig
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -81,7 +81,7 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
     pixels = np.flatnonzero(object_mask(depth_mm))
     normals, depth_m = normals_of_depth(depth_mm, x, y)[pixels], depth_mm.ravel()[pixels] / MM_PER_M
     record = dataset.measured(sample)
-    mesh_file = dataset.path / render.MESH_FOLDER / f"{record['object']}.ply"
+    mesh_file = dataset.path / MESH_FOLDER / f"{record['object']}.ply"
     if mesh_file.is_file() and record.get("distance_mm") is not None:
         solid = render.load_user_mesh(render.UserMesh(mesh_file.stem, str(mesh_file), centre=False))
         vertices_m = render.turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])

@@ -56,29 +56,19 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     if args.pitch is not None:
         sequence = rig.sequence
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
-            horizontal, vertical = (
-                optics.bits_needed(rig.pattern_length(direction), args.pitch) for direction in optics.DIRECTIONS
-            )
-            sequence = replace(
-                sequence,
-                bits_horizontal=max(sequence.bits_horizontal, horizontal),
-                bits_vertical=max(sequence.bits_vertical, vertical),
-            )
+            lengths = (rig.pattern_length(direction) for direction in optics.DIRECTIONS)
+            horizontal, vertical = (optics.bits_needed(length, args.pitch) for length in lengths)
+            horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
+            sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
     meshes = (render.read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(render.single_mesh, args.mesh))
     if args.objects is not None:
         objects = tuple(name.strip() for name in args.objects.split(",") if name.strip())
     elif meshes:
         objects = ()
+    names = (*objects, *(mesh.name for mesh in meshes))
     return render.BuildSettings(
-        rig=rig,
-        objects=(*objects, *(mesh.name for mesh in meshes)),
-        placement=args.placement,
-        stored=args.frames,
-        seed=args.seed,
-        noise_sigma_grey=args.noise_sigma,
-        shadows=args.shadows,
-        user_meshes=meshes,
+        rig, names, args.placement, args.frames, args.seed, args.noise_sigma, args.shadows, meshes
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders import published, storage
 from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns."
@@ -30,14 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export. Raises FppBenchError for an unusable dataset, form or folder."""
-    forms = [form for form in storage.FORMS if getattr(args, form)]
+    forms = [form for form in published.FORMS if getattr(args, form)]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
     dataset = storage.DatasetFolder(args.dataset)
-    splits = storage.chosen_splits(dataset, args.split)
+    splits = published.chosen_splits(dataset, args.split)
     samples = sum(len(dataset.samples(split)) for split in splits)
-    with progress_bar("exporting", samples * sum(form in storage.SAMPLE_FORMS for form in forms), "samples") as advance:
-        storage.export(dataset, args.out, forms, splits, usable_cores(), advance)
+    with progress_bar(
+        "exporting", samples * sum(form in published.SAMPLE_FORMS for form in forms), "samples"
+    ) as advance:
+        published.export(dataset, args.out, forms, splits, usable_cores(), advance)
     files = [path for path in args.out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{args.out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

@@ -61,9 +61,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    print(
-        f"fringes         pitch {rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px; periods in range {periods}"
-    )
+    pitches = f"{rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px"
+    print(f"fringes         pitch {pitches}; periods in range {periods}")
     print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
@@ -81,7 +80,7 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2f}%"
 
 
-_ROWS: tuple[tuple[str, "Callable[[storage.SplitStatistics], str]"], ...] = (
+_ROWS: tuple[tuple[str, Callable[["storage.SplitStatistics"], str]], ...] = (
     ("objects, samples", lambda s: f"{s.objects}, {s.samples}"),
     ("cover, mean", lambda s: _share(s.cover_mean)),
     ("cover, least-most", lambda s: f"{100 * s.cover_min:.1f}-{100 * s.cover_max:.1f}%"),

@@ -23,7 +23,6 @@ _SIGNS = {"new": "+", "changed": "~", "deleted": "-", "unchanged": " "}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
     kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
 
     add = _part(kinds, "dataset", "a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes")
@@ -68,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _dataset(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
-    from fpp_ml_bench.cli.console import progress_bar
+    from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
 
     dataset = loaders.DatasetFolder(args.dataset)
     licence = loaders.hub_dataset.dataset_licence(dataset, args.license)

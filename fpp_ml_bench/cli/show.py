@@ -19,9 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
     parser.add_argument("--sheet", action="store_true", help="all objects and views on one sheet instead")
     parser.add_argument("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)"
-    )
+    default = "picture to write (default: SAMPLE.png or sheet.png)"
+    parser.add_argument("--out", type=Path, metavar="FILE.png", help=default)
 
 
 def run(args: argparse.Namespace) -> int:

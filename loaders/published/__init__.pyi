@@ -1,11 +1,14 @@
-from .export import write_tree as write_tree
+from .exporting import FORMS as FORMS
+from .exporting import SAMPLE_FORMS as SAMPLE_FORMS
+from .exporting import chosen_splits as chosen_splits
+from .exporting import export as export
+from .files import parse_matrix as parse_matrix
+from .files import png_chunks as png_chunks
 from .importing import import_notes as import_notes
 from .importing import import_tree as import_tree
 from .importing import plan_import as plan_import
-from .mat_files import parse_matrix as parse_matrix
 from .order import FrameOrder as FrameOrder
 from .order import parse_order as parse_order
-from .png import png_chunks as png_chunks
 from .tree import DEPTH as DEPTH
 from .tree import FRINGE as FRINGE
 from .tree import TRAINING as TRAINING

@@ -15,29 +15,13 @@ from numpy.typing import NDArray
 from fpp_ml_bench import __version__
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
-from fpp_ml_bench.loaders.published.mat_files import read_matrix, read_scalar
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.published import tree as published_tree
+from fpp_ml_bench.loaders.published.files import read_grey_png, read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
-from fpp_ml_bench.loaders.published.png import read_grey_png
-from fpp_ml_bench.loaders.published.tree import (
-    INFO_VARIABLES,
-    VARIABLES,
-    VARIANT_FOLDERS,
-    PublishedSample,
-    PublishedTree,
-    layout_error,
-    scan_tree,
-)
+from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
-from fpp_ml_bench.loaders.storage import (
-    MANIFEST,
-    WORK_FOLDER,
-    Assembly,
-    Manifest,
-    Progress,
-    ShardPlan,
-    assemble,
-    plan_shards,
-)
+from fpp_ml_bench.loaders.storage import MANIFEST, WORK_FOLDER, Assembly, Manifest, Progress, ShardPlan
 from fpp_ml_bench.optics import Rig, paper_rig
 
 IMPORTED = "imported"
@@ -70,7 +54,7 @@ class SampleReader:
     order: FrameOrder | None
 
     def read(self, sample: PublishedSample) -> Row:
-        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line per wrong file."""
+        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
         row, problems = self._read(sample)
         if row is None:
             raise LayoutError("\n".join(problems))
@@ -154,7 +138,7 @@ class SampleReader:
     def _range_mm(self, sample: PublishedSample, problems: list[str]) -> tuple[float, float] | None:
         with _listed(problems):
             if sample.info is not None:
-                low, high = (read_scalar(sample.info, name) for name in INFO_VARIABLES)
+                low, high = (read_scalar(sample.info, name) for name in published_tree.INFO_VARIABLES)
                 if 0 < low <= high:
                     return low, high
                 problems.append(f"{sample.info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
@@ -220,14 +204,12 @@ class ImportPlan:
 def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
     """Scan the tree at ``root`` and determine how it is read.
 
-    ``rig``: the rig that took the images; None assumes the paper's rig, scaled to the image size.
-    ``frame_order``: see `fpp_ml_bench.loaders.published.order`; ``auto`` determines it from the first sample's images,
-    and all other samples are checked against it.
-
-    Raises `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size.
+    ``rig``: the rig that took the images; None assumes the paper's rig, scaled to the image size. ``frame_order``: see
+    `FrameOrder`; ``auto`` determines it from the first sample's images, and checks all others against it. Raises
+    `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size.
     """
     order = parse_order(frame_order)
-    tree = scan_tree(root, len((rig or paper_rig()).sequence))
+    tree = published_tree.scan_tree(root, len((rig or paper_rig()).sequence))
     rig_used = _rig_for(tree, rig)
     if not tree.has_frames:
         order = None
@@ -238,28 +220,20 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
     plans = []
     for split, samples in tree.samples.items():
         objects: dict[str, list[tuple[str, str, str]]] = {}
-        for sample in samples:
-            objects.setdefault(sample.object, []).append((sample.sample, sample.object, sample.view))
-        plans += plan_shards(split, objects)
-    manifest = Manifest(
-        origin=IMPORTED,
-        generator={"name": "fpp-ml-bench", "version": __version__},
-        settings={
-            "layout": "published",
-            "depth_from": VARIANT_FOLDERS[tree.variants[0]],
-            "depth_checked_against": [VARIANT_FOLDERS[name] for name in tree.variants[1:]],
-            "frame_order": order.name if order else None,
-            "rig_assumed": rig is None,
-            "ignored": list(tree.ignored),
-            "objects": {
-                split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()
-            },
-        },
-        rig=rig_used.to_dict(),
-        size=tree.size,
-        stored=stored,
-        exact=False,
-    )
+        for s in samples:
+            objects.setdefault(s.object, []).append((s.sample, s.object, s.view))
+        plans += storage.plan_shards(split, objects)
+    settings = {
+        "layout": "published",
+        "depth_from": VARIANT_FOLDERS[tree.variants[0]],
+        "depth_checked_against": [VARIANT_FOLDERS[name] for name in tree.variants[1:]],
+        "frame_order": order.name if order else None,
+        "rig_assumed": rig is None,
+        "ignored": list(tree.ignored),
+        "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
+    }
+    generator = {"name": "fpp-ml-bench", "version": __version__}
+    manifest = Manifest(IMPORTED, generator, settings, rig_used.to_dict(), tree.size, stored, exact=False)
     rows = ImportedRows({sample.sample: sample for sample in tree.all_samples()}, reader)
     return ImportPlan(tree, reader, Assembly(plans, rows, manifest))
 
@@ -274,12 +248,11 @@ def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress
     _refuse_changed(folder, plan.tree)
     _drop_stale_receipts(folder, plan)
     try:
-        return assemble(folder, plan.assembly, workers, progress)
+        return storage.assemble(folder, plan.assembly, workers, progress)
     except LayoutError as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems_by_sample = list(pool.map(plan.reader.problems, plan.tree.all_samples()))
-        problems = [line for lines in problems_by_sample for line in lines]
-        raise layout_error(plan.tree.root, problems or str(error).splitlines()) from error
+            problems = [line for lines in pool.map(plan.reader.problems, plan.tree.all_samples()) for line in lines]
+        raise published_tree.layout_error(plan.tree.root, problems or str(error).splitlines()) from error
 
 
 def import_notes(manifest: Manifest) -> list[str]:
@@ -289,9 +262,8 @@ def import_notes(manifest: Manifest) -> list[str]:
     if settings["depth_checked_against"]:
         notes[0] += f", checked against {', '.join(settings['depth_checked_against'])}"
     if settings["depth_from"] == VARIANT_FOLDERS["individual"]:
-        notes.append(
-            "in this variant, pixels at a sample's least depth can't be told from background; they became background"
-        )
+        lost = "pixels at a sample's least depth can't be told from background; they became background"
+        notes.append(f"in this variant, {lost}")
     if settings["rig_assumed"]:
         notes.append("the rig is assumed to be the paper's, scaled to the image size; give --rig if it is another")
     if settings["frame_order"]:
@@ -312,9 +284,8 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
     height, width = tree.size
     if rig is None:
         if height != width:
-            raise RigError(
-                f"{tree.root}: images of {width} x {height} px are not square like the paper's; give the rig with --rig"
-            )
+            images = f"images of {width} x {height} px"
+            raise RigError(f"{tree.root}: {images} are not square like the paper's; give the rig with --rig")
         return paper_rig(width)
     if (rig.camera.height, rig.camera.width) != tree.size:
         raise RigError(
@@ -340,7 +311,7 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
         refusals.append(
             f"{sample.frames[0].parent}: fits no named frame order. Mismatch with the paper's order: {misfits[0]}"
         )
-    raise layout_error(tree.root, refusals)
+    raise published_tree.layout_error(tree.root, refusals)
 
 
 def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:

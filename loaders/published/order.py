@@ -18,18 +18,15 @@ from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Frame, Rig, Sequence
 
 AUTO = "auto"
+_SH, _SV, _GH, _GV = (
+    ("sinusoid", "horizontal"), ("sinusoid", "vertical"), ("gray", "horizontal"), ("gray", "vertical"),
+)  # fmt: skip
 LAYOUTS: dict[str, tuple[tuple[str, Direction], ...]] = {
-    "paper": (("sinusoid", "horizontal"), ("sinusoid", "vertical"), ("gray", "horizontal"), ("gray", "vertical")),
-    "vertical-first": (
-        ("sinusoid", "vertical"), ("sinusoid", "horizontal"), ("gray", "vertical"), ("gray", "horizontal"),
-    ),
-    "by-direction": (
-        ("sinusoid", "horizontal"), ("gray", "horizontal"), ("sinusoid", "vertical"), ("gray", "vertical"),
-    ),
-    "by-direction-vertical-first": (
-        ("sinusoid", "vertical"), ("gray", "vertical"), ("sinusoid", "horizontal"), ("gray", "horizontal"),
-    ),
-}  # fmt: skip
+    "paper": (_SH, _SV, _GH, _GV),
+    "vertical-first": (_SV, _SH, _GV, _GH),
+    "by-direction": (_SH, _GH, _SV, _GV),
+    "by-direction-vertical-first": (_SV, _GV, _SH, _GH),
+}
 WHITE_FIRST, BACKWARD_STEPS, LEAST_BIT_FIRST = "white-first", "backward-steps", "least-bit-first"
 MODIFIERS = (WHITE_FIRST, BACKWARD_STEPS, LEAST_BIT_FIRST)
 
@@ -140,12 +137,10 @@ def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
     problems = _two_valued(lines, frames, lit, black, white)
     if not problems:
         for direction in DIRECTIONS:
-            problems += _sinusoids(
-                lines, [file_of_frame[i] for i in rig.sequence.sinusoids(direction)], lit, direction, rig
-            )
-            problems += _codes(
-                lines, [file_of_frame[i] for i in rig.sequence.gray(direction)], lit, direction, rig, black, white
-            )
+            sinusoids, codes = rig.sequence.sinusoids(direction), rig.sequence.gray(direction)
+            problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], lit, direction, rig)
+            limit = [(part[black] + part[white]) / 2 for part in (lines.along_x, lines.along_y)]
+            problems += _codes(lines, [file_of_frame[i] for i in codes], lit, direction, rig, limit)
     return problems
 
 
@@ -221,19 +216,12 @@ def _sinusoids(
 
 
 def _codes(
-    lines: _Lines,
-    numbers: list[int],
-    lit: list[NDArray[np.bool_]],
-    direction: Direction,
-    rig: Rig,
-    black: int,
-    white: int,
-) -> list[str]:
+    lines: _Lines, numbers: list[int], lit: list[NDArray[np.bool_]], direction: Direction, rig: Rig,
+    limit: list[NDArray[np.float32]],
+) -> list[str]:  # fmt: skip
     axis = int(np.abs(_expected_gradient(direction, rig)).argmax())
-    codes, pairs = [], []
-    for part, part_lit in zip((lines.along_x, lines.along_y), lit, strict=True):
-        codes.append(part[numbers] > (part[black] + part[white]) / 2)
-        pairs.append(part_lit[:, 1:] & part_lit[:, :-1])
+    codes = [part[numbers] > middle for part, middle in zip((lines.along_x, lines.along_y), limit, strict=True)]
+    pairs = [part_lit[:, 1:] & part_lit[:, :-1] for part_lit in lit]
     # Changes of each bit per image line: (bits,) along x and along y.
     edges = [
         ((code[:, :, 1:] != code[:, :, :-1]) & pair).sum(axis=(1, 2)) / code.shape[1]
@@ -263,8 +251,7 @@ def _exchanged_bits(code: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> list[t
     """Pairs of bits that give a more regular code along the lines when exchanged; ``code`` bool (bits, lines, L)."""
 
     def jumps(order: list[int]) -> int:
-        cells = np.zeros(code.shape[1:], dtype=np.int32)
-        bit = np.zeros(code.shape[1:], dtype=np.bool_)
+        cells, bit = np.zeros(code.shape[1:], dtype=np.int32), np.zeros(code.shape[1:], dtype=np.bool_)
         for number in order:
             bit ^= code[number]
             cells += cells
@@ -273,10 +260,5 @@ def _exchanged_bits(code: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> list[t
 
     straight = list(range(len(code)))
     as_is = jumps(straight)
-    exchanged = []
-    for i, j in combinations(straight, 2):
-        order = straight.copy()
-        order[i], order[j] = j, i
-        if jumps(order) < as_is:
-            exchanged.append((i, j))
-    return exchanged
+    exchanged = {(i, j): [{i: j, j: i}.get(k, k) for k in straight] for i, j in combinations(straight, 2)}
+    return [pair for pair, order in exchanged.items() if jumps(order) < as_is]

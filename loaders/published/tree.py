@@ -12,7 +12,7 @@ from pathlib import Path
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.png import read_png_size
+from fpp_ml_bench.loaders.published.files import read_png_size
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"
@@ -47,13 +47,6 @@ FilesBySplit = dict[str, dict[str, Path]]
 def frame_file(index: int) -> str:
     """File name of frame ``index`` in a raw scan."""
     return f"A_{index}.png"
-
-
-def _is_sample(stem: str) -> bool:
-    try:
-        return split_sample_name(stem)[1] in VIEWS
-    except ValueError:
-        return False
 
 
 def layout_error(root: object, problems: list[str]) -> LayoutError:
@@ -182,9 +175,10 @@ class _Scan:
             return {}
         files = {}
         for entry in _entries(folder):
+            name, _, view = entry.stem.rpartition("_")
             if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
-            elif not _is_sample(entry.stem):
+            elif not name or view not in VIEWS:
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
             else:
                 files[entry.stem] = entry
@@ -225,9 +219,8 @@ class _Scan:
         folder = self.training / INFO
         if not folder.is_dir():
             if needed:
-                self.problems.append(
-                    f"{folder}: the folder is missing; normalised depth can't be converted to mm without it"
-                )
+                reason = "normalised depth can't be converted to mm without it"
+                self.problems.append(f"{folder}: the folder is missing; {reason}")
             return {}
         files: FilesBySplit = {}
         split_folders = sorted(PUBLISHED_SPLIT_FOLDERS[split] for split in depths)
@@ -290,9 +283,9 @@ class _Scan:
         """Report objects that are in two splits or lack views."""
         first_files: dict[str, dict[str, Path]] = {}
         views: dict[str, set[str]] = {}
-        for sample in samples:
-            views.setdefault(sample.object, set()).add(sample.view)
-            first_files.setdefault(sample.object, {}).setdefault(sample.split, sample.fringes[0])
+        for s in samples:
+            views.setdefault(s.object, set()).add(s.view)
+            first_files.setdefault(s.object, {}).setdefault(s.split, s.fringes[0])
         for name, by_split in first_files.items():
             first, *others = by_split.values()
             if others:

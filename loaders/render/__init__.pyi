@@ -1,4 +1,3 @@
-from .builder import MESH_FOLDER as MESH_FOLDER
 from .builder import assembly_of as assembly_of
 from .builder import build as build
 from .builder import explain_build as explain_build

@@ -10,14 +10,13 @@ import numpy as np
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import GENERATED, Assembly, Manifest, Progress, ShardPlan, assemble, plan_shards
+from fpp_ml_bench.loaders.storage import MESH_FOLDER, Assembly, Manifest, Progress, ShardPlan
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
-
-MESH_FOLDER = "meshes"
 
 
 @dataclass(frozen=True)
@@ -47,27 +46,19 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
     user_splits = {mesh.name: mesh.split for mesh in settings.user_meshes}
     plans = []
     for split in SPLITS:
-        objects = {
-            name: [(sample_name(name, view), name, view) for view in VIEWS]
-            for name in settings.objects
-            if user_splits.get(name, split_of(name)) == split
-        }
-        if objects:
-            plans += plan_shards(split, objects)
+        names = [name for name in settings.objects if user_splits.get(name, split_of(name)) == split]
+        if names:
+            objects = {name: [(sample_name(name, view), name, view) for view in VIEWS] for name in names}
+            plans += storage.plan_shards(split, objects)
     return plans
 
 
 def assembly_of(settings: BuildSettings) -> Assembly:
     """What there is to do for a build, and its manifest so far."""
-    manifest = Manifest(
-        origin=GENERATED,
-        generator={"name": "fpp-ml-bench", "version": __version__},
-        settings=settings.describe(),
-        rig=settings.rig.to_dict(),
-        size=(settings.rig.camera.height, settings.rig.camera.width),
-        stored=settings.stored,
-        exact=True,
-    )
+    rig, generator = settings.rig, {"name": "fpp-ml-bench", "version": __version__}
+    size = rig.camera.height, rig.camera.width
+    described, stored = settings.describe(), settings.stored
+    manifest = Manifest(storage.GENERATED, generator, described, rig.to_dict(), size, stored, exact=True)
     return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 
 
@@ -76,7 +67,7 @@ def build(folder: Path, settings: BuildSettings, workers: int, progress: Progres
 
     Raises `BuildError` (folder in use, other settings, disk full) and `MeshError` (an object does not fit).
     """
-    return assemble(folder, assembly_of(settings), workers, progress)
+    return storage.assemble(folder, assembly_of(settings), workers, progress)
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
@@ -84,7 +75,7 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
 
     Raises `BuildError` for a dataset of an earlier version, which counted something else.
     """
-    if manifest.origin != GENERATED:
+    if manifest.origin != storage.GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
     if any("shadow_rays" not in row for row in rows):
@@ -116,10 +107,8 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     decoded = frames - 2
     if settings.shadows:  # a ray for every pixel of the image would be all of them
         rays = sum(row["shadow_rays"] for row in rows)
-        background = account(
-            "shadow rays past the object's box", "rays", rays, all_px, empty_scene,
-            view_px - row["shadow_rays"],
-        )  # fmt: skip
+        past = view_px - row["shadow_rays"]
+        background = account("shadow rays past the object's box", "rays", rays, all_px, empty_scene, past)
     else:
         background = account("empty background again", "pixels", view_px, all_px, empty_scene, view_px)
         background = replace(background, rule=f"{rule}; lit once a process, one process assumed")

@@ -5,7 +5,7 @@ plane). A surface turned away from the projector gets ambient light only; cast s
 paper.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -47,7 +47,7 @@ class LitPixels:
     lookup: dict[Direction, PatternLookup]
     gain: NDArray[np.float32]
     ambient: NDArray[np.float32]
-    shadow_rays: int = field(default=0)
+    shadow_rays: int = 0
 
     def patched(self, where: NDArray[np.int64], patch: "LitPixels") -> "LitPixels":
         """A copy in which the pixels at flat indices ``where`` are those of ``patch``."""
@@ -57,10 +57,10 @@ class LitPixels:
             copy[where] = patches
             return copy
 
-        lookup = {
-            direction: PatternLookup(replaced(here.index, there.index), replaced(here.weight, there.weight))
-            for (direction, here), there in zip(self.lookup.items(), patch.lookup.values(), strict=True)
-        }
+        lookup = {}
+        for direction, here in self.lookup.items():
+            there = patch.lookup[direction]
+            lookup[direction] = PatternLookup(replaced(here.index, there.index), replaced(here.weight, there.weight))
         gain, ambient = replaced(self.gain, patch.gain), replaced(self.ambient, patch.ambient)
         return LitPixels(lookup, gain, ambient, self.shadow_rays + patch.shadow_rays)
 
@@ -109,12 +109,8 @@ def light_surface(
         "vertical": PatternLookup.of(u, rig.pattern_length("vertical")),
         "horizontal": PatternLookup.of(v, rig.pattern_length("horizontal")),
     }
-    return LitPixels(
-        lookup,
-        np.where(lit, gain, 0.0).astype(np.float32),
-        np.where(seen, lighting.ambient_grey, 0.0).astype(np.float32),
-        shadow_rays,
-    )
+    gain = np.where(lit, gain, 0.0).astype(np.float32)
+    return LitPixels(lookup, gain, np.where(seen, lighting.ambient_grey, 0.0).astype(np.float32), shadow_rays)
 
 
 def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:

@@ -48,9 +48,8 @@ def load_user_mesh(description: UserMesh) -> SolidMesh:
         vertices_m[:, first], vertices_m[:, second] = cosine * a - sine * b, sine * a + cosine * b
     if description.centre:
         vertices_m = vertices_m - (vertices_m.min(axis=0) + vertices_m.max(axis=0)) / 2
-    return SolidMesh(
-        description.name, vertices_m + np.asarray(description.offset_m), np.asarray(mesh.faces, dtype=np.int32)
-    )
+    vertices_m = vertices_m + np.asarray(description.offset_m)
+    return SolidMesh(description.name, vertices_m, np.asarray(mesh.faces, dtype=np.int32))
 
 
 # What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8

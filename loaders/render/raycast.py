@@ -1,10 +1,9 @@
 """Which pixel sees which triangle of an object, the exact depth and normal there, and what lies in shadow.
 
-The camera's rays go through a depth buffer over the pixels' own rays, lens distortion included; any other ray through a
-box tree. All of it is compiled and float64. Which triangle a ray meets is decided by the signs of three edge functions,
-``d . (a x b)`` for the edge from a to b as seen from the ray's origin. Two triangles that share an edge compute exactly
-opposite values for it, so no ray passes between them. There is no fastmath and no fused multiply-add, so every
-processor gives the same answer (see `fpp_ml_bench.machine`).
+The camera's rays go through a depth buffer over the pixels' own rays, any other ray through a box tree, compiled and in
+float64. The signs of three edge functions, ``d . (a x b)`` for the edge from a to b seen from the ray's origin, decide:
+triangles that share an edge have exactly opposite values for it, so no ray passes between them. Without fastmath and
+fused multiply-add every processor gives the same answer (see `fpp_ml_bench.machine`).
 """
 
 from dataclasses import dataclass
@@ -39,11 +38,9 @@ class Hits:
 
 
 class PixelRays:
-    """The rays of an image: ``x`` and ``y`` float64 (H, W), undistorted normalised coordinates; NaN where there is no
-    ray.
+    """The rays of an image: ``x`` and ``y`` float64 (H, W), undistorted normalised coordinates, NaN without a ray.
 
-    ``columns`` float64 (2, W) bounds them: the greatest x up to each column, and the least x from it on. ``rows``
-    (2, H) does the same for y.
+    ``columns`` float64 (2, W): the greatest x up to each column, and the least x from it on; ``rows`` (2, H) for y.
     """
 
     def __init__(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:

@@ -84,12 +84,8 @@ class BuildSettings:
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
         return {
-            "objects": list(self.objects),
-            "placement": self.placement,
-            "frames": self.stored,
-            "seed": self.seed,
-            "noise_sigma_grey": self.noise_sigma_grey,
-            "shadows": self.shadows,
+            "objects": list(self.objects), "placement": self.placement, "frames": self.stored, "seed": self.seed,
+            "noise_sigma_grey": self.noise_sigma_grey, "shadows": self.shadows,
             "user_meshes": [
                 {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(mesh).items()
                  if key != "path"}

@@ -1,13 +1,8 @@
 """From lit pixels to the bytes of frames: pattern light, counter-based noise and 8-bit quantisation.
 
-Nothing is traced twice: where each pixel reads the pattern and how bright it is are computed once a view
-(`loaders.render.illumination`) and shared by all its frames. Frames can be exposed for any subset of pixels, in any
-order of computation; the bytes are those that the whole frames have there.
-
-The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit integer hash of the
-pixel number under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles.
-The sum of two normals is normal; it reaches 5.2 sigma and has 16 million levels, and the table stays in the first-level
-cache. This makes noise cheap (see docs/generating.md) and keeps its distribution normal (tests/render/test_sensor.py).
+The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit hash of the pixel number
+under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles, which is
+normal, reaches 5.2 sigma and has 16 million levels (docs/generating.md). So any subset of pixels can be exposed alone.
 """
 
 from collections.abc import Sequence
@@ -110,13 +105,9 @@ class Exposure:
         return cls(np.pad(light, ((0, 0), (0, 1)), mode="edge"), vertical, noise)
 
     def expose(
-        self,
-        frames: Sequence[int],
-        lit: LitPixels,
-        pixels: NDArray[np.uint32],
-        stream: tuple[object, ...],
+        self, frames: Sequence[int], lit: LitPixels, pixels: NDArray[np.uint32], stream: tuple[object, ...],
         out: NDArray[np.uint8] | None = None,
-    ) -> NDArray[np.uint8]:
+    ) -> NDArray[np.uint8]:  # fmt: skip
         """Frames at flat image positions ``pixels`` uint32 (n,), which ``lit`` describes in that order.
 
         ``stream`` names the view's noise, ``(seed, object, view)``. Returns uint8 (k, n), one row per entry of

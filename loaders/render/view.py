@@ -61,11 +61,8 @@ class Studio:
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
-        measured = {
-            "distance_mm": scene.distance_m * MM_PER_M,
-            "shadow_rays": whole.shadow_rays,
-            **ground_truth_error(depth_mm, exact_mm),
-        }
+        measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": whole.shadow_rays}
+        measured |= ground_truth_error(depth_mm, exact_mm)
         frames = {index: self._frames[index] for index in self.stored}
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
 

@@ -1,4 +1,4 @@
-"""The dataset format on disk: Arrow shards, manifest, reading, verifying, exporting."""
+"""The dataset format on disk: Arrow shards, manifest, reading, verifying, Parquet."""
 
 import lazy_loader
 

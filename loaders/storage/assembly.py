@@ -55,30 +55,25 @@ class Assembly:
 
     def key(self) -> dict[str, Any]:
         """Settings that must be equal for a run to resume in this folder."""
-        content = asdict(self.manifest)
-        return {
-            name: content[name] for name in ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
-        }
+        names = ("origin", "settings", "rig", "size", "stored", "exact", "schema_version")
+        return {name: getattr(self.manifest, name) for name in names}
 
     def writer(self, folder: Path, scratch: Path) -> ShardWriter:
-        """The writer of this dataset's shards."""
         content = self.manifest
         return ShardWriter(folder, scratch, content.sequence, content.stored, content.exact, content.size)
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset. Returns the manifest at the end.
+    """Write or finish the dataset, and return its manifest.
 
-    ``progress`` is called with numbers of finished rows: first the rows of an interrupted run, then each new row. It is
-    not called when the dataset is already finished.
-
+    ``progress`` is called with numbers of finished rows, first those of an interrupted run; not for a finished dataset.
     Raises `BuildError` when the folder is in use, holds other files, or can't be written.
     """
     try:
         with writing(folder) as scratch:
             if (folder / MANIFEST).exists():
                 manifest = DatasetFolder(folder).manifest  # every file is there, in full length
-                _compare(folder, {key: asdict(manifest)[key] for key in assembly.key()}, assembly.key())
+                _compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
                 return manifest
             return _assemble(folder, scratch, assembly, workers, progress)
     except OSError as error:
@@ -269,16 +264,14 @@ def _end_with_parent() -> None:
 @contextmanager
 def _single_threaded_algebra() -> Iterator[None]:
     """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
-    previous = {name: os.environ.get(name) for name in THREAD_COUNTS}
+    previous = {name: os.environ[name] for name in THREAD_COUNTS if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
     try:
         yield
     finally:
-        for name, value in previous.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in THREAD_COUNTS:
+            os.environ.pop(name, None)
+        os.environ.update(previous)
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:

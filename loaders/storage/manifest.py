@@ -18,6 +18,7 @@ from fpp_ml_bench.optics import Sequence
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
+MESH_FOLDER = "meshes"
 GENERATED = "generated"
 """`Manifest.origin` of a dataset that the builder made."""
 

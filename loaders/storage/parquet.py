@@ -25,16 +25,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
-from fpp_ml_bench.loaders.sample import (
-    DATA_GROUP,
-    DEPTH,
-    DEPTH_EXACT,
-    LABELS,
-    RANGE,
-    config_columns,
-    features,
-    row_columns,
-)
+from fpp_ml_bench.loaders import sample as layout
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, config_columns
 from fpp_ml_bench.loaders.storage.card import CARD_HEAD, data_version
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
@@ -74,7 +66,7 @@ def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
 
 
 def _all_columns(dataset: DatasetFolder) -> list[str]:
-    return row_columns(dataset.sequence, dataset.manifest.stored_frames, dataset.has_exact)
+    return layout.row_columns(dataset.sequence, dataset.manifest.stored_frames, dataset.has_exact)
 
 
 def data_shards(dataset: DatasetFolder) -> dict[str, ShardFile]:
@@ -154,13 +146,9 @@ def write_shard(
     def groups(pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
         for first in range(0, len(samples), rows):
             group = samples[first : first + rows]
-            arrays = [
-                _encoded(dataset, group, field, pool)
-                if field.name in pictures
-                else stored[field.name].slice(first, len(group))
-                for field in schema
-            ]
-            yield pa.Table.from_arrays(arrays, schema=schema)
+            encoded = {name: _encoded(dataset, group, schema.field(name), pool) for name in pictures}
+            plain = {name: column.slice(first, len(group)) for name, column in stored.items()}
+            yield pa.Table.from_arrays([(plain | encoded)[name] for name in names], schema=schema)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -177,18 +165,13 @@ def write_shard(
 
 
 def _write_groups(
-    path: Path,
-    schema: pa.Schema,
-    settings: dict[str, Any],
-    groups: Iterator[pa.Table],
-    rows_done: Callable[[int], None],
+    path: Path, schema: pa.Schema, settings: dict[str, Any], groups: Iterator[pa.Table], done: Callable[[int], None]
 ) -> None:
-    """Write tables as row groups of a Parquet file."""
     try:
         with pq.ParquetWriter(path, schema, **settings) as writer:
             for group in groups:
                 writer.write_table(group, row_group_size=group.num_rows)
-                rows_done(group.num_rows)
+                done(group.num_rows)
     except pa.ArrowException as error:
         raise OSError(f"{path.name}: {error}") from error
 
@@ -216,13 +199,12 @@ def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str,
 
 def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]) -> pa.Schema:
     arrays = [name for name in names if name not in pictures]
-    fields = {field.name: field for field in arrow_schema(arrays, dataset.size)}
-    described: dict[str, Any] = features(arrays, dataset.size)
+    schema = arrow_schema(arrays, dataset.size)
+    described = layout.features(arrays, dataset.size) | {name: {"_type": "Image"} for name in pictures}
     image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    fields |= {name: pa.field(name, image) for name in pictures}
-    described |= {name: {"_type": "Image"} for name in pictures}
+    fields = [pa.field(name, image) if name in pictures else schema.field(name) for name in names]
     content = {"info": {"features": {name: described[name] for name in names}}}
-    return pa.schema([fields[name] for name in names], metadata={b"huggingface": json.dumps(content).encode()})
+    return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
 
 
 def _encoded(dataset: DatasetFolder, samples: list[str], field: pa.Field, pool: ThreadPoolExecutor) -> pa.Array:
@@ -272,13 +254,8 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
         for config in dataset.configs
     ]
     return CARD_HEAD + _CARD.format(
-        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(),
-        origin=manifest.origin,
-        rows=sum(len(dataset.samples(split)) for split in splits),
-        height=dataset.size[0],
-        width=dataset.size[1],
-        fingerprint=manifest.fingerprint,
-        config=dataset.configs[0],
-        split=splits[0],
+        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(), origin=manifest.origin,
+        rows=sum(len(dataset.samples(split)) for split in splits), height=dataset.size[0], width=dataset.size[1],
+        fingerprint=manifest.fingerprint, config=dataset.configs[0], split=splits[0],
         names=", ".join(f"`{config}`" for config in dataset.configs),
-    )
+    )  # fmt: skip

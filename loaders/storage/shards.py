@@ -1,9 +1,17 @@
-"""Writing shards: the rows of a few objects, an Arrow stream file per column group, completely or not at all."""
+"""Writing shards: the rows of a few objects, an Arrow stream file per column group, completely or not at all.
 
+Gigabytes of shards would push everything else out of memory, and copying them into the cache takes longer than
+rendering them. Blocks therefore go to the disk directly (``O_DIRECT``) from a separate thread while the next block is
+being filled. Where the file system can't do that (tmpfs, some network mounts), the same code writes through the cache.
+"""
+
+import errno
+import fcntl
 import json
+import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +19,115 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import xxhash
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.sample import (
-    DATA_GROUP,
-    DEPTH,
-    DEPTH_EXACT,
-    LABELS,
-    RANGE,
-    Row,
-    features,
-    group_columns,
-    stored_groups,
-)
-from fpp_ml_bench.loaders.storage.direct_file import DirectFile
+from fpp_ml_bench.loaders import sample as layout
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.optics import Sequence
+
+BLOCK_BYTES = 1 << 22
+_BLOCKS = 4
+
+
+class DirectFile:
+    """A new file for sequential writing, in the form that ``pyarrow.PythonFile`` takes.
+
+    ``thread`` writes the blocks; several files may share it. After `close`, ``size`` bytes with hash ``xxh3_128`` are
+    on the disk. Errors of the disk are raised as ``OSError`` by a later `write` or by `close`.
+    """
+
+    def __init__(self, path: Path, thread: ThreadPoolExecutor) -> None:
+        self._hash = xxhash.xxh3_128()
+        self._thread = thread
+        # Anonymous maps are page-aligned, as direct writes demand.
+        self._blocks = [mmap.mmap(-1, BLOCK_BYTES) for _ in range(_BLOCKS)]
+        self._pending: list[Future[None] | None] = [None] * _BLOCKS
+        self._current, self._filled = 0, 0
+        self.size = 0
+        self.closed = False
+        self._descriptor = _open_for_writing(path)
+
+    def write(self, data: object) -> int:
+        """Append ``data`` (any bytes-like object); returns its length."""
+        view = memoryview(data).cast("B")  # type: ignore[arg-type]
+        length = len(view)
+        self._hash.update(view)
+        self.size += length
+        while len(view):
+            count = min(len(view), BLOCK_BYTES - self._filled)
+            self._blocks[self._current][self._filled : self._filled + count] = view[:count]
+            self._filled += count
+            view = view[count:]
+            if self._filled == BLOCK_BYTES:
+                self._pending[self._current] = self._thread.submit(
+                    _write_block, self._descriptor, memoryview(self._blocks[self._current])
+                )
+                self._current, self._filled = (self._current + 1) % _BLOCKS, 0
+                self._wait(self._current)
+        return length
+
+    def _wait(self, block: int) -> None:
+        pending, self._pending[block] = self._pending[block], None
+        if pending is not None:
+            pending.result()
+
+    def flush(self) -> None:
+        """Does nothing, but pyarrow calls it."""
+
+    def close(self) -> None:
+        """Write the rest and wait until everything is on the disk."""
+        if self.closed:
+            return
+        self.closed = True
+        try:
+            for block in range(_BLOCKS):
+                self._wait(block)
+            if self._filled:
+                _use_cache(self._descriptor)  # the rest is not a whole number of disk blocks
+                _write_block(self._descriptor, memoryview(self._blocks[self._current])[: self._filled])
+            os.fdatasync(self._descriptor)
+        finally:
+            for pending in self._pending:
+                if pending is not None:
+                    pending.exception()  # wait: the thread may still read the block
+            os.close(self._descriptor)
+
+    @property
+    def xxh3_128(self) -> str:
+        """Hash of everything written."""
+        return self._hash.hexdigest()
+
+
+def _open_for_writing(path: Path) -> int:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    try:
+        return os.open(path, flags | getattr(os, "O_DIRECT", 0), 0o644)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        return os.open(path, flags, 0o644)
+
+
+def _use_cache(descriptor: int) -> None:
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) & ~getattr(os, "O_DIRECT", 0))
+
+
+def _write_block(descriptor: int, view: memoryview) -> None:
+    while len(view):
+        try:
+            done = os.write(descriptor, view)
+        except OSError as error:
+            direct = fcntl.fcntl(descriptor, fcntl.F_GETFL) & getattr(os, "O_DIRECT", 0)
+            if error.errno != errno.EINVAL or not direct:
+                raise
+            _use_cache(descriptor)  # a file system that opens for direct writes and then refuses them
+            continue
+        view = view[done:]
+
 
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
@@ -61,9 +160,9 @@ def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> l
     count = max(1, len(names) // OBJECTS_PER_SHARD)
     plans, first_row = [], 0
     for index, chunk in enumerate(np.array_split(np.arange(len(names)), count)):
-        samples = tuple(sample for i in chunk for sample in objects[names[i]])
-        plans.append(ShardPlan(split, index, count, first_row, samples))
-        first_row += len(samples)
+        rows = tuple(sample for i in chunk for sample in objects[names[i]])
+        plans.append(ShardPlan(split, index, count, first_row, rows))
+        first_row += len(rows)
     return plans
 
 
@@ -73,8 +172,7 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
     Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
     metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
     """
-    fields = []
-    described = features(columns, size)
+    fields, described = [], layout.features(columns, size)
     types = {"string": pa.string(), "float32": pa.float32(), "uint8": pa.uint8()}
     for name, feature in described.items():
         kind = types[feature["dtype"]]
@@ -100,9 +198,9 @@ class ShardWriter:
         self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
     ) -> None:
         self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
-        self._groups = stored_groups(sequence, stored)
+        self._groups = layout.stored_groups(sequence, stored)
         self._schemas = {
-            group: arrow_schema(group_columns(sequence, group, frames, exact), size)
+            group: arrow_schema(layout.group_columns(sequence, group, frames, exact), size)
             for group, frames in self._groups.items()
         }
         self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
@@ -127,10 +225,9 @@ class ShardWriter:
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
-            raise BuildError(
-                f"{self._folder / plan.path(DATA_GROUP)}: can't be written ({reason}); free some space or choose "
-                "another disk, then run the same command again: it resumes"
-            ) from error
+            where = self._folder / plan.path(DATA_GROUP)
+            advice = "free some space or choose another disk, then run the same command again: it resumes"
+            raise BuildError(f"{where}: can't be written ({reason}); {advice}") from error
         finally:
             for path in temporary.values():
                 path.unlink(missing_ok=True)
@@ -140,14 +237,11 @@ class ShardWriter:
         self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
     ) -> tuple[list[dict[str, Any]], dict[str, DirectFile]]:
         with ThreadPoolExecutor(1) as thread, ExitStack() as files:
-            sinks: dict[str, DirectFile] = {}
+            sinks, writers = {}, {}
             for group, path in paths.items():
                 sinks[group] = DirectFile(path, thread)
                 files.callback(sinks[group].close)
-            writers = {
-                group: pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
-                for group, sink in sinks.items()
-            }
+                writers[group] = pa.ipc.new_stream(pa.PythonFile(sinks[group], mode="w"), self._schemas[group])
             described = []
             data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
@@ -161,9 +255,7 @@ class ShardWriter:
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
                 for group, frames in self._groups.items():
-                    images: dict[str, Any] = {
-                        self._sequence.frames[index].column: row.frames[index] for index in frames
-                    }
+                    images: dict[str, Any] = {self._sequence.frames[i].column: row.frames[i] for i in frames}
                     if group != DATA_GROUP:
                         batch = [self._checked(image, column)[None] for column, image in images.items()]
                         writers[group].write_batch(_record_batch(batch, self._schemas[group]))
@@ -237,7 +329,6 @@ def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, f
         raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
     inside = depth_mm[object_mask(depth_mm)]
     if inside.size == 0:
-        raise BuildError(
-            f"sample {sample!r}: its depth map has no pixel above 0 mm; expected an object in the working range"
-        )
+        expected = "expected an object in the working range"
+        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm; {expected}")
     return float(inside.min()), float(inside.max())

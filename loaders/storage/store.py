@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,10 +56,8 @@ class DatasetFolder:
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
             if size != shard.bytes:
-                found_size = "it is missing" if size is None else f"it has {size}"
-                raise DatasetError(
-                    f"{file}: expected {shard.bytes} bytes, {found_size}; build or copy the dataset again"
-                )
+                found = "it is missing" if size is None else f"it has {size}"
+                raise DatasetError(f"{file}: expected {shard.bytes} bytes, {found}; build or copy the dataset again")
 
     def forget(self, shard: ShardFile) -> None:
         """Close the memory maps of a file."""
@@ -223,11 +221,9 @@ class DatasetFolder:
             try:
                 self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
             except (ValueError, KeyError, AttributeError) as error:
-                height, width = self.size
-                raise DatasetError(
-                    f"{self.path / shard.path}: column {column} does not hold images of {height} x {width} px "
-                    f"({error}); run: fpp-bench verify"
-                ) from error
+                expected = f"does not hold images of {self.size[0]} x {self.size[1]} px ({error})"
+                where = f"{self.path / shard.path}: column {column}"
+                raise DatasetError(f"{where} {expected}; run: fpp-bench verify") from error
         return self._images[key]
 
     def _views(self, column: "pa.Array") -> NDArray:
@@ -255,11 +251,10 @@ def _madvise() -> Any:
 
 
 def release_pages(view: NDArray[Any], address: int, size: int) -> None:
-    """Release the pages that contain ``view``, a contiguous array, and the pages mapped together with them.
+    """Release the pages of ``view``, a contiguous array in a READ-ONLY FILE map, and the pages mapped with them.
 
-    ``address`` and ``size`` (bytes) are those of the whole READ-ONLY FILE map that contains ``view``. No page outside
-    is touched: on memory that is not backed by a file, the same call would erase the data. On systems other than Linux,
-    or for a view outside the map, this does nothing.
+    ``address`` and ``size`` (bytes) are those of the whole map. No page outside is touched: on memory that is not
+    backed by a file, the same call would erase the data. Does nothing on other systems than Linux.
     """
     madvise = _madvise()
     start = view.ctypes.data
@@ -272,28 +267,8 @@ def release_pages(view: NDArray[Any], address: int, size: int) -> None:
     madvise(begin, end - begin, _MADV_DONTNEED)
 
 
-@overload
-def load_dataset(folder: str | Path, config: str = ..., *, split: str) -> "Dataset": ...
-@overload
-def load_dataset(folder: str | Path, config: str = ..., split: None = ...) -> "DatasetDict": ...
 def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
-    """Open a built or imported dataset folder as a ``datasets.Dataset``, or every split as a ``DatasetDict``.
-
-    Parameters
-    ----------
-    folder : dataset folder written by ``fpp-bench build`` or ``fpp-bench import``.
-    config : ``single_shot`` (frame 0), ``horizontal``, ``vertical``, ``sinusoidal`` or ``all``. Columns: ``sample,
-        object, view, split``, one uint8 (H, W) ``frame_NN`` column per frame, ``depth`` and, for generated data,
-        ``depth_exact`` (float32 (H, W), mm, 0 = background), ``depth_min``, ``depth_max`` (mm).
-    split : ``train``, ``validation`` or ``test``; None for all of them.
-
-    Raises `DatasetError` for a folder that is not a finished dataset, an unknown or unstored configuration or split.
-
-    Examples
-    --------
-    >>> train = load_dataset("data/mini", "single_shot", split="train")        # doctest: +SKIP
-    >>> train.with_format("numpy")[0]["depth"].max()                            # doctest: +SKIP
-    """
+    """A built or imported dataset folder as ``datasets`` objects; see `fpp_ml_bench.load_dataset`."""
     dataset = DatasetFolder(folder)
     if config not in CONFIGS:
         raise DatasetError(f"unknown configuration {config!r}; there are {', '.join(CONFIGS)}")
@@ -326,10 +301,8 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
         if names:
             tables.append(concat_tables([file.select(names) for file in files], axis=0))
     table = tables[0] if len(tables) == 1 else ConcatenationTable.from_tables(tables, axis=1)
-    info = DatasetInfo(
-        features=Features.from_dict(features(columns, dataset.size)), config_name=config,
-        dataset_name="fpp-ml-bench",
-    )  # fmt: skip
+    described = Features.from_dict(features(columns, dataset.size))
+    info = DatasetInfo(features=described, config_name=config, dataset_name="fpp-ml-bench")
     # `datasets` caches later transforms by this fingerprint: it depends on the data, not on the path.
     fingerprint = f"{dataset.fingerprint[:16]}-{config}-{split}"
     return Dataset(table.select(columns), info=info, split=NamedSplit(split), fingerprint=fingerprint)

@@ -146,18 +146,16 @@ def _split_findings(manifest: Manifest) -> list[str]:
     for split, rows in manifest.samples.items():
         views: dict[str, list[str]] = {}
         for row in rows:
-            views.setdefault(row["object"], []).append(row["view"])
-            if row["sample"] != sample_name(row["object"], row["view"]):
-                findings.append(
-                    f"sample {row['sample']!r} in {split}: said to be view {row['view']} of {row['object']!r}"
-                )
+            name, view = row["object"], row["view"]
+            views.setdefault(name, []).append(view)
+            if row["sample"] != sample_name(name, view):
+                findings.append(f"sample {row['sample']!r} in {split}: said to be view {view} of {name!r}")
         for name, seen in views.items():
             if home.setdefault(name, split) != split:
                 findings.append(f"object {name!r} is in two splits, {home[name]} and {split}: scores would leak")
             if sorted(seen) != sorted(VIEWS):
-                findings.append(
-                    f"object {name!r} in {split}: expected the views {', '.join(VIEWS)}, found {', '.join(seen)}"
-                )
+                expected, found = ", ".join(VIEWS), ", ".join(seen)
+                findings.append(f"object {name!r} in {split}: expected the views {expected}, found {found}")
             if manifest.origin == GENERATED and name in OBJECTS and split_of(name) != split:
                 findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
     return findings

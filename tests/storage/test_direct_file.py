@@ -12,8 +12,8 @@ import pytest
 import xxhash
 from disks import small_disk
 
-from fpp_ml_bench.loaders.storage import direct_file
-from fpp_ml_bench.loaders.storage.direct_file import DirectFile
+from fpp_ml_bench.loaders.storage import shards
+from fpp_ml_bench.loaders.storage.shards import DirectFile
 
 BLOCK = 1 << 16
 
@@ -21,7 +21,7 @@ BLOCK = 1 << 16
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Blocks of 64 KiB, so that a few hundred kB fill every block several times."""
-    monkeypatch.setattr(direct_file, "BLOCK_BYTES", BLOCK)
+    monkeypatch.setattr(shards, "BLOCK_BYTES", BLOCK)
 
 
 def noise(size, seed=0):
@@ -63,13 +63,13 @@ def test_pieces_of_any_size_and_type(tmp_path, small_blocks):
 
 
 def test_a_block_is_not_filled_again_before_the_slow_disk_has_it(tmp_path, small_blocks, monkeypatch):
-    write_block = direct_file._write_block
+    write_block = shards._write_block
 
     def slow(descriptor, view):
         time.sleep(0.005)
         write_block(descriptor, view)
 
-    monkeypatch.setattr(direct_file, "_write_block", slow)
+    monkeypatch.setattr(shards, "_write_block", slow)
     content = noise(20 * BLOCK + 5)
     write(tmp_path / "x", [content])
     assert (tmp_path / "x").read_bytes() == content

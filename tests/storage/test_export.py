@@ -16,9 +16,9 @@ from scored_dataset import write_predictions
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.published import FrameOrder, import_notes, parse_order
-from fpp_ml_bench.loaders.published import export as export_tree
+from fpp_ml_bench.loaders.published import exporting as export_tree
+from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
 from fpp_ml_bench.loaders.sample import config_columns
-from fpp_ml_bench.loaders.storage.exporting import chosen_splits, export
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
 
 TRAINING = Path("training_datasets")
@@ -306,7 +306,7 @@ def test_a_full_disk_leaves_nothing_and_a_second_try_succeeds(opened, tmp_path, 
 
 
 def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp_path):
-    from fpp_ml_bench.loaders.storage.exporting import exporting
+    from fpp_ml_bench.loaders.published.exporting import exporting
 
     with exporting(tmp_path / "out"):
         with pytest.raises(BuildError, match="another process"):

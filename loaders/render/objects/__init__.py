@@ -1,98 +1,53 @@
 """The 50 ground-truth objects of the benchmark, as procedural watertight meshes.
 
-``object_mesh(name)`` is all there is to call. Every builder draws its object in millimetres at its real size, in a pose
-that shows it to the camera of the first view; the table below says which builder, and how much larger than life the
-object stands in the scene. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all;
-ours follow that and depart from it where the paper's image statistics need it: every view covers 3 to 40% of the image
-and a tenth on average, half the views span less than about 80 mm in depth, and nothing leaves 1.5 to 2.1 m.
-Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
+Each is drawn in millimetres at its real size, in a pose that shows it to the camera of the first view, and enlarged.
+The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all; ours depart from it where
+its image statistics need it: a view covers 3 to 40% of the image and a tenth on average, half the views span less
+than about 80 mm in depth. Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
 """
 
 import difflib
-from collections.abc import Callable
 
 import numpy as np
 import trimesh
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.objects import boxes, containers, household, tools
+from fpp_ml_bench.loaders.render.objects import containers, household, tools
 from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
 
-__all__ = ["BUILDERS", "object_mesh"]
+__all__ = ["ENLARGED", "object_mesh"]
 
 SLIVER_MM = 1e-2  # edges shorter than this are collapsed: booleans leave slivers there, and no pixel sees one
-
 FINAL_GRID_MM = 2.0**-8  # of the finished mesh: two hundred to a pixel, and coarse enough to leave no sliver
 
-# name: (builder, times real size)
-BUILDERS: dict[str, tuple[Callable[[], Solid], float]] = {
-    "master_chef_can": (containers.master_chef_can, 1.32),
-    "cracker_box": (boxes.cracker_box, 1.75),
-    "sugar_box": (boxes.sugar_box, 2.1),
-    "tomato_soup_can": (containers.tomato_soup_can, 2.25),
-    "mustard_bottle": (containers.mustard_bottle, 1.48),
-    "tuna_fish_can": (containers.tuna_fish_can, 3.0),
-    "pudding_box": (boxes.pudding_box, 2.7),
-    "gelatin_box": (boxes.gelatin_box, 3.3),
-    "potted_meat_can": (containers.potted_meat_can, 2.65),
-    "banana": (household.banana, 3.0),
-    "pitcher": (household.pitcher, 1.85),
-    "bleach_cleanser": (containers.bleach_cleanser, 1.35),
-    "bowl": (household.bowl, 2.6),
-    "mug": (household.mug, 3.2),
-    "power_drill": (tools.power_drill, 1.72),
-    "wood_block": (boxes.wood_block, 2.1),
-    "scissors": (tools.scissors, 2.6),
-    "marker": (household.marker, 4.0),
-    "large_clamp": (tools.large_clamp, 2.15),
-    "eyeglasses": (household.eyeglasses, 2.55),
-    "open_book": (boxes.open_book, 1.65),
-    "spray_bottle": (containers.spray_bottle, 1.6),
-    "cleaning_bucket": (household.cleaning_bucket, 1.5),
-    "container_bottle": (containers.container_bottle, 1.8),
-    "container_tin": (containers.container_tin, 1.32),
-    "vial": (containers.vial, 4.6),
-    "lighting_candles": (household.lighting_candles, 1.75),
-    "magazine_stack": (boxes.magazine_stack, 1.27),
-    "wooden_boards": (boxes.wooden_boards, 1.0),
-    "paint_container_bottle": (containers.paint_container_bottle, 3.0),
-    "paint_container_jar": (containers.paint_container_jar, 1.68),
-    "paint_container_spraycan": (containers.paint_container_spraycan, 2.05),
-    "paint_container_tube_small": (containers.paint_container_tube_small, 4.35),
-    "paint_container_tube": (containers.paint_container_tube, 2.88),
-    "paint_container_tube_large": (containers.paint_container_tube_large, 1.78),
-    "paint_brush": (tools.paint_brush, 2.35),
-    "paint_brush_large": (tools.paint_brush_large, 2.1),
-    "pallet_knife": (tools.pallet_knife, 2.15),
-    "pallet_knife_large": (tools.pallet_knife_large, 1.95),
-    "spraygun": (tools.spraygun, 1.45),
-    "paint_thinner": (containers.paint_thinner, 1.7),
-    "battery": (household.battery, 4.9),
-    "battery_case": (household.battery_case, 4.2),
-    "chalk_stick": (household.chalk_stick, 4.9),
-    "pen": (household.pen, 4.2),
-    "cork": (containers.cork, 4.5),
-    "clamp": (tools.clamp, 2.0),
-    "boxcutter": (tools.boxcutter, 2.5),
-    "hammer": (tools.hammer, 1.8),
-    "duct_tape": (household.duct_tape, 2.4),
-}
+ENLARGED: dict[str, float] = {
+    "master_chef_can": 1.32, "cracker_box": 1.75, "sugar_box": 2.1, "tomato_soup_can": 2.25, "mustard_bottle": 1.48,
+    "tuna_fish_can": 3.0, "pudding_box": 2.7, "gelatin_box": 3.3, "potted_meat_can": 2.65, "banana": 3.0,
+    "pitcher": 1.85, "bleach_cleanser": 1.35, "bowl": 2.6, "mug": 3.2, "power_drill": 1.72, "wood_block": 2.1,
+    "scissors": 2.6, "marker": 4.0, "large_clamp": 2.15, "eyeglasses": 2.55, "open_book": 1.65, "spray_bottle": 1.6,
+    "cleaning_bucket": 1.5, "container_bottle": 1.8, "container_tin": 1.32, "vial": 4.6, "lighting_candles": 1.75,
+    "magazine_stack": 1.27, "wooden_boards": 1.0, "paint_container_bottle": 3.0, "paint_container_jar": 1.68,
+    "paint_container_spraycan": 2.05, "paint_container_tube_small": 4.35, "paint_container_tube": 2.88,
+    "paint_container_tube_large": 1.78, "paint_brush": 2.35, "paint_brush_large": 2.1, "pallet_knife": 2.15,
+    "pallet_knife_large": 1.95, "spraygun": 1.45, "paint_thinner": 1.7, "battery": 4.9, "battery_case": 4.2,
+    "chalk_stick": 4.9, "pen": 4.2, "cork": 4.5, "clamp": 2.0, "boxcutter": 2.5, "hammer": 1.8, "duct_tape": 2.4,
+}  # fmt: skip
+"""How much larger than life each object stands in the scene; a function of its name draws it."""
+_DRAWN = {**vars(containers), **vars(household), **vars(tools)}
 
 
 def object_mesh(name: str) -> trimesh.Trimesh:
-    """Mesh of one of the 50 objects, at the size it has in the scene.
+    """Mesh of one of the 50 objects at the size it has in the scene: metres, z up, watertight, centred at the origin.
 
-    Metres, z up, outward faces, watertight. The bounding box is centred at the origin and the turning axis is z; the
-    camera of the first view looks along +x. The same name gives the same bytes at every call. Raises
-    :class:`MeshError` for a name that is not one of ``constants.OBJECTS``. Source: own.
+    The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an unknown name.
     """
-    if name not in BUILDERS:
-        near = difflib.get_close_matches(name, BUILDERS, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(BUILDERS)}"
-        raise MeshError(f"expected one of the benchmark's {len(BUILDERS)} objects, got {name!r}; {hint}")
-    builder, scale = BUILDERS[name]
-    solid = on_grid(builder().scale((scale, scale, scale)), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
+    if name not in ENLARGED:
+        near = difflib.get_close_matches(name, ENLARGED, n=3, cutoff=0.4)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(ENLARGED)}"
+        raise MeshError(f"expected one of the benchmark's {len(ENLARGED)} objects, got {name!r}; {hint}")
+    drawn: Solid = _DRAWN[name]()
+    solid = on_grid(drawn.scale((ENLARGED[name],) * 3), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
     mesh = solid.to_mesh64()
     vertices_m = mesh.vert_properties[:, :3] / MM_PER_M
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)

@@ -2,42 +2,16 @@
 
 import numpy as np
 
-from fpp_ml_bench.loaders.render.objects.solids import (
-    SEGMENTS,
-    Point2,
-    Solid,
-    ball,
-    block,
-    curve,
-    cut,
-    disc,
-    embossed,
-    facing,
-    lathe,
-    loft,
-    place,
-    plate,
-    polygon,
-    rectangle,
-    ring,
-    rod,
-    softened,
-    stroke,
-    text_plate,
-    text_section,
-    tube,
-    union,
-    wrapped,
-)
+from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
+    SEGMENTS, Point2, Solid, around, ball, block, curve, cut, disc, embossed, facing, lathe, lettered, loft, place,
+    plate, polygon, rectangle, ring, rod, softened, stroke, text_plate, text_section, tube, union, wrapped,
+)  # fmt: skip
 
 
 def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
     """Screw cap standing on z = 0 with vertical grips."""
-    angle = 2 * np.pi * np.arange(ribs) / ribs
-    grips = [
-        rod((radius * c, radius * s, 1.5), (radius * c, radius * s, height - 2.5), 0.07 * radius)
-        for c, s in zip(np.cos(angle).tolist(), np.sin(angle).tolist(), strict=True)
-    ]
+    feet = [(radius * c, radius * s) for c, s in around(ribs)]
+    grips = [rod((x, y, 1.5), (x, y, height - 2.5), 0.07 * radius) for x, y in feet]
     return union(lathe([(radius, 0), (radius, height - 2), (radius - 2, height)]), *grips)
 
 
@@ -47,11 +21,7 @@ def mustard_bottle() -> Solid:
         [(0, 84, 46, 2.6), (3, 92, 55, 2.6), (10, 95, 58, 2.6), (60, 95, 58, 2.6), (112, 94, 57, 2.5),
          (132, 84, 53, 2.4), (146, 62, 46, 2.2), (153, 46, 42, 2.0), (155, 42, 41, 2.0)], smooth=8,
     )  # fmt: skip
-    closure = lathe(
-        np.concatenate(
-            [[(23.0, 152.0), (23.0, 163.0)], curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])]
-        )
-    )
+    closure = lathe([(23, 152), (23, 163), *curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])])
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
     words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
@@ -82,9 +52,8 @@ def container_bottle() -> Solid:
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
     panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
-    marks = (
-        text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70)) + rectangle(60, 7, 3, (-19, 48))
-    )
+    marks = text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70))
+    marks = marks + rectangle(60, 7, 3, (-19, 48))
     for step in range(7):
         marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
     drained = cut(union(body, panel, embossed(body, marks, 2.4)), hole, *thinner)
@@ -93,23 +62,16 @@ def container_bottle() -> Solid:
 
 def spray_bottle() -> Solid:
     """Trigger sprayer, 78 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
-    body = lathe(
-        np.concatenate([
-            [(31, 0), (37, 1)],
-            curve([(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]),
-            [(14.5, 205)],
-        ])
-    )  # fmt: skip
+    side = [(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]
+    body = lathe([(31, 0), (37, 1), *curve(side), (14.5, 205)])
     collar = ribbed_cap(19, 20, 30).translate((0, 0, 196))
     head = polygon([(-18, 214), (18, 214), (20, 226), (34, 236), (36, 262), (20, 275), (-34, 275), (-62, 266),
         (-64, 248), (-20, 244)], 3)  # fmt: skip
-    trigger = plate(
-        polygon(np.concatenate([
-            curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
-            curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
-        ])), 13, 0)  # fmt: skip
-    nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), rod((-76, 257, 0),
-        (-80, 257, 0), 5)))  # fmt: skip
+    front, back = (curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
+                   curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]))  # fmt: skip
+    trigger = plate(polygon([*front, *back]), 13)
+    tip = rod((-76, 257, 0), (-80, 257, 0), 5)
+    nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), tip))
     grip = [ring(39.2, 0.9, z) for z in (16, 22, 28)]
     words = wrapped(text_section("SPRAY", 56), 38.8, 74, 1.3)
     return place(union(body, collar, facing(plate(head, 19)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
@@ -133,11 +95,9 @@ def cork() -> Solid:
     for k in range(90):
         angle, z = 2.39996 * k, 2.5 + 36.5 * ((k * 0.4142136) % 1.0)
         radius = 12.7 + 0.09 * z
-        long = 0.6 + 1.9 * ((k * 0.7320508) % 1.0)
-        start = (radius * float(np.cos(angle)), radius * float(np.sin(angle)), z)
-        side = angle + 0.09 * long
-        end = (radius * float(np.cos(side)), radius * float(np.sin(side)), z + 0.4)
-        pits.append(rod(start, end, 0.4, 0.75, rounded=True))
+        side = angle + 0.09 * (0.6 + 1.9 * ((k * 0.7320508) % 1.0))
+        ends = [(radius * float(np.cos(a)), radius * float(np.sin(a)), at) for a, at in ((angle, z), (side, z + 0.4))]
+        pits.append(rod(ends[0], ends[1], 0.4, 0.75, rounded=True))
     holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
     split = block(10, 0.8, 14, 0, (-14, 4, 36))
     return place(cut(body, *pits, *holes, split), turn=(0, -2, 0))
@@ -160,23 +120,13 @@ def _pull_tab(scale: float = 1.0) -> Solid:
     return union(plate(tab, 1.6).translate((0, 0, 1.2)), rod((0, 0, -1), (0, 0, 2.6), 3.0 * scale))
 
 
-def _around(count: int) -> list[Point2]:
-    """Unit vectors at ``count`` equal steps round the axis."""
-    angle = 2 * np.pi * np.arange(count) / count
-    return [(float(c), float(s)) for c, s in zip(np.cos(angle), np.sin(angle), strict=True)]
-
-
 def master_chef_can() -> Solid:
     """Coffee can, 102 x 139 mm, with an overhanging plastic lid and its name on a label that does not quite close."""
     body = _rimmed(50, 132)
     lid = cut(lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]), rod((0, 0, 137), (0, 0, 141), 46))
     label = wrapped(rectangle(292, 112), 50, 65, 0.6)
-    name = union(
-        wrapped(text_section("MASTER", 76), 50.6, 92, 1.0),
-        wrapped(text_section("CHEF", 58), 50.6, 70, 1.0),
-        wrapped(disc(17), 50.6, 36, 1.0),
-    )
-    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in _around(60)]
+    name = union(*lettered(50.6, 1.0, ("MASTER", 76, 92), ("CHEF", 58, 70)), wrapped(disc(17), 50.6, 36, 1.0))
+    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in around(60)]
     return union(body, lid, label, name, *grips)
 
 
@@ -184,11 +134,7 @@ def tomato_soup_can() -> Solid:
     """Soup can, 66 x 101 mm, with ring-pull, two ribs and a label."""
     body = _rimmed(32.5, 101, ribs=(10, 91))
     label = wrapped(rectangle(188, 68), 32.5, 50.5, 0.5)
-    name = union(
-        wrapped(text_section("TOMATO", 62), 33, 66, 0.9),
-        wrapped(text_section("SOUP", 50), 33, 48, 0.9),
-        wrapped(disc(8), 33, 29, 1.0),
-    )
+    name = union(*lettered(33, 0.9, ("TOMATO", 62, 66), ("SOUP", 50, 48)), wrapped(disc(8), 33, 29, 1.0))
     return union(body, label, name, _pull_tab().translate((-8, 0, 98)))
 
 
@@ -204,13 +150,10 @@ def tuna_fish_can() -> Solid:
 
 def potted_meat_can() -> Solid:
     """Rectangular meat tin with round corners, 97 x 50 x 82 mm, a sunk lid with ring-pull."""
-    outline = 5.0
-    rows = [
-        (0, 95, 48, outline), (1, 97.5, 50.5, outline), (3, 97.5, 50.5, outline), (4, 95, 48, outline),
-        (78, 95, 48, outline), (79, 97.5, 50.5, outline), (81, 97.5, 50.5, outline), (82, 95, 48, outline),
-    ]  # fmt: skip
+    waist, rim, outline = (95, 48), (97.5, 50.5), 5.0
+    levels = ((0, waist), (1, rim), (3, rim), (4, waist), (78, waist), (79, rim), (81, rim), (82, waist))
     lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
-    body = loft(rows)
+    body = loft([(height, *size, outline) for height, size in levels])
     label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
     words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
     tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
@@ -221,7 +164,7 @@ def container_tin() -> Solid:
     """Kitchen canister, 110 x 158 mm: rolled seams, an overlapping domed lid with a knob, a label plate."""
     body = lathe([(53, 0), (54.4, 0.8), (54.4, 2.6), (53, 3.6), (53, 112)])
     dome = curve([(54.6, 122), (52, 127), (40, 132), (22, 135), (7, 136)])
-    lid = lathe(np.concatenate([[(54.0, 104.0), (55.4, 104.6), (55.4, 106.4), (54.6, 107.4)], dome, [(5.0, 140.0)]]))
+    lid = lathe([(54, 104), (55.4, 104.6), (55.4, 106.4), (54.6, 107.4), *dome, (5, 140)])
     knob = lathe(curve([(5, 138), (7, 143), (11, 147), (12.5, 152), (9, 157), (1, 158.6)]))
     beads = [ring(53, 1.2, z) for z in (14, 96)]
     plaque = wrapped(rectangle(74, 44, 8), 53, 56, 1.0)
@@ -234,22 +177,13 @@ _BRUSH_MARK = [(-20, -6), (-10, 4), (-2, -4), (8, 5), (20, -2)]
 
 def paint_container_bottle() -> Solid:
     """Craft-paint bottle, 44 x 118 mm, with a flip-top cap and a daub of paint on its label."""
-    body = lathe(
-        np.concatenate(
-            [[(19.0, 0.0), (21.5, 2.0), (22.0, 6.0), (22.0, 72.0)], curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])]
-        )
-    )
-    cap = union(
-        ribbed_cap(13, 13, 28).translate((0, 0, 91)),
-        lathe([(12.4, 103), (12.6, 112), (11, 115)]),
-        rod((0, 0, 114), (0, 0, 119), 4, 3),
-    )
+    body = lathe([(19, 0), (21.5, 2), (22, 6), (22, 72), *curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])])
+    top = lathe([(12.4, 103), (12.6, 112), (11, 115)])
+    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), top, rod((0, 0, 114), (0, 0, 119), 4, 3))
     notch = block(5, 11, 4, 1, (-13.6, 0, 104))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
-    words = union(
-        wrapped(text_section("PAINT", 34), 22.4, 54, 0.7),
-        wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9),
-    )
+    daub = wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9)
+    words = union(*lettered(22.4, 0.7, ("PAINT", 34, 54)), daub)
     return union(body, cut(cap, notch), label, words)
 
 
@@ -258,9 +192,9 @@ def paint_container_jar() -> Solid:
     body = lathe([(32, 0), (37, 3), (38, 8), (38, 52), (36, 58), (33, 62), (33, 68)], 1.2)
     lid = place(union(ribbed_cap(37.5, 17, 60), ring(34, 1.6, 17), ring(22, 1.0, 17)), (0, 0, 65), (0, 0, 7))
     runs = []
-    for y, top, length in ((-14, 62, 30), (-6, 62, 44), (3, 62, 22), (11, 62, 12), (20, 62, 34)):
+    for y, length in ((-14, 30), (-6, 44), (3, 22), (11, 12), (20, 34)):
         x = -float(np.sqrt(36.4**2 - y**2))
-        runs.append(rod((x, y, top), (x, y, top - length), 2.4, 3.6, rounded=True))
+        runs.append(rod((x, y, 62), (x, y, 62 - length), 2.4, 3.6, rounded=True))
     hem = tube([(-36.0 * np.cos(a), 36.0 * np.sin(a), 62.5) for a in np.linspace(-0.7, 0.8, 30)], 3.4)
     words = wrapped(text_section("PAINT", 44), 38, 14, 1.1)
     return union(body, lid, hem, words, *runs)
@@ -268,20 +202,14 @@ def paint_container_jar() -> Solid:
 
 def paint_container_spraycan() -> Solid:
     """Spray can, 66 x 195 mm: domed shoulder, valve cup and spray button with its nozzle."""
-    body = lathe(
-        np.concatenate([
-            [(31, 0), (33, 1), (33, 3), (32, 5), (32, 150), (33, 152), (33, 154.5)],
-            curve([(32, 156), (27, 163), (19, 168), (14.5, 169.5)]), [(14.5, 173), (11, 173)],
-        ])
-    )  # fmt: skip
+    dome = curve([(32, 156), (27, 163), (19, 168), (14.5, 169.5)])
+    wall = [(31, 0), (33, 1), (33, 3), (32, 5), (32, 150), (33, 152), (33, 154.5)]
+    body = lathe([*wall, *dome, (14.5, 173), (11, 173)])
     button = cut(lathe([(9, 171), (9, 186), (7.8, 193), (6.5, 195)], 0.8), block(10, 30, 10, 2, (5.5, 0, 197)))
     nozzle = union(rod((-6, 0, 187), (-10.5, 0, 187), 3.2), rod((-6, 0, 187), (-11.5, 0, 187), 1.2))
     label = wrapped(rectangle(178, 118), 32, 77, 0.4)
-    words = union(
-        wrapped(text_section("SPRAY", 66), 32.4, 112, 0.9),
-        wrapped(text_section("PAINT", 66), 32.4, 94, 0.9),
-        wrapped(stroke(_BRUSH_MARK, 12).scale((1.2, 1.2)), 32.4, 54, 1.0),
-    )
+    daub = wrapped(stroke(_BRUSH_MARK, 12).scale((1.2, 1.2)), 32.4, 54, 1.0)
+    words = union(*lettered(32.4, 0.9, ("SPRAY", 66, 112), ("PAINT", 66, 94)), daub)
     return union(body, button, nozzle, label, words)
 
 
@@ -297,12 +225,10 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
     ]  # fmt: skip
     body = loft(levels, smooth=8)
     fold = block(0.08 * width + 2.6, width + 1.5, crimp, 0.8, (0, 0, end - crimp / 2))
-    pleats = [
-        block(0.08 * width + 3.8, width + 1.6, 1.1, 0, (0, 0, end - crimp + 1.5 + 2.4 * k))
-        for k in range(int(crimp / 2.6))
-    ]
-    neck = lathe([(0.40 * width, shoulder), (0.40 * width, shoulder + 0.5), (0.36 * width, shoulder - 2),
-        (cap_radius * 0.6, cap_height - 4)][::-1])  # fmt: skip
+    folds = (end - crimp + 1.5 + 2.4 * k for k in range(int(crimp / 2.6)))
+    pleats = [block(0.08 * width + 3.8, width + 1.6, 1.1, 0, (0, 0, z)) for z in folds]
+    throat = [(cap_radius * 0.6, cap_height - 4), (0.36 * width, shoulder - 2)]
+    neck = lathe([*throat, (0.40 * width, shoulder + 0.5), (0.40 * width, shoulder)])
     rim = ring(0.4 * width - 0.6, 1.3, shoulder)
     return union(body, fold, neck, rim, *pleats, ribbed_cap(cap_radius, cap_height, 24))
 
@@ -310,9 +236,8 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 21 x 84 mm."""
     body = _tube(62, 20.5, 7.0, 10, 6)
-    return place(union(body, embossed(body, text_section("RED", 13).translate((0, 48)), 0.5)), turn=(1, 0, 0)).rotate(
-        (0, 0, 30)
-    )
+    words = embossed(body, text_section("RED", 13).translate((0, 48)), 0.5)
+    return place(union(body, words), turn=(1, 0, 0)).rotate((0, 0, 30))
 
 
 def paint_container_tube() -> Solid:
@@ -334,18 +259,13 @@ def paint_container_tube_large() -> Solid:
 
 def paint_thinner() -> Solid:
     """Rectangular solvent can, 165 x 100 x 240 mm: seams, sunk top with screw spout and a strap handle."""
-    body = union(
-        loft([(0, 163, 98, 9), (2, 166, 101, 9), (6, 166, 101, 9), (7, 163, 98, 9), (193, 163, 98, 9),
-              (194, 166, 101, 9), (199, 166, 101, 9), (200, 163, 98, 9)]),
-    )  # fmt: skip
+    wall, seam_size = (163, 98), (166, 101)
+    levels = ((0, wall), (2, seam_size), (6, seam_size), (7, wall), (193, wall), (194, seam_size), (199, seam_size))
+    body = union(loft([(height, *size, 9) for height, size in (*levels, (200, wall))]))
     top = loft([(196, 157, 92, 9), (203, 157, 92, 9)])
     spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
-    strap = tube(
-        curve([(0, 16, 196), (0, 12, 224), (0, -14, 238), (0, -48, 234), (0, -64, 214), (0, -66, 196)]),
-        9,
-        flatten=0.28,
-        up=(0, 0.3, 1),
-    )
+    bow = [(16, 196), (12, 224), (-14, 238), (-48, 234), (-64, 214), (-66, 196)]
+    strap = tube(curve([(0, y, z) for y, z in bow]), 9, flatten=0.28, up=(0, 0.3, 1))
     words = union(
         text_plate("PAINT", 112, 1.6).translate((0, 46, 0)), text_plate("THINNER", 140, 1.6).translate((0, 14, 0)),
         plate(stroke([(-58, -34), (-20, -34), (-20, -58), (-58, -58), (-58, -34)], 4), 3),

@@ -17,6 +17,7 @@ Solid: TypeAlias = Manifold
 Section: TypeAlias = CrossSection
 Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]
+Points: TypeAlias = Sequence[Sequence[float]] | np.ndarray
 Level = tuple[float, float, float, float]
 """Height, size along y, size along x, and power of a superellipse."""
 
@@ -70,7 +71,7 @@ def embossed(body: Solid, section: Section, relief: float) -> Solid:
     return on_grid(grown) ^ on_grid(facing(section.extrude(-2 * low_x)))
 
 
-def polygon(points: Sequence[Point2] | np.ndarray, soften: float = 0.0) -> Section:
+def polygon(points: Points, soften: float = 0.0) -> Section:
     """Filled outline (N, 2) in mm, in either sense of turning; its corners rounded to radius ``soften``."""
     outline = CrossSection([np.asarray(points, dtype=np.float64)])
     if outline.area() <= 0:
@@ -88,7 +89,7 @@ def softened(section: Section, radius: float) -> Section:
     return closed.offset(-radius, JoinType.Round, 2.0, arcs).simplify(0.01)
 
 
-def stroke(points: Sequence[Point2] | np.ndarray, width: float) -> Section:
+def stroke(points: Points, width: float) -> Section:
     """A polyline drawn with a round pen of ``width`` mm."""
     dots = [CrossSection.circle(width / 2, SMALL_SEGMENTS).translate((float(x), float(y))) for x, y in points]
     pieces = [(a + b).hull() for a, b in pairwise(dots)]
@@ -115,18 +116,17 @@ def plate(section: Section, thickness: float, bevel: float = 0.0) -> Solid:
     return (core + skin).hull()
 
 
-def _turned_section(profile: Sequence[Point2] | np.ndarray, soften: float) -> Section:
+def _turned_section(profile: Points, soften: float) -> Section:
     side = np.asarray(profile, dtype=np.float64)
-    mirrored = side[::-1] * (-1.0, 1.0)
-    return polygon(np.concatenate([side, mirrored]), soften)
+    return polygon([*side, *(side[::-1] * (-1.0, 1.0))], soften)
 
 
-def lathe(profile: Sequence[Point2] | np.ndarray, soften: float = 0.0, segments: int = SEGMENTS) -> Solid:
+def lathe(profile: Points, soften: float = 0.0, segments: int = SEGMENTS) -> Solid:
     """Solid of revolution about z of (radius, height) points from bottom to top, corners rounded by ``soften``."""
     return Manifold.revolve(_turned_section(profile, soften), segments)
 
 
-def vessel(profile: Sequence[Point2] | np.ndarray, wall: float, soften: float = 0.0) -> Solid:
+def vessel(profile: Points, wall: float, soften: float = 0.0) -> Solid:
     """A lathe that is hollow and open at its top, with walls and floor of ``wall`` mm."""
     outer = _turned_section(profile, soften)
     top = float(np.max(np.asarray(profile)[:, 1]))
@@ -170,7 +170,7 @@ def block(width: float, depth: float, height: float, soften: float = 0.0, at: Po
     return Manifold.batch_hull(corners).translate(at)
 
 
-def curve(points: Sequence[Sequence[float]] | np.ndarray, per_span: int = 10) -> np.ndarray:
+def curve(points: Points, per_span: int = 10) -> np.ndarray:
     """Smooth curve (M, D) through control points (N, D): centripetal Catmull-Rom, ``per_span`` pieces each."""
     control = np.asarray(points, dtype=np.float64)
     padded = np.concatenate([2 * control[:1] - control[1:2], control, 2 * control[-1:] - control[-2:-1]])
@@ -215,16 +215,25 @@ def skin(rings: np.ndarray, closed: bool = False) -> Solid:
     return Manifold(Mesh64(vertices, np.ascontiguousarray(triangles, dtype=np.uint64)))
 
 
+def angles(count: int) -> np.ndarray:
+    """``count`` equal steps round a circle from 0, in radians."""
+    return 2 * np.pi * np.arange(count) / count
+
+
+def around(count: int) -> list[Point2]:
+    """Unit vectors at ``count`` equal steps round the axis."""
+    return list(zip(np.cos(angles(count)).tolist(), np.sin(angles(count)).tolist(), strict=True))
+
+
 def superellipse(width: float, depth: float, power: float = 2.0, sides: int = 120) -> np.ndarray:
     """Outline (sides, 2) of |2x/width|^power + |2y/depth|^power = 1: an ellipse at 2, towards a rectangle above."""
-    angle = 2 * np.pi * np.arange(sides) / sides
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine, sine = np.cos(angles(sides)), np.sin(angles(sides))
     x = np.sign(cosine) * np.abs(cosine) ** (2 / power)
     y = np.sign(sine) * np.abs(sine) ** (2 / power)
     return np.stack([x * width / 2, y * depth / 2], axis=1)
 
 
-def loft(levels: Sequence[Level] | np.ndarray, smooth: int = 0, sides: int = 120) -> Solid:
+def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
     """Upright solid through superellipses (`Level`), wide side to the camera.
 
     ``smooth`` above 0 passes a smooth curve through the levels, with that many pieces between two of them.
@@ -240,19 +249,13 @@ def loft(levels: Sequence[Level] | np.ndarray, smooth: int = 0, sides: int = 120
 
 
 def tube(
-    path: Sequence[Point3] | np.ndarray,
-    radius: float | Sequence[float] | np.ndarray,
-    flatten: float = 1.0,
-    up: Point3 = (0, 0, 1),
-    closed: bool = False,
-    sides: int = 32,
+    path: Points, radius: float, flatten: float = 1.0, up: Point3 = (0, 0, 1), closed: bool = False, sides: int = 32
 ) -> Solid:
-    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3) with one radius or one for each point.
+    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3).
 
     ``up`` fixes how an oval section lies: its radius towards ``up`` is ``flatten`` times the one across.
     """
     points = np.asarray(path, dtype=np.float64)
-    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), len(points))
     if closed:
         tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     else:
@@ -261,40 +264,19 @@ def tube(
     across = np.cross(np.broadcast_to(np.asarray(up, dtype=np.float64), points.shape), tangents)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     above = np.cross(tangents, across)
-    angle = 2 * np.pi * np.arange(sides) / sides
-    ring_across = np.cos(angle)[None, :, None] * across[:, None, :]
-    ring_above = flatten * np.sin(angle)[None, :, None] * above[:, None, :]
-    return skin(points[:, None, :] + radii[:, None, None] * (ring_across + ring_above), closed)
+    angle = angles(sides)[None, :, None]
+    ring_across = np.cos(angle) * across[:, None, :]
+    ring_above = flatten * np.sin(angle) * above[:, None, :]
+    return skin(points[:, None, :] + float(radius) * (ring_across + ring_above), closed)
 
 
 _GLYPHS = {
-    "A": "01110 10001 10001 11111 10001 10001 10001",
-    "B": "11110 10001 10001 11110 10001 10001 11110",
-    "C": "01111 10000 10000 10000 10000 10000 01111",
-    "D": "11110 10001 10001 10001 10001 10001 11110",
-    "E": "11111 10000 10000 11110 10000 10000 11111",
-    "F": "11111 10000 10000 11110 10000 10000 10000",
-    "G": "01111 10000 10000 10011 10001 10001 01111",
-    "H": "10001 10001 10001 11111 10001 10001 10001",
-    "I": "01110 00100 00100 00100 00100 00100 01110",
-    "J": "00111 00010 00010 00010 00010 10010 01100",
-    "K": "10001 10010 10100 11000 10100 10010 10001",
-    "L": "10000 10000 10000 10000 10000 10000 11111",
-    "M": "10001 11011 10101 10101 10001 10001 10001",
-    "N": "10001 11001 10101 10101 10011 10001 10001",
-    "O": "01110 10001 10001 10001 10001 10001 01110",
-    "P": "11110 10001 10001 11110 10000 10000 10000",
-    "R": "11110 10001 10001 11110 10100 10010 10001",
-    "S": "01111 10000 10000 01110 00001 00001 11110",
-    "T": "11111 00100 00100 00100 00100 00100 00100",
-    "U": "10001 10001 10001 10001 10001 10001 01110",
-    "V": "10001 10001 10001 10001 01010 01010 00100",
-    "Y": "10001 10001 01010 00100 00100 00100 00100",
-    "Z": "11111 00001 00010 00100 01000 10000 11111",
-    "+": "00000 00100 00100 11111 00100 00100 00000",
-    "-": "00000 00000 00000 11111 00000 00000 00000",
-    " ": "00000 00000 00000 00000 00000 00000 00000",
-}
+    "A": "EHHVHHH", "B": "UHHUHHU", "C": "FGGGGGF", "D": "UHHHHHU", "E": "VGGUGGV", "F": "VGGUGGG", "G": "FGGJHHF",
+    "H": "HHHVHHH", "I": "E44444E", "J": "72222IC", "K": "HIKOKIH", "L": "GGGGGGV", "M": "HRLLHHH", "N": "HPLLJHH",
+    "O": "EHHHHHE", "P": "UHHUGGG", "R": "UHHUKIH", "S": "FGGE11U", "T": "V444444", "U": "HHHHHHE", "V": "HHHHAA4",
+    "Y": "HHA4444", "Z": "V1248GV", "+": "044V440", "-": "000V000", " ": "0000000",
+}  # fmt: skip
+"""Letters of 5 x 7 cells: a base-32 digit is a row, its bits are the cells, the left one first."""
 _ROWS, _ADVANCE = 7, 6
 
 
@@ -302,8 +284,8 @@ def text_section(text: str, width: float) -> Section:
     """The text as a flat section, ``width`` mm wide, centred at the origin; cells overlap a little where they meet."""
     runs = []
     for place, letter in enumerate(text):
-        for row, cells in enumerate(_GLYPHS[letter].split()):
-            for column, cell in enumerate(cells):
+        for row, digit in enumerate(_GLYPHS[letter]):
+            for column, cell in enumerate(f"{int(digit, 32):05b}"):
                 if cell == "1":
                     corner = (place * _ADVANCE + column - 0.05, _ROWS - 1 - row - 0.05)
                     runs.append(CrossSection.square((1.1, 1.1)).translate(corner))
@@ -329,3 +311,8 @@ def wrapped(section: Section, radius: float, height: float, relief: float, turn:
         return np.stack([-reach * np.cos(angle), -reach * np.sin(angle), points[:, 1] + height], axis=1)
 
     return flat.warp_batch(bend).rotate((0, 0, turn))
+
+
+def lettered(radius: float, relief: float, *lines: tuple[str, float, float]) -> list[Solid]:
+    """Text lines (words, width, height) bent round an upright cylinder like `wrapped`."""
+    return [wrapped(text_section(words, width), radius, height, relief) for words, width, height in lines]

@@ -1,0 +1,171 @@
+"""Exporting a dataset: as Parquet, as the published tree (PNG fringes, .mat depth, raw scans), its meshes and patterns.
+
+In the tree, depth in mm is written as float32, the same bits as in the dataset. The normalised representations are
+written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench import optics
+from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.depth import normalise, object_mask
+from fpp_ml_bench.errors import BuildError, DatasetError
+from fpp_ml_bench.files import exclusive
+from fpp_ml_bench.loaders.published import tree
+from fpp_ml_bench.loaders.published.files import matrix_bytes, png_bytes
+from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
+from fpp_ml_bench.loaders.storage import ALL_SPLITS, MESH_FOLDER, DatasetFolder, depth_range_mm, write_parquet
+from fpp_ml_bench.optics import Direction
+
+FORMS = ("parquet", "mat", "meshes", "patterns")
+SAMPLE_FORMS = ("parquet", "mat")
+"""Forms whose progress is counted in samples."""
+_LOCK = ".lock"
+
+_PHASE_DIRECTION: Direction = "horizontal"
+"""The published phases do not name their direction; they belong to the fringes of the single-shot frame."""
+
+
+def write_tree(
+    dataset: DatasetFolder, folder: Path, splits: list[str], threads: int, row_done: Callable[[], None] = lambda: None
+) -> None:
+    """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all frames are stored.
+
+    ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
+    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
+    """
+    samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
+    with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
+        for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
+            row_done()
+
+
+def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str) -> None:
+    published_split = PUBLISHED_SPLIT_FOLDERS[split]
+    depth_mm = dataset.depth_mm(sample)
+    frame = dataset.frame(sample, SINGLE_SHOT_FRAME)
+    fringe = png_bytes(frame)
+    background_removed = png_bytes(np.where(object_mask(depth_mm), frame, np.uint8(0)))
+    low_mm, high_mm = depth_range_mm(depth_mm, sample)
+    training = folder / tree.TRAINING
+    for name, variable in tree.VARIABLES.items():
+        represented: NDArray = depth_mm
+        if name != "raw":
+            represented = normalise(depth_mm.astype(np.float64), name, low_mm, high_mm, out=np.empty(depth_mm.shape))
+        depth = matrix_bytes({variable: represented})
+        for variant, image in (
+            (tree.VARIANT_FOLDERS[name], fringe),
+            (tree.BACKGROUND_REMOVED_FOLDERS[name], background_removed),
+        ):
+            _write(training / variant / published_split / tree.FRINGE / f"{sample}.png", image)
+            _write(training / variant / published_split / tree.DEPTH / f"{sample}.mat", depth)
+    limits = matrix_bytes(dict(zip(tree.INFO_VARIABLES, (low_mm, high_mm), strict=True)))
+    _write(training / tree.INFO / published_split / tree.DEPTH / f"{sample}.mat", limits)
+    if "all" in dataset.configs:
+        labels = dataset.measured(sample)
+        _write_scan(dataset, sample, folder / tree.RAW_SCANS / labels["object"] / labels["view"])
+
+
+def _write_scan(dataset: DatasetFolder, sample: str, folder: Path) -> None:
+    """Frames in the paper's order, wrapped phase, and unwrapped phase (NaN where a pixel can't be decoded)."""
+    frames = dataset.frames(sample, range(len(dataset.sequence)))
+    for index, image in enumerate(frames):
+        _write(folder / tree.frame_file(index), png_bytes(image))
+    measured = decode_stack(frames, dataset.rig, _PHASE_DIRECTION, details=True).details[_PHASE_DIRECTION]
+    absolute_rad = measured.coordinate_px * (2 * np.pi / dataset.rig.pitch(_PHASE_DIRECTION))
+    _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: measured.phase.astype(np.float32)}))
+    _write(
+        folder / tree.UNWRAPPED_PHASE, matrix_bytes({tree.UNWRAPPED_PHASE_VARIABLE: absolute_rad.astype(np.float32)})
+    )
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+
+
+@contextmanager
+def exporting(out: Path) -> Iterator[Path]:
+    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails.
+
+    Remains of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being
+    written by another process, or the disk can't be written.
+    """
+    target = out.resolve()
+    if target.exists() and not target.is_dir():
+        raise BuildError(f"{out}: is a file; give a new folder")
+    if target.is_dir() and any(target.iterdir()):
+        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
+    staging = target.with_name(f".{target.name}.export")
+    with exclusive(staging / _LOCK, out, "exporting there"):
+        try:
+            for remains in staging.iterdir():
+                if remains.is_dir() and not remains.is_symlink():
+                    shutil.rmtree(remains)
+                elif remains.name != _LOCK:
+                    remains.unlink()
+            yield staging
+            (staging / _LOCK).unlink()
+            staging.replace(target)
+        except BaseException as error:
+            shutil.rmtree(staging, ignore_errors=True)
+            if not isinstance(error, OSError):
+                raise
+            raise BuildError(
+                f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
+                "space or choose another disk"
+            ) from error
+
+
+def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
+    """Splits that ``split`` names, in row order; raises `DatasetError` when the dataset has no such samples."""
+    dataset.samples(split)
+    return list(dataset.splits) if split == ALL_SPLITS else [split]
+
+
+def export(
+    dataset: DatasetFolder, out: Path, forms: list[str], splits: list[str], threads: int = 1,
+    progress: Callable[[int], None] = lambda rows: None,
+) -> None:  # fmt: skip
+    """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
+
+    ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
+    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks.
+    """
+    if not forms or not set(forms) <= set(FORMS):
+        raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
+    if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
+        raise BuildError(f"{out}: lies in the dataset itself; give another folder")
+    meshes = _meshes(dataset, splits) if "meshes" in forms else []
+    with exporting(out) as staging:
+        for form in forms:
+            folder = staging / form if len(forms) > 1 else staging
+            folder.mkdir(exist_ok=True)
+            if form == "parquet":
+                write_parquet(dataset, folder, splits, threads, progress)
+            elif form == "mat":
+                write_tree(dataset, folder, splits, threads, lambda: progress(1))
+            elif form == "meshes":
+                for path in meshes:
+                    shutil.copyfile(path, folder / path.name)
+            else:
+                optics.export_patterns(dataset.rig, folder)
+
+
+def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
+    rows = (row for split in splits for row in dataset.manifest.samples[split])
+    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
+    for path in paths:
+        if not path.is_file():
+            imported = dataset.manifest.origin == "imported"
+            hint = "imported datasets have no meshes" if imported else "run: fpp-bench verify"
+            raise DatasetError(f"{path}: the mesh is missing; {hint}")
+    return paths
