@@ -61,17 +61,18 @@ def _loss(name: str, alpha: float | None, prediction: Tensor, target: Tensor, *,
     root = name.endswith("rmse")
     errors = difference.square() if root else difference.abs()
     pixels = (1, 2, 3) if per_sample else (0, 1, 2, 3)
-    masked = whole = torch.empty(0)
-    if not name.startswith("masked_"):
-        whole = errors.mean(pixels)
-        whole = (whole + EPSILON).sqrt() if root else whole
-    if name not in ("rmse", "l1"):
-        mask = target > 0
-        count = mask.sum(pixels)
-        # Products, not selections: 0 x NaN is NaN, and the gradient of what they leave out is 0.
-        masked = (errors * mask).sum(pixels) / count.clamp(min=1)
-        masked = (masked + EPSILON).sqrt() * (count > 0) if root else masked
-    return whole if name in ("rmse", "l1") else masked if alpha is None else alpha * masked + (1 - alpha) * whole
+
+    def everywhere() -> Tensor:
+        return (errors.mean(pixels) + EPSILON).sqrt() if root else errors.mean(pixels)
+
+    if name in ("rmse", "l1"):
+        return everywhere()
+    mask = target > 0
+    count = mask.sum(pixels)
+    # Products, not selections: 0 x NaN is NaN, and the gradient of what they leave out is 0.
+    masked = (errors * mask).sum(pixels) / count.clamp(min=1)
+    masked = (masked + EPSILON).sqrt() * (count > 0) if root else masked
+    return masked if alpha is None else alpha * masked + (1 - alpha) * everywhere()
 
 
 Features = Sequence[Sequence[Tensor]]
