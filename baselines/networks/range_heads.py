@@ -183,7 +183,7 @@ def _range_error_mm(predicted: NDArray[np.float64], ranges: NDArray[np.float64])
 def _ridge(
     pooled: Values, ranges: Values, validation_pooled: Values, validation_ranges: Values
 ) -> tuple[float, Values, Values, float]:
-    """Strength of least `_range_error_mm` on the validation's (N, F) and (N, 2), weight (F, 2), bias (2,), the error."""
+    """Strength of least `_range_error_mm` on validation's (N, F) and (N, 2), weight (F, 2), bias (2,), the error."""
     centre, spread = pooled.mean(axis=0), pooled.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     target = ranges.mean(axis=0)
