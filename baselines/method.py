@@ -5,7 +5,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,9 @@ from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics import Rig
 
-if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.training import ModelConfig, NetConfig
-
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
 Setting = str | int | float | bool | None
-NO_SEEDS: Mapping[str, int] = {}
 
 
 class Method(ABC):
@@ -30,6 +27,12 @@ class Method(ABC):
 
     name: what it is called on the command line. title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
+    uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
+    uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
+    mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
+    packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
+    says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports,
+    crops: whether `predict_reported` reports, and there is a `crop`.
     """
 
     name: str
@@ -38,28 +41,18 @@ class Method(ABC):
     settings: Mapping[str, Setting]
 
     uses_ground_truth_range: bool = False
-    """Whether it is given depth_min and depth_max of the sample it predicts."""
     uses_ground_truth_mask: bool = False
-    """Whether it is given frames that are 0 outside the object."""
     units: Units = "mm"
     mode: Mode = "standard"
-    """The scoring mode that its row is made with."""
     target: Target = "depth_exact"
-    """What its row is scored against; for a network the decoded depth, which is what it was trained on."""
     packages: tuple[str, ...] = ("numpy", "numba")
-    """Packages whose versions matter."""
-    seeds: Mapping[str, int] = NO_SEEDS
+    seeds: Mapping[str, int] = MappingProxyType({})
     device: str = "cpu"
     parameters: int = 0
-    """Numbers that were learned."""
-    weights_config: "ModelConfig | NetConfig | None" = None
-    """What its weights file says of the network and its training data."""
+    weights_config: "training.ModelConfig | training.NetConfig | None" = None
     batched: bool = False
-    """Whether `predict_batch` takes all samples at once."""
     reports: bool = False
-    """Whether `predict_reported` reports."""
     crops: bool = False
-    """Whether there is a `crop`."""
 
     @abstractmethod
     def predict(self, frames: Frames) -> NDArray[np.float32]:
@@ -88,13 +81,11 @@ class Method(ABC):
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
 
 
-def _phase(rig: Rig, **options: Any) -> Method:
-    return (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(rig, **options)
-
-
 METHODS: Mapping[str, Callable[..., Method]] = {
     "classical": lambda rig, **options: baselines.ClassicalMethod(rig, **options),
-    "phase": _phase,
+    "phase": lambda rig, **options: (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(
+        rig, **options
+    ),
     "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
@@ -106,7 +97,6 @@ def load_method(name_or_path: str | Path, rig: Rig, **options: Any) -> Method:
     or of a ``.safetensors`` file.
 
     ``options`` are those of the method's class; a network also takes ``device`` (``cpu``, ``cuda``, ...).
-
     >>> from fpp_ml_bench.baselines import load_method
     >>> depth_mm = load_method("phase", dataset.rig).predict(frames)    # doctest: +SKIP
 

@@ -36,14 +36,12 @@ class Run:
 def predict_split(
     opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
 ) -> Run:
-    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or
-    the method's own units, and ``submission.yaml`` last.
+    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or the method's own units,
+    and ``submission.yaml`` last. The reports of a method that ``reports`` are written beside, by sample, as
+    `REPORTS_FILE`, and its summary of them into the submission's settings.
 
-    The reports of a method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them
-    into the submission's settings.
-
-    A sample's time is that of `Method.predict` on frames that are in memory: neither reading nor writing counts. One
-    run that is not counted warms caches and compiled code up. The submission gives the median over the split.
+    A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
+    the median over the split.
 
     Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same samples, and
     `DatasetError` when the dataset lacks a frame that the method needs.
@@ -71,10 +69,8 @@ def predict_split(
 
 
 def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
-    """The sequence with the frames that the method uses, read into memory, and None for every other frame.
-
-    For a method that uses the ground-truth mask they are 0 outside the object (paper Section 5.3.4).
-    """
+    """The sequence with the frames that the method uses, read into memory, and None for every other frame; 0 outside
+    the object for a method that uses the ground-truth mask (paper Section 5.3.4)."""
     frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
     for index in method.frames_used:
         frame = opened.frame(sample, index).copy()
@@ -116,19 +112,13 @@ def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int
 def _described(method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> dict[str, Any]:
     """What the submission says of ``method`` and the run."""
     return {
-        "name": method.title,
-        "method": method.name,
-        "units": method.units,
-        "frames_used": list(method.frames_used),
+        "name": method.title, "method": method.name, "units": method.units, "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
         **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
-        "seconds_per_sample": float(f"{seconds_per_sample:.6g}"),
-        "seconds_source": "measured",
-        "hardware": describe_hardware().to_dict(),
-        "software": method.software,
-        "settings": {**method.settings, **summary},
-        **({"seeds": dict(method.seeds)} if method.seeds else {}),
-    }
+        "seconds_per_sample": float(f"{seconds_per_sample:.6g}"), "seconds_source": "measured",
+        "hardware": describe_hardware().to_dict(), "software": method.software,
+        "settings": {**method.settings, **summary}, **({"seeds": dict(method.seeds)} if method.seeds else {}),
+    }  # fmt: skip
 
 
 def write_submission(path: Path, submission: Submission) -> None:

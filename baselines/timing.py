@@ -23,23 +23,15 @@ from fpp_ml_bench.machine import describe_hardware
 
 WARM_UP = 3
 _MIB = 2.0**20
-_CLEAR_PEAK = "5"
-"""What resets the kernel's high-water mark of the resident set, written to ``/proc/self/clear_refs`` (proc(5))."""
 
 
 def time_method(
-    opened: DatasetFolder,
-    method: Method,
-    split: str = "test",
-    batch: int = 4,
-    repeats: int = 20,
+    opened: DatasetFolder, method: Method, split: str = "test", batch: int = 4, repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
-) -> Timing:
+) -> Timing:  # fmt: skip
     """Time ``method`` on images of ``split``: see `Timing` for what each figure means.
 
-    Frames are in memory before the clock starts, at most ``batch`` sequences of them: neither reading nor writing
-    counts.
-
+    Frames are in memory before the clock starts, at most ``batch`` sequences of them: no reading or writing counts.
     Raises `DatasetError` for an empty split, or when the dataset lacks a frame that the method needs.
     """
     samples = opened.samples(split)
@@ -49,19 +41,30 @@ def time_method(
         raise ValueError(f"expected a batch and repeats of at least 1, got {batch} and {repeats}")
     # A batch larger than the split holds its samples again: views, which cost no memory.
     stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
-    gpu = _Gpu(method.device)
+    cuda: Any = None
+    if method.device.startswith("cuda"):
+        import torch
+
+        cuda = torch.cuda
+
+    def seconds(run: Callable[[], object]) -> float:
+        """Time of ``run``; calls to a GPU return before their work is done."""
+        if cuda is not None:
+            cuda.synchronize(method.device)
+        started = perf_counter()
+        run()
+        if cuda is not None:
+            cuda.synchronize(method.device)
+        return perf_counter() - started
 
     def latency_s(number: int) -> float:
-        gpu.synchronise()
-        started = perf_counter()
-        method.predict(stacks[number % len(stacks)])
-        gpu.synchronise()
-        return perf_counter() - started
+        return seconds(lambda: method.predict(stacks[number % len(stacks)]))
 
     for number in range(WARM_UP):
         latency_s(number)
     working_mib = _added_by(lambda: latency_s(0))
-    gpu.reset_peak()
+    if cuda is not None:
+        cuda.reset_peak_memory_stats(method.device)
     latencies_ms = []
     for number in range(repeats):
         latencies_ms.append(1000 * latency_s(number))
@@ -69,32 +72,22 @@ def time_method(
     batch_stacks: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
     rates = []
     for number in range(1 + max(1, -(-repeats // batch))):
-        gpu.synchronise()
-        started = perf_counter()
-        method.predict_batch(batch_stacks)
-        gpu.synchronise()
+        batch_s = seconds(lambda: method.predict_batch(batch_stacks))
         if number or not method.batched:  # the first batch warms the batched path up
-            rates.append(batch / (perf_counter() - started))
+            rates.append(batch / batch_s)
     low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
+    # getrusage(2): kB on Linux, bytes on macOS
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MIB if sys.platform == "darwin" else 1024)
     return Timing(
-        provenance="measured",
-        latency_median_ms=_digits(statistics.median(latencies_ms)),
-        latency_p5_ms=_digits(low),
-        latency_p95_ms=_digits(high),
-        repeats=repeats,
-        batch=batch,
-        batched=method.batched,
-        throughput_per_s=_digits(statistics.median(rates)),
-        peak_memory_mib=round(_peak_mib(), 1),
+        provenance="measured", latency_median_ms=_digits(statistics.median(latencies_ms)),
+        latency_p5_ms=_digits(low), latency_p95_ms=_digits(high), repeats=repeats, batch=batch, batched=method.batched,
+        throughput_per_s=_digits(statistics.median(rates)), peak_memory_mib=round(peak_mib, 1),
         working_memory_mib=None if working_mib is None else round(working_mib, 1),
-        gpu_memory_mib=gpu.peak_mib(),
-        parameters=method.parameters,
-        frames=len(method.frames_used),
-        image_size=list(opened.size),
-        device=method.device,
-        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+        gpu_memory_mib=None if cuda is None else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
+        parameters=method.parameters, frames=len(method.frames_used), image_size=list(opened.size),
+        device=method.device, hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
         software=method.software,
-    )
+    )  # fmt: skip
 
 
 def _digits(value: float) -> float:
@@ -102,17 +95,13 @@ def _digits(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def _peak_mib() -> float:
-    """Largest resident set of this process so far (getrusage(2): kB on Linux, bytes on macOS)."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / _MIB if sys.platform == "darwin" else peak / 1024
-
-
 def _added_by(run: Callable[[], Any]) -> float | None:
     """By how much ``run`` raises the resident set at its highest, in MiB; None where the kernel does not tell."""
     try:
-        _give_back_freed_memory()
-        Path("/proc/self/clear_refs").write_text(_CLEAR_PEAK)
+        # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's use shows.
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: None)(0)
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak of the resident set, VmHWM (proc(5))
         before = _status_mib("VmRSS")
         run()
         return max(0.0, _status_mib("VmHWM") - before)
@@ -121,41 +110,9 @@ def _added_by(run: Callable[[], Any]) -> float | None:
         return None
 
 
-def _give_back_freed_memory() -> None:
-    """Return memory that earlier runs freed to the system (malloc_trim(3)), so that the next run's use shows."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
 def _status_mib(key: str) -> float:
     fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return float(fields[key].split()[0]) / 1024
-
-
-class _Gpu:
-    """What is measured on a GPU; nothing for a method that runs on the processor."""
-
-    def __init__(self, device: str) -> None:
-        self.device = device
-        self.cuda: Any = None
-        if device.startswith("cuda"):
-            import torch
-
-            self.cuda = torch.cuda
-
-    def synchronise(self) -> None:
-        """Wait until the device has finished: calls to a GPU return before their work is done."""
-        if self.cuda is not None:
-            self.cuda.synchronize(self.device)
-
-    def reset_peak(self) -> None:
-        if self.cuda is not None:
-            self.cuda.reset_peak_memory_stats(self.device)
-
-    def peak_mib(self) -> float | None:
-        return None if self.cuda is None else round(self.cuda.max_memory_allocated(self.device) / _MIB, 1)
 
 
 def check_target(path: Path, method: Method) -> None:
@@ -163,43 +120,36 @@ def check_target(path: Path, method: Method) -> None:
 
     Raises SubmissionError, which says what differs.
     """
-    submission = read_result(path).submission if _is_result(path) else _described(path)
-    method_entries = {"method": method.name, "frames_used": list(method.frames_used), "settings": dict(method.settings)}
-    file_entries = {
-        "method": submission.method,
-        "frames_used": sorted(submission.frames_used),
-        "settings": dict(submission.settings),
-    }
-    for key, value in method_entries.items():
-        if file_entries[key] != value:
+    submission = read_result(path).submission if path.suffix == ".json" else _described(path)
+    for key, in_file, timed in (
+        ("method", submission.method, method.name),
+        ("frames_used", sorted(submission.frames_used), list(method.frames_used)),
+        ("settings", dict(submission.settings), dict(method.settings)),
+    ):
+        if in_file != timed:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(file_entries[key])}, but {printable(value)} would "
-                "be timed; a time belongs to the method that was scored: give the same options"
+                f"{printable(str(path), 500)}: {key} is {printable(in_file)}, but {printable(timed)} would be timed; a "
+                "time belongs to the method that was scored: give the same options"
             )
 
 
 def write_timing(path: Path, timing: Timing) -> None:
     """Put ``timing`` into the file, with ``seconds_per_sample`` and ``hardware`` as measured. See `check_target`."""
+    content = timing.model_dump(mode="json")
     measured = {
-        "seconds_per_sample": timing.latency_median_ms / 1000,
-        "seconds_source": "measured",
-        "hardware": timing.hardware.model_dump(mode="json"),
-        "timing": timing.model_dump(mode="json"),
-    }
-    if _is_result(path):
-        result = read_result(path)
-        submission = Submission.model_validate({**result.submission.model_dump(mode="json"), **measured})
+        "seconds_per_sample": timing.latency_median_ms / 1000, "seconds_source": "measured",
+        "hardware": content["hardware"], "timing": content,
+    }  # fmt: skip
+    result = read_result(path) if path.suffix == ".json" else None
+    submission = _described(path) if result is None else result.submission
+    submission = Submission.model_validate({**submission.model_dump(mode="json"), **measured})
+    if result is not None:
         write_result(result.model_copy(update={"submission": submission}), path)
         return
-    submission = Submission.model_validate({**_described(path).model_dump(mode="json"), **measured})
     try:
         write_submission(path, submission)
     except OSError as error:
         raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
-
-
-def _is_result(path: Path) -> bool:
-    return path.suffix == ".json"
 
 
 def _described(path: Path) -> Submission:

@@ -19,8 +19,7 @@ class FringeNetwork(nn.Module, ABC):
     """A network from one fringe image to one depth map in the training representation.
 
     ``forward`` takes a floating tensor (B, 1, H, W), fringe in [0, 1], and gives the same shape. H and W must be
-    multiples of `stride` and at least twice it (at a single bottleneck pixel, instance and batch normalisation would
-    have no spread to divide by); another input raises `NetworkError`.
+    multiples of `stride` and at least twice it, so that a bottleneck has a spread; else `NetworkError`.
 
     name: what `build` calls it. options: JSON scalars with which `build` makes it again.
     last_layer: name in `probe_layers` of the last decoder layer, whose output is (B, C, H, W), before the 1x1 head.
@@ -53,9 +52,8 @@ class FringeNetwork(nn.Module, ABC):
         if fringe.dim() != 4 or shape[1] != 1:
             raise NetworkError(f"{self.name} takes one fringe channel, (B, 1, H, W); it was given {shape}")
         if not fringe.is_floating_point():
-            raise NetworkError(
-                f"{self.name} takes floating fringe in [0, 1]; it was given {fringe.dtype}; divide by 255"
-            )
+            words = f"takes floating fringe in [0, 1]; it was given {fringe.dtype}; divide by 255"
+            raise NetworkError(f"{self.name} {words}")
         self.check_size(shape[2], shape[3])
 
     def check_size(self, height: int, width: int) -> None:
@@ -150,12 +148,9 @@ RECENTRED_FROM = 1e-6
 
 
 class _CpuInstanceNorm(torch.autograd.Function):
-    """(x - mean) / sqrt(variance + eps) x weight + bias over the last two axes, with its gradient in closed form.
-
-    Torch's kernel copies channels-last maps and reads them more often; this one takes either memory layout as it is.
-    The variance is taken of the centred map. Where the rounding of the mean would show in it, on a map that hardly
-    varies about a large mean, the map is centred once more: a constant map then gives the bias, whatever its value.
-    """
+    """(x - mean) / sqrt(variance + eps) x weight + bias over the last two axes, with its gradient in closed form, in
+    either memory layout. A map that hardly varies about a large mean, so that the rounding of the mean would show, is
+    centred once more: a constant map gives the bias, whatever its value."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor | None, bias: Tensor | None, eps: float) -> Tensor:
@@ -187,11 +182,8 @@ class _CpuInstanceNorm(torch.autograd.Function):
 
 
 class InstanceNorm(nn.InstanceNorm2d):
-    """`torch.nn.InstanceNorm2d` (B, C, h, w) -> the same, faster on the CPU in float32 and float64.
-
-    Other devices and types, and networks being compiled or exported, go through torch's own kernel. Like that one, it
-    needs more than one pixel. On the CPU it can be differentiated once only.
-    """
+    """`torch.nn.InstanceNorm2d` (B, C, h, w) -> the same, faster on the CPU in float32 and float64, where it can be
+    differentiated once only. Other devices and types, compiling and exporting go through torch's own kernel."""
 
     def forward(self, x: Tensor) -> Tensor:
         plain = x.is_cpu and x.dtype in (torch.float32, torch.float64)
@@ -205,31 +197,21 @@ class DoubleConvolution(nn.Sequential):
 
     def __init__(self, c_in: int, c_out: int) -> None:
         super().__init__(
-            nn.Conv2d(c_in, c_out, 3, padding=1, bias=False),
-            InstanceNorm(c_out, affine=True),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
-            InstanceNorm(c_out, affine=True),
-            nn.ReLU(inplace=True),
-        )
+            nn.Conv2d(c_in, c_out, 3, padding=1, bias=False), InstanceNorm(c_out, affine=True), nn.ReLU(inplace=True),
+            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False), InstanceNorm(c_out, affine=True), nn.ReLU(inplace=True),
+        )  # fmt: skip
 
 
 class ResidualBlock(nn.Module):
-    """ReLU(convolution-norm-ReLU-convolution-norm + identity); 3x3, batch normalisation, no biases.
-
-    The identity is a 1x1 convolution with batch normalisation where the stride or the channels change.
-    (B, c_in, h, w) -> (B, c_out, h / stride, w / stride).
-    """
+    """ReLU(convolution-norm-ReLU-convolution-norm + identity); 3x3, batch normalisation, no biases. The identity is a
+    1x1 convolution where stride or channels change. (B, c_in, h, w) -> (B, c_out, h / stride, w / stride)."""
 
     def __init__(self, c_in: int, c_out: int, stride: int = 1) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
-            nn.BatchNorm2d(c_out),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
-            nn.BatchNorm2d(c_out),
-        )
+            nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False), nn.BatchNorm2d(c_out), nn.ReLU(inplace=True),
+            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out),
+        )  # fmt: skip
         self.identity: nn.Module = nn.Identity()
         if stride != 1 or c_in != c_out:
             self.identity = nn.Sequential(nn.Conv2d(c_in, c_out, 1, stride, bias=False), nn.BatchNorm2d(c_out))
@@ -239,17 +221,13 @@ class ResidualBlock(nn.Module):
 
 
 class Join(nn.Module):
-    """A decoder level: double the map by a 2x2 transposed convolution, concatenate the skip, run a block.
-
-    ``block`` takes 2 x ``c_out`` channels: [skip, up] when ``skip_first``, else [up, skip].
-    (B, c_in, h, w) and (B, c_out, 2h, 2w) -> (B, c_out, 2h, 2w).
-    """
+    """A decoder level: double the map by a 2x2 transposed convolution, concatenate the skip ([skip, up] when
+    ``skip_first``), run ``block``. (B, c_in, h, w) and (B, c_out, 2h, 2w) -> (B, c_out, 2h, 2w)."""
 
     def __init__(self, c_in: int, c_out: int, block: nn.Module, skip_first: bool = True) -> None:
         super().__init__()
         self.up = nn.ConvTranspose2d(c_in, c_out, 2, 2)
-        self.block = block
-        self.skip_first = skip_first
+        self.block, self.skip_first = block, skip_first
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         x = self.up(x)

@@ -6,16 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.networks.base import (
-    FringeNetwork,
-    ResidualBlock,
-    TransformerLayer,
-    in_full_precision,
-    initialise_convolutions,
-    initialise_tokens,
-    rate,
-    whole,
-)
+from fpp_ml_bench.baselines.networks import base
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, ResidualBlock, TransformerLayer, in_full_precision
 
 HEADS = (1, 1, 2, 4)
 ENCODER_DEPTHS = (1, 1, 2, 2)
@@ -40,22 +32,17 @@ def _convolution(c_in: int, c_out: int, stride: int) -> nn.Sequential:
 
 
 class Backbone(nn.Module):
-    """(B, 1, H, W) -> four branches (B, c_i, h_i, w_i) at 1/4, 1/8, 1/16 and 1/32 of the image.
-
-    Two stride-2 convolutions and four residual blocks, then three stages. Each stage passes every branch there is
-    through one convolution, opens the next branch by a stride-2 convolution of the last one, and runs its residual
-    blocks on every branch by itself.
-    """
+    """(B, 1, H, W) -> four branches (B, c_i, h_i, w_i) at 1/4, 1/8, 1/16 and 1/32 of the image: a stem, then three
+    stages. Each opens the next branch by a stride-2 convolution of the last one, and passes every branch by itself
+    through a convolution and residual blocks."""
 
     def __init__(self, stem: int, branches: Sequence[int]) -> None:
         super().__init__()
         first = branches[0]
         self.stem = nn.Sequential(
-            _convolution(1, stem, 2),
-            _convolution(stem, stem, 2),
-            ResidualBlock(stem, first),
+            _convolution(1, stem, 2), _convolution(stem, stem, 2), ResidualBlock(stem, first),
             *(ResidualBlock(first, first) for _ in range(STEM_BLOCKS - 1)),
-        )
+        )  # fmt: skip
         self.stages = nn.ModuleList()
         for stage, blocks in enumerate(STAGE_BLOCKS, 1):
             lanes = nn.ModuleList()
@@ -100,10 +87,7 @@ class Level(nn.Module):
 
 
 class MergePatches(nn.Module):
-    """2x2 pixels into one, and the branch of that size joined to it.
-
-    (B, C, 2h, 2w) and (B, 2C, h, w) -> (B, 2C, h, w).
-    """
+    """2x2 pixels into one, and the branch joined: (B, C, 2h, 2w) and (B, 2C, h, w) -> (B, 2C, h, w)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -119,10 +103,7 @@ class MergePatches(nn.Module):
 
 
 class ExpandPatches(nn.Module):
-    """One pixel into 2x2, the encoder's map joined to it, then transformer layers.
-
-    (B, 2C, h, w) and (B, C, 2h, 2w) -> (B, C, 2h, 2w).
-    """
+    """One pixel into 2x2, the encoder's map joined, layers: (B, 2C, h, w) and (B, C, 2h, 2w) -> (B, C, 2h, 2w)."""
 
     def __init__(self, channels: int, heads: int, drop_paths: Sequence[float]) -> None:
         super().__init__()
@@ -145,10 +126,6 @@ class Hformer(FringeNetwork):
     9/16 x width (rounded) x (1, 2, 4, 8). drop_path: rate of the deepest layer's DropPath, rising from 0 at the first
     layer of the encoder; a decoder level has its encoder level's rates. Attention is global, so time grows with the
     fourth power of the image side. There are no position embeddings: zero padding in the backbone tells pixels apart.
-    Convolutions start Kaiming-normal (fan out), linear layers normal with spread 0.02.
-
-    Probe layers: enc1..enc3 (1/4 to 1/16 of the image), bottleneck (1/32), dec3..dec1, up1 (1/2), up2 (full
-    resolution, width / 4 channels).
     """
 
     name = "hformer"
@@ -156,8 +133,8 @@ class Hformer(FringeNetwork):
     last_layer = "up2"
 
     def __init__(self, *, width: int = 32, drop_path: float = 0.4) -> None:
-        width = whole(self.name, "width", width, least=4, multiple=4)
-        drop_path = rate(self.name, "drop_path", drop_path)
+        width = base.whole(self.name, "width", width, least=4, multiple=4)
+        drop_path = base.rate(self.name, "drop_path", drop_path)
         super().__init__(width=width, drop_path=drop_path)
         first = (9 * width + 8) // 16
         branches = [first * 2**level for level in range(4)]
@@ -179,8 +156,8 @@ class Hformer(FringeNetwork):
         self.up1 = nn.Sequential(nn.ConvTranspose2d(width, width // 2, 2, 2), nn.ReLU(inplace=True))
         self.up2 = nn.Sequential(nn.ConvTranspose2d(width // 2, width // 4, 2, 2), nn.ReLU(inplace=True))
         self.head = nn.Conv2d(width // 4, 1, 1)
-        initialise_convolutions(self)
-        initialise_tokens(self)
+        base.initialise_convolutions(self)
+        base.initialise_tokens(self)
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:

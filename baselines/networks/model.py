@@ -125,11 +125,10 @@ TWINS: tuple[Twin, ...] = get_args(Twin)
 
 @dataclass(frozen=True)
 class HeadReport:
-    """How the heads do on the validation split.
+    """How the heads do on the validation split, on which ridge strength and thresholds were chosen.
 
-    Range errors are means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is the
-    intersection of predicted and true object over their union, all pixels pooled, at the threshold of ``predicted``.
-    The ridge's strength and the thresholds were chosen on these same pairs, so the test split does a little worse.
+    Range errors are means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is that of
+    predicted and true object, all pixels pooled, at the threshold of ``predicted``.
     """
 
     mean_range_error_mm: float
@@ -154,12 +153,10 @@ class RangeHeads:
     - ``predicted``: a ridge regression from the mean and spread of each bottleneck channel to (D_min, D_max - D_min).
 
     Both also need an object mask, because v = 0 means both background and D_min: a logistic regression on the features
-    of the last decoder layer (a 1x1 convolution). Depth is v span + D_min, held within the training set's range and a
-    quarter of its width to either side, where the mask says object, and 0 elsewhere. The network itself stays as it is;
-    `fpp_ml_bench.baselines.networks.range_heads.fit_heads` fits the heads.
+    of the last decoder layer. Depth is v span + D_min, held within the training set's range and a quarter of its width
+    to either side, where the mask says object, and 0 elsewhere. `range_heads.fit_heads` fits the heads.
 
     Ranges and limits in mm, float64; ``F`` pooled and ``C`` per-pixel features.
-
     mean_range_mm (2,): D_min, D_max. range_weight (F, 2), range_bias (2,): to (D_min, span). mask_weight (C,),
     mask_bias (): the logit of being object. mask_threshold (2,): least logit of an object pixel, for each of `TWINS`.
     limits_mm (2,): what depth is held within. report (6,): a `HeadReport`.
@@ -175,7 +172,6 @@ class RangeHeads:
     report: Tensor
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """As stored in a weights file."""
         return dict(vars(self))
 
     @property
@@ -260,13 +256,11 @@ class Model:
     def predict(self, fringe: Fringe, depth_range: Twin = "predicted") -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm of one fringe image (H, W), uint8 or float in [0, 1], of the size trained at.
 
-        Of a network trained under raw or global normalisation this is the output as it is, negative values and all.
-        Under individual normalisation the range heads make it: 0 where their mask says background, and the range
-        ``predicted`` from the image or the training set's ``mean``. A network trained with the background removed
-        expects ``fringe`` to be 0 outside the object.
+        Under raw or global normalisation the output as it is, negative values and all; under individual normalisation
+        the range heads make it, with a range ``predicted`` from the image or the training set's ``mean``. A network
+        trained with the background removed expects ``fringe`` to be 0 outside the object.
 
-        Raises `PredictionError` for another image than that, or an output that is not finite; `WeightsError` where the
-        weights hold no range heads.
+        Raises `PredictionError` for another image or an output that is not finite, `WeightsError` without range heads.
         """
         return self.predict_batch([fringe], depth_range)[0]
 

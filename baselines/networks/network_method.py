@@ -26,11 +26,9 @@ class NetworkMethod(Method):
     or ``predicted`` or ``mean`` (the range heads of the weights file make mm). None takes ``predicted`` where the file
     holds heads, else ``oracle``.
 
-    ``frame`` is the index of the frame, by default the first of those that the network was trained on. ``threads``
-    are torch's while it predicts. ``remark`` is added to the title, ``about`` to the settings. A network
-    trained with the background removed needs frames that are 0 outside the object (``uses_ground_truth_mask``):
-    `fpp_ml_bench.baselines.run.captured_frames` sees to that.
-    Raises `PredictionError` for an unknown range or frame.
+    ``frame``: its index, by default the first of those that the network was trained on. ``threads`` are torch's while
+    it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises `PredictionError` for an unknown
+    range or frame.
     """
 
     target = "depth"

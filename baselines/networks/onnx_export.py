@@ -23,13 +23,8 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
     """Write a network as an ONNX file in float32, and return its path.
 
     The file takes ``fringe`` float32 (B, 1, H, W) in [0, 1] and gives ``depth_representation`` of the same shape; B is
-    free, H and W are ``size`` (one number for a square). Weights are inside the file. What the representation means in
-    mm is the model's configuration, not the file's. The model itself is left as it was.
-
-    model: a `FringeNetwork`, or anything that holds one as ``.network``.
-
-    Torch's TorchScript-based exporter is used on purpose: for these networks it takes 0.4 to 2 s where the one on
-    torch.export takes 6 to 30 s, to the same numbers.
+    free, H and W are ``size`` (one number for a square). ``model``: a `FringeNetwork`, or what holds one as
+    ``.network``. Torch's older exporter takes 0.4 to 2 s where the newer takes 6 to 30 s, to the same numbers.
 
     Raises `FppBenchError` where the onnx package is missing or the file can't be written, and `NetworkError` for
     something that is no network or a size that it does not take.

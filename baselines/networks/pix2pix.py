@@ -3,13 +3,8 @@
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import (
-    FringeNetwork,
-    InstanceNorm,
-    in_full_precision,
-    initialise_normal,
-    whole,
-)
+from fpp_ml_bench.baselines.networks import base
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, InstanceNorm, in_full_precision
 
 DOWNSAMPLINGS = 4
 RESIDUAL_BLOCKS = 9
@@ -17,9 +12,8 @@ LEAK = 0.2
 
 
 def _convolution(c_in: int, c_out: int, kernel: int, stride: int = 1, reflect: bool = False) -> nn.Conv2d:
-    return nn.Conv2d(
-        c_in, c_out, kernel, stride, kernel // 2, padding_mode="reflect" if reflect else "zeros"
-    )  # biases as published, though an instance normalisation after them takes them out again
+    # biases as published, though an instance normalisation after them takes them out again
+    return nn.Conv2d(c_in, c_out, kernel, stride, kernel // 2, padding_mode="reflect" if reflect else "zeros")
 
 
 class GeneratorBlock(nn.Module):
@@ -28,12 +22,9 @@ class GeneratorBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            _convolution(channels, channels, 3, reflect=True),
-            InstanceNorm(channels),
-            nn.ReLU(inplace=True),
-            _convolution(channels, channels, 3, reflect=True),
-            InstanceNorm(channels),
-        )
+            _convolution(channels, channels, 3, reflect=True), InstanceNorm(channels), nn.ReLU(inplace=True),
+            _convolution(channels, channels, 3, reflect=True), InstanceNorm(channels),
+        )  # fmt: skip
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.residual(x)
@@ -76,10 +67,10 @@ class Pix2Pix(FringeNetwork):
     last_layer = "up1"
 
     def __init__(self, *, width: int = 64) -> None:
-        width = whole(self.name, "width", width)
+        width = base.whole(self.name, "width", width)
         super().__init__(width=width)
         self.generator = Generator(width)
-        initialise_normal(self)
+        base.initialise_normal(self)
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
@@ -95,22 +86,19 @@ class Pix2Pix(FringeNetwork):
 class Discriminator(nn.Module):
     """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64.
 
-    ``forward`` takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1], concatenated. It gives, for
-    each scale (full resolution first), the list of feature maps after each of its ``layers + 2`` convolutions; the
-    last map is the judgement, (B, 1, h, w), unbounded (a least-squares GAN has no sigmoid). The scales do not share
-    weights. Convolutions start from N(0, 0.02).
-
-    width: channels of the first layer. layers: stride-2 layers of a scale. scales: number of scales.
+    ``forward`` takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1]. It gives, for each scale (full
+    resolution first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the
+    judgement, (B, 1, h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer.
     """
 
     def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
-        width = whole("discriminator", "width", width)
-        layers = whole("discriminator", "layers", layers)
-        scales = whole("discriminator", "scales", scales)
+        width = base.whole("discriminator", "width", width)
+        layers = base.whole("discriminator", "layers", layers)
+        scales = base.whole("discriminator", "scales", scales)
         super().__init__()
         self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
         self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))
-        initialise_normal(self)
+        base.initialise_normal(self)
 
     def forward(self, pair: Tensor) -> list[list[Tensor]]:
         features = []
@@ -130,12 +118,7 @@ def _patch_discriminator(width: int, layers: int) -> nn.ModuleList:
     widths = [min(width * 2**level, 8 * width) for level in range(layers + 1)]
     stages = [nn.Sequential(nn.Conv2d(2, width, 4, 2, 2), nn.LeakyReLU(LEAK, inplace=True))]
     for level in range(1, layers + 1):
-        stages.append(
-            nn.Sequential(
-                nn.Conv2d(widths[level - 1], widths[level], 4, 2 if level < layers else 1, 2),
-                InstanceNorm(widths[level]),
-                nn.LeakyReLU(LEAK, inplace=True),
-            )
-        )
+        convolution = nn.Conv2d(widths[level - 1], widths[level], 4, 2 if level < layers else 1, 2)
+        stages.append(nn.Sequential(convolution, InstanceNorm(widths[level]), nn.LeakyReLU(LEAK, inplace=True)))
     stages.append(nn.Sequential(nn.Conv2d(widths[-1], 1, 4, 1, 2)))
     return nn.ModuleList(stages)

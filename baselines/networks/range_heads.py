@@ -27,6 +27,7 @@ RIDGE_STRENGTHS = tuple(10.0 ** (power / 2) for power in range(-8, 9))
 """Candidates, per training pair, on features of unit spread."""
 MASK_DECAY = 1e-6
 LOGIT_LIMIT, LOGIT_STEP = 20.0, 0.05
+Values = NDArray[np.float64]
 _SEED = 42
 _PIXELS_AT_ONCE = 4 * 224 * 224
 
@@ -70,12 +71,12 @@ def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str
 
 @dataclass
 class _Batch:
+    """``values``: network output (B, 1, H, W); ``depth_mm`` (B, H, W), 0 = background; ``range_mm`` (B, 2): D_min and
+    span."""
+
     values: Tensor
-    """Network output (B, 1, H, W)."""
     depth_mm: NDArray[np.float32]
-    """(B, H, W), 0 = background."""
-    range_mm: NDArray[np.float64]
-    """(B, 2): D_min and span."""
+    range_mm: Values
 
 
 class _Pairs:
@@ -103,12 +104,8 @@ class _Pairs:
         self.order = [usable[place] for place in places]
         self.network, self.probe, self.name, self.progress = network, probe, config.name, progress
         self.device = next(network.parameters()).device
-        height, width = source.size
-        self.size = (height, width)
-        self.batch = max(1, min(4, _PIXELS_AT_ONCE // (height * width)))
-
-    def __len__(self) -> int:
-        return len(self.order)
+        self.size = source.size
+        self.batch = max(1, min(4, _PIXELS_AT_ONCE // (self.size[0] * self.size[1])))
 
     def run(self) -> Iterator[_Batch]:
         for batch in self.data.batches(self.batch, self.order):
@@ -152,15 +149,11 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     )
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
-        mean_range_mm=torch.from_numpy(mean),
-        range_weight=torch.from_numpy(weight),
-        range_bias=torch.from_numpy(bias),
-        mask_weight=mask_weight,
-        mask_bias=mask_bias,
-        mask_threshold=torch.zeros(2, dtype=torch.float64),
+        mean_range_mm=torch.from_numpy(mean), range_weight=torch.from_numpy(weight), range_bias=torch.from_numpy(bias),
+        mask_weight=mask_weight, mask_bias=mask_bias, mask_threshold=torch.zeros(2, dtype=torch.float64),
         limits_mm=torch.tensor([lows.min() - margin, highs.max() + margin], dtype=torch.float64),
         report=torch.zeros(6, dtype=torch.float64),
-    )
+    )  # fmt: skip
     tallies = {twin: _Tally() for twin in TWINS}
     for batch in validation.run():
         logits = heads.logits(validation.probe, validation.size).cpu().numpy()[:, 0]
@@ -188,13 +181,9 @@ def _range_error_mm(predicted: NDArray[np.float64], ranges: NDArray[np.float64])
 
 
 def _ridge(
-    pooled: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    validation_pooled: NDArray[np.float64],
-    validation_ranges: NDArray[np.float64],
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
-    """Strength of least `_range_error_mm` on ``unseen`` (N, F) against ``truth`` (N, 2), weight (F, 2), bias (2,) and
-    that error."""
+    pooled: Values, ranges: Values, validation_pooled: Values, validation_ranges: Values
+) -> tuple[float, Values, Values, float]:
+    """Strength of least `_range_error_mm` on validation's (N, F) and (N, 2), weight (F, 2), bias (2,), the error."""
     centre, spread = pooled.mean(axis=0), pooled.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     target = ranges.mean(axis=0)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fpp_ml_bench.baselines.networks import base
 from fpp_ml_bench.baselines.networks.base import (
     DoubleConvolution,
     FringeNetwork,
@@ -13,19 +14,13 @@ from fpp_ml_bench.baselines.networks.base import (
     ResidualBlock,
     TransformerLayer,
     in_full_precision,
-    initialise_convolutions,
-    initialise_tokens,
-    rate,
-    whole,
 )
 from fpp_ml_bench.errors import NetworkError
 
 
 class UShape(FringeNetwork):
-    """The UNet's encoder and decoder around any ``bottleneck``: (B, 8 width, h, w) -> (B, 16 width, h, w).
-
-    Convolutions start Kaiming-normal (fan out); the bottleneck is left as it comes.
-    """
+    """The UNet's encoder and decoder, Kaiming-normal (fan out), around any ``bottleneck``: (B, 8 width, h, w) -> (B, 16
+    width, h, w), left as it comes."""
 
     stride = 16
     last_layer = "dec1"
@@ -40,7 +35,7 @@ class UShape(FringeNetwork):
             Join(2 * c_out, c_out, DoubleConvolution(2 * c_out, c_out)) for c_out in reversed(widths[:4])
         )
         self.head = nn.Conv2d(width, 1, 1)
-        initialise_convolutions(self)
+        base.initialise_convolutions(self)
         self.bottleneck = bottleneck
 
     @property
@@ -72,10 +67,10 @@ class UNet(UShape):
     name = "unet"
 
     def __init__(self, *, width: int = 64, dropout: float = 0.0) -> None:
-        width = whole(self.name, "width", width)
-        dropout = rate(self.name, "dropout", dropout)
+        width = base.whole(self.name, "width", width)
+        dropout = base.rate(self.name, "dropout", dropout)
         bottleneck = DoubleConvolution(8 * width, 16 * width)
-        initialise_convolutions(bottleneck)
+        base.initialise_convolutions(bottleneck)
         super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout)
 
 
@@ -100,7 +95,7 @@ class TokenBottleneck(nn.Module):
         self.layers = nn.Sequential(*(TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
         self.norm = nn.LayerNorm(channels)
         self.unembed = nn.Linear(channels, c_out * patch**2)
-        initialise_tokens(self)
+        base.initialise_tokens(self)
         for weight in (self.position, self.embed.weight):
             nn.init.trunc_normal_(weight, std=0.02)
         if self.embed.bias is not None:
@@ -109,25 +104,23 @@ class TokenBottleneck(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         tokens = self.embed(x).flatten(2).transpose(1, 2) + self.position
         patches = self.unembed(self.norm(self.layers(tokens)))
-        return functional.pixel_shuffle(
-            patches.transpose(1, 2).reshape(-1, patches.shape[2], self.grid, self.grid), self.patch
-        )
+        maps = patches.transpose(1, 2).reshape(-1, patches.shape[2], self.grid, self.grid)
+        return functional.pixel_shuffle(maps, self.patch)
 
 
 class TransUNet(UShape):
     """Encoder and decoder of the UNet around 8 transformer layers of 12 heads; 116,162,881 parameters at the defaults.
 
     width: channels of the first level; tokens have 12 x width numbers. map_size: side of the bottleneck map, 1/16 of
-    the image side (60 for 960 px). patch: side of a patch in that map, a divisor of ``map_size``. The learned
-    positions tie the network to images of 16 x map_size px a side. Probe layers as the UNet's.
+    the image side, to which the learned positions tie the network. patch: side of a patch, a divisor of ``map_size``.
     """
 
     name = "transunet"
 
     def __init__(self, *, width: int = 64, patch: int = 6, map_size: int = 60) -> None:
-        width = whole(self.name, "width", width)
-        patch = whole(self.name, "patch", patch)
-        map_size = whole(self.name, "map_size", map_size, least=2)
+        width = base.whole(self.name, "width", width)
+        patch = base.whole(self.name, "patch", patch)
+        map_size = base.whole(self.name, "map_size", map_size, least=2)
         if map_size % patch:
             raise NetworkError(f"{self.name}: patch must divide map_size; they were {patch} and {map_size}")
         bottleneck = TokenBottleneck(8 * width, 16 * width, 12 * width, map_size, patch)
@@ -146,8 +139,7 @@ class ResUNet(FringeNetwork):
     """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120.
 
     The paper's four levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but
-    the first starts with stride 2. Convolutions start Kaiming-normal (fan out). Probe layers: enc1..enc4, bottleneck,
-    dec3..dec1 (dec1 at full resolution, ``width`` channels).
+    the first starts with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1.
     """
 
     name = "resunet"
@@ -155,7 +147,7 @@ class ResUNet(FringeNetwork):
     last_layer = "dec1"
 
     def __init__(self, *, width: int = 120) -> None:
-        width = whole(self.name, "width", width)
+        width = base.whole(self.name, "width", width)
         super().__init__(width=width)
         widths = [width * 2**level for level in range(4)]
         self.encoder = nn.ModuleList(
@@ -164,16 +156,11 @@ class ResUNet(FringeNetwork):
         )
         self.bottleneck = nn.Sequential(*(ResidualBlock(widths[3], widths[3]) for _ in range(2)))
         self.decoder = nn.ModuleList(
-            Join(
-                2 * c_out,
-                c_out,
-                nn.Sequential(ResidualBlock(2 * c_out, c_out), ResidualBlock(c_out, c_out)),
-                skip_first=False,
-            )
-            for c_out in reversed(widths[:3])
+            Join(2 * c, c, nn.Sequential(ResidualBlock(2 * c, c), ResidualBlock(c, c)), skip_first=False)
+            for c in reversed(widths[:3])
         )
         self.head = nn.Conv2d(width, 1, 1)
-        initialise_convolutions(self)
+        base.initialise_convolutions(self)
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:

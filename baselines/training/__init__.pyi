@@ -1,4 +1,3 @@
-from .data import open_data as open_data
 from .depth_training import DONE as DONE
 from .depth_training import SCORING as SCORING
 from .depth_training import WEIGHTS as WEIGHTS
@@ -11,6 +10,7 @@ from .engine import RECIPE as RECIPE
 from .engine import Training as Training
 from .engine import claim_folder as claim_folder
 from .engine import reproducible as reproducible
+from .epochs import open_data as open_data
 from .losses import EPSILON as EPSILON
 from .losses import loss_function as loss_function
 from .losses import sample_losses as sample_losses

@@ -1,11 +1,8 @@
 """Training a network from a fringe image to depth by a recipe (paper Section 5.3), from dataset to weights file.
 
-The rate falls on a plateau of the validation loss, training ends when it has reached its minimum, and the weights kept
-are those of the lowest validation loss. A validation loss is the mean over samples of each sample's own loss, and the
-scores beside it are the evaluator's: individual normalisation is scored with the sample's range, by the paper's rule,
-as its rows on the leaderboard are.
-
-Beside the files of the engine, a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
+The weights kept are those of the lowest validation loss, the mean over samples of each one's own; the scores beside it
+are the evaluator's, under individual normalisation with the sample's range, as on the leaderboard. Beside the engine's
+files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
 """
 
 import json
@@ -25,12 +22,11 @@ from torch.optim import RMSprop
 from torch.utils.data import DataLoader
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training.data import EpochSampler, open_data, spread, training_loader
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, claim_folder, reproducible
-from fpp_ml_bench.baselines.training.losses import Adversarial, DepthObjective, Regression
+from fpp_ml_bench.baselines.training.epochs import EpochSampler, Schedule, open_data, spread, training_loader
+from fpp_ml_bench.baselines.training.losses import Adversarial, Regression
 from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
-from fpp_ml_bench.baselines.training.schedules import Schedule
 from fpp_ml_bench.baselines.training.tables import GAN
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
 from fpp_ml_bench.depth import Normalisation
@@ -46,7 +42,6 @@ SCORING: dict[Normalisation, tuple[Units, Mode]] = {
 }  # fmt: skip
 """How a network's output is scored: its unit, and the evaluator's mode."""
 LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
-"""The scores of `DepthScores` that a training log holds."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +62,9 @@ def train(
 ) -> TrainingRun:
     """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
 
-    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one epoch is always
-    trained. ``show``: progress on stderr.
-
-    Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a dataset of another image
-    size, a loss that is not finite or has diverged (the batch's samples are named); what else recipe, dataset or
-    network refuse comes as their own error.
+    ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
+    progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
+    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named).
     """
     out, started = Path(out), perf_counter()
     data, validation = open_data(recipe, Path(dataset))
@@ -111,14 +103,18 @@ def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> T
 class DepthTraining(Training):
     """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is validated."""
 
-    objective: DepthObjective
+    objective: Regression | Adversarial
 
     def __init__(self, recipe: Recipe, data: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
         identity = {"recipe": recipe.digest, "fingerprint": data.source.fingerprint}
         super().__init__(out, identity, recipe.seed, recipe.precision)
         self.recipe, self.data, self.validation = recipe, data, validation
         self.name, self.title = recipe.name, recipe.title
-        self.objective = objective_of(recipe)
+        network = networks.build(recipe.network, width=recipe.width, **recipe.options)
+        if recipe.loss.name == GAN:
+            self.objective = Adversarial(network, networks.discriminator(width=recipe.width))
+        else:
+            self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha)
         self.bare = dict(self.objective.modules)
         on_gpu = self.accelerator.device.type == "cuda"
         if on_gpu:
@@ -144,7 +140,6 @@ class DepthTraining(Training):
 
     @property
     def epoch(self) -> int:
-        """Epochs done."""
         return len(self.history)
 
     @property
@@ -205,11 +200,8 @@ class DepthTraining(Training):
         }  # fmt: skip
 
     def _validate(self) -> dict[str, float | None]:
-        """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled).
-
-        Each process takes its share of the validation pairs, and all get the means over all pairs; a score is None
-        where no pair has such a pixel.
-        """
+        """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled): means over the
+        pairs of all processes, None where no pair has such a pixel."""
         network, accelerator = self.bare["network"], self.accelerator
         pairs = spread(len(self.validation), self.recipe.validation_pairs)
         indices = pairs[accelerator.process_index :: accelerator.num_processes]
@@ -241,9 +233,8 @@ class DepthTraining(Training):
         if self.best is record and self.accelerator.is_main_process:
             scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
             network, fingerprint = self.bare["network"], self.data.source.fingerprint
-            save_weights(
-                self.out / WEIGHTS, network, model_config(self.recipe, network, fingerprint, record["epoch"], scores)
-            )
+            config = model_config(self.recipe, network, fingerprint, record["epoch"], scores)
+            save_weights(self.out / WEIGHTS, network, config)
 
     def state(self) -> dict[str, Any]:
         return {"schedule": self.schedule.state()}
@@ -261,24 +252,12 @@ class DepthTraining(Training):
         )
 
     def panels(self) -> list[Panel]:
+        labels = {"training_loss": "training", "validation_loss": "validation"}
+        losses = Panel.of("loss", self.history, "epoch", labels, log=True)
         kept = self.best["epoch"]
-        losses = Panel.of(
-            "loss", self.history, "epoch", {"training_loss": "training", "validation_loss": "validation"}, log=True
-        )
-        mark = {f"kept: epoch {kept}": ([kept], [self.best["validation_loss"]])}
-        return [
-            Panel(losses.title, losses.x_label, {**losses.lines, **mark}, log=True),
-            Panel.of("validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"}),
-            Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True),
-        ]
-
-
-def objective_of(recipe: Recipe) -> DepthObjective:
-    """The objective of a recipe, with freshly initialised networks. Seed torch first."""
-    network = networks.build(recipe.network, width=recipe.width, **recipe.options)
-    if recipe.loss.name == GAN:
-        return Adversarial(network, networks.discriminator(width=recipe.width))
-    return Regression(network, recipe.loss.name, recipe.loss.alpha)
+        losses.lines[f"kept: epoch {kept}"] = ([kept], [self.best["validation_loss"]])
+        object_mae = Panel.of("validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"})
+        return [losses, object_mae, Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True)]
 
 
 def model_config(

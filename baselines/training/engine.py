@@ -1,11 +1,8 @@
-"""The training loop of all networks, on one processor or many, on the devices that `accelerate` finds.
+"""The training loop of all networks, on the devices that `accelerate` finds, or that ``accelerate launch`` gives it; a
+batch of the recipe is that of one process.
 
-    accelerate launch ...   several GPUs or machines; a batch of the recipe is then that of one process
-
-A training goes in intervals (an epoch, or a number of steps). After each of them its folder holds all that is needed to
-resume: ``checkpoint.safetensors`` (everything), ``log.jsonl`` and ``recipe.json``; at the end also ``curve.png``. On
-one processor type and number of threads, the same recipe and data give the same bits on the CPU, stopped and resumed or
-not.
+After each interval (an epoch, or a number of steps) the folder holds all that is needed to resume. On one processor
+type and number of threads the same recipe and data give the same bits on the CPU, stopped and resumed or not.
 """
 
 import json
@@ -77,7 +74,7 @@ class Training(ABC):
     @property
     @abstractmethod
     def over(self) -> bool:
-        """Whether the training has come to its end."""
+        """Whether it has come to its end."""
 
     @property
     @abstractmethod
@@ -130,16 +127,17 @@ class Training(ABC):
 
     def run(self, started: float, minutes: float | None, show: bool) -> float:
         """Train to the end, or until an interval would outlast ``minutes`` since ``started``; one is always trained.
-
-        Returns the seconds so far, those of earlier calls included.
-        """
+        Returns the seconds so far, those of earlier calls included."""
         with Display(self.name, self.total_steps, show and self.accelerator.is_main_process) as display:
             self._show(display)
             last_interval_s = 0.0
-            while not self.over and self._agreed(last_interval_s == 0 or _fits(started, last_interval_s, minutes)):
+            while not self.over:
+                in_time = minutes is None or perf_counter() - started + last_interval_s < 60 * minutes
+                # The first process decides: clocks differ, and all must train the same intervals.
+                if not broadcast_object_list([last_interval_s == 0 or in_time])[0]:
+                    break
                 began = perf_counter()
-                losses = self._train_interval(display)
-                self._finish_interval(losses, began)
+                self._finish_interval(self._train_interval(display), began)
                 self._show(display)
                 last_interval_s = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
@@ -179,17 +177,12 @@ class Training(ABC):
             self.resumed_at = len(self.history)
             self.restore(state)
         if len(set(gather_object([len(self.history)]))) > 1:
-            raise TrainingError(
-                f"{self.out}: processes found different checkpoints; give a folder that all machines share"
-            )
+            words = "processes found different checkpoints; give a folder that all machines share"
+            raise TrainingError(f"{self.out}: {words}")
 
     def _show(self, display: Display) -> None:
         if self.history:
             display.update(self.steps_done, self.progress())
-
-    def _agreed(self, next_interval: bool) -> bool:
-        """Whether the first process trains on: clocks differ, and all processes must train the same intervals."""
-        return bool(broadcast_object_list([next_interval])[0])
 
     def _train_interval(self, display: Display) -> dict[str, float]:
         """One pass over `batches`; the mean over them of everything the objective logs."""
@@ -249,11 +242,6 @@ class Training(ABC):
         save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
 
 
-def _fits(started: float, last_interval_s: float, minutes: float | None) -> bool:
-    """Whether another interval like the last one ends in time."""
-    return minutes is None or perf_counter() - started + last_interval_s < 60 * minutes
-
-
 def claim_folder(out: Path, content: dict[str, Any]) -> None:
     """Make ``out`` the folder of the training that ``content`` (``recipe``, and what identifies its data) describes,
     or see that it is. Raises `TrainingError` for a folder of another training or of other files."""
@@ -286,17 +274,17 @@ def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     AcceleratorState._reset_state(cpu)
     keep_freed_memory()
     on_gpu = torch.cuda.is_available()
-    before = torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.benchmark
+    matmul, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    before = cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32
     torch.use_deterministic_algorithms(not on_gpu)
-    torch.backends.cudnn.benchmark = on_gpu
-    tf32 = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    cudnn.benchmark = on_gpu
     if precision == "fp32":
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+        matmul.allow_tf32 = cudnn.allow_tf32 = False
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(before[0])
-        torch.backends.cudnn.benchmark = before[1]
-        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = tf32
+        torch.use_deterministic_algorithms(deterministic)
+        cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32 = before
         if cpu:
             AcceleratorState._reset_state(True)

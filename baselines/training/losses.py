@@ -1,33 +1,17 @@
-"""The six losses of the paper's comparison (Section 5.5), on a batch for training and on each sample for validation,
-and those of a GAN; then the objectives that are made of them.
+"""The six losses of the paper's comparison (Section 5.5), those of a GAN, and the objectives that are made of them.
 
-With p the prediction, t the target, both in the training representation, and e = 1e-8:
+With p the prediction, t the target, both in the training representation, and e = 1e-8, ``rmse`` is sqrt(mean (p - t)^2
++ e), ``l1`` mean abs(p - t), over all pixels; ``masked_rmse`` and ``masked_l1`` the same over the object's (t > 0);
+``hybrid_rmse`` and ``hybrid_l1`` are alpha masked + (1 - alpha) unmasked.
 
-============ ======================================= ==========================
-name         value                                   pixels
-============ ======================================= ==========================
-rmse         sqrt(mean (p - t)^2 + e)                all
-l1           mean abs(p - t)                         all
-masked_rmse  sqrt(mean (p - t)^2 + e)                object
-masked_l1    mean abs(p - t)                         object
-hybrid_rmse  alpha masked_rmse + (1 - alpha) rmse
-hybrid_l1    alpha masked_l1 + (1 - alpha) l1
-============ ======================================= ==========================
-
-- Object pixels are those with t > 0 *in the representation*: under individual normalisation the pixels at D_min are 0
-  and count as background, as in the paper.
-- `loss_function` takes one mean over all pixels of the batch, `sample_losses` one for each sample. The two differ: the
-  root of a mean is not the mean of roots, and a masked mean over a batch weighs samples by their object's size. Scores
-  average samples, so validation must too.
-- e is under the root once, so an RMSE loss is never below 1e-4 in its representation (0.1 mm under global
-  normalisation). It makes the gradient at zero residual 0 instead of 0/0, and is the reason why no score is a loss.
-- Without a single object pixel a masked part is exactly 0, with zero gradient, instead of 0/0. In a batch the loss then
-  depends on the other samples. In `sample_losses` such a sample gives 0 too; it shifts a validation mean by the same
-  amount in every epoch.
-- A prediction or target that is NaN or infinite *anywhere* makes every loss NaN or infinite, outside the mask too:
-  masking multiplies, it does not select. The training engine stops on it.
-- Half precisions are computed in float32 (2,100 mm squared is beyond float16), float64 in float64. float32 sums differ
-  from float64 ones by less than 1e-6 of their value, at four images of 960 x 960 px in mm (tests/test_losses.py).
+- Under individual normalisation the pixels at D_min are 0 and count as background, as in the paper.
+- `loss_function` takes one mean over the batch, `sample_losses` one for each sample, as scores do. The two differ: the
+  root of a mean is not the mean of roots, and a masked mean over a batch weighs samples by their object's size.
+- e makes the gradient at zero residual 0 instead of 0/0; an RMSE loss is never below 1e-4, so no score is a loss.
+- Without an object pixel a masked part is exactly 0, with zero gradient, instead of 0/0.
+- A value that is NaN or infinite *anywhere* makes every loss so, outside the mask too: masking multiplies, it does not
+  select. The training engine stops on it.
+- Half precisions are computed in float32 (2,100 mm squared is beyond float16), float64 in float64.
 """
 
 import math
@@ -46,14 +30,10 @@ from fpp_ml_bench.loaders.training import FringeDepth
 
 EPSILON = 1e-8
 
-LossFunction = Callable[[Tensor, Tensor], Tensor]
 
-
-def loss_function(name: str, alpha: float | None = None) -> LossFunction:
-    """The training loss ``name`` as a function of ``prediction`` and ``target``, each (B, 1, H, W), any float dtype.
-
-    It returns a 0-d tensor, float32 (float64 for float64 input). ``alpha`` in [0, 1], the weight of the object's part,
-    is for the hybrids and must be given there.
+def loss_function(name: str, alpha: float | None = None) -> Callable[[Tensor, Tensor], Tensor]:
+    """The training loss ``name`` as a function of ``prediction`` and ``target``, each (B, 1, H, W), any float dtype, to
+    a 0-d tensor, float32 (float64 for float64 input). ``alpha`` in [0, 1] is for the hybrids, and needed there.
 
     Raises `RecipeError` for an unknown name or an ``alpha`` that is missing, out of range, or of no use. The function
     raises ``ValueError`` for tensors that are not of one shape (B, 1, H, W), empty, or not of floats.
@@ -69,46 +49,37 @@ def sample_losses(name: str, alpha: float | None, prediction: Tensor, target: Te
 
 
 def _loss(name: str, alpha: float | None, prediction: Tensor, target: Tensor, *, per_sample: bool) -> Tensor:
-    prediction, target = _checked(prediction, target)
-    difference = prediction - target
-    root = name.endswith("rmse")
-    errors = difference.square() if root else difference.abs()
-    pixels = (1, 2, 3) if per_sample else (0, 1, 2, 3)
-    if name in ("rmse", "l1"):
-        return _everywhere(errors, root, pixels)
-    masked = _on_object(errors, target > 0, root, pixels)
-    return masked if alpha is None else alpha * masked + (1 - alpha) * _everywhere(errors, root, pixels)
-
-
-def _everywhere(errors: Tensor, root: bool, pixels: tuple[int, ...]) -> Tensor:
-    mean = errors.mean(pixels)
-    return (mean + EPSILON).sqrt() if root else mean
-
-
-def _on_object(errors: Tensor, mask: Tensor, root: bool, pixels: tuple[int, ...]) -> Tensor:
-    count = mask.sum(pixels)
-    # Products, not selections: 0 x NaN is NaN, and the gradient of what they leave out is 0.
-    mean = (errors * mask).sum(pixels) / count.clamp(min=1)
-    return (mean + EPSILON).sqrt() * (count > 0) if root else mean
-
-
-def _checked(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Both in float32 or better. Shapes must agree: broadcasting (B, H, W) would compare every pair of samples."""
+    # Shapes must agree: broadcasting (B, H, W) would compare every pair of samples.
     shapes = f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}"
     if prediction.shape != target.shape or prediction.ndim != 4 or prediction.shape[1] != 1 or not prediction.numel():
         raise ValueError(f"expected prediction and target of one shape (B, 1, H, W), not empty, got {shapes}")
     if not (prediction.is_floating_point() and target.is_floating_point()):
         raise ValueError(f"expected prediction and target as floats, got {prediction.dtype} and {target.dtype}")
     dtype = torch.promote_types(torch.promote_types(prediction.dtype, target.dtype), torch.float32)
-    return prediction.to(dtype), target.to(dtype)
+    target = target.to(dtype)
+    difference = prediction.to(dtype) - target
+    root = name.endswith("rmse")
+    errors = difference.square() if root else difference.abs()
+    pixels = (1, 2, 3) if per_sample else (0, 1, 2, 3)
+
+    def everywhere() -> Tensor:
+        return (errors.mean(pixels) + EPSILON).sqrt() if root else errors.mean(pixels)
+
+    if name in ("rmse", "l1"):
+        return everywhere()
+    mask = target > 0
+    count = mask.sum(pixels)
+    # Products, not selections: 0 x NaN is NaN, and the gradient of what they leave out is 0.
+    masked = (errors * mask).sum(pixels) / count.clamp(min=1)
+    masked = (masked + EPSILON).sqrt() * (count > 0) if root else masked
+    return masked if alpha is None else alpha * masked + (1 - alpha) * everywhere()
 
 
 Features = Sequence[Sequence[Tensor]]
 
 LOG_FLOOR = 1e-3
-"""Added to depths in [0, 1] before their logarithm, so that differences below a thousandth of the range hardly count.
-Own choice: with 1e-6 the pixels near D_min would have gradients up to a million times those of all others."""
-
+"""Added to depths in [0, 1] before their logarithm. Own choice: with 1e-6 the pixels near D_min would have gradients up
+to a million times those of all others."""
 SHARED_SCALE = 0.5
 """How much of an error common to all pixels, a wrong scale, is forgiven: Eigen et al.'s lambda."""
 
@@ -124,15 +95,10 @@ def feature_matching(generated: Features, real: Features) -> Tensor:
 
     The real image's features are taken as they are: no gradient flows into them.
     """
-    scales = [
-        torch.stack(
-            [(_wide(generated_map) - _wide(real_map).detach()).abs().mean() for generated_map, real_map in layers]
-        ).sum()
-        for layers in (
-            list(zip(generated_maps[:-1], real_maps[:-1], strict=True))
-            for generated_maps, real_maps in zip(generated, real, strict=True)
-        )
-    ]
+    scales = []
+    for ours, theirs in zip(generated, real, strict=True):
+        pairs = zip(ours[:-1], theirs[:-1], strict=True)
+        scales.append(torch.stack([(_wide(our) - _wide(their).detach()).abs().mean() for our, their in pairs]).sum())
     return torch.stack(scales).mean()
 
 
@@ -176,8 +142,9 @@ Step = tuple[str, Tensor, dict[str, Tensor]]
 class Objective(Protocol):
     """What is minimised: it owns its networks and gives the engine the losses, one by one.
 
-    Before training, the engine may put wrapped networks (several processes, mixed precision, compiled) in the place of
-    ``modules[name]``: every call goes through that mapping. The weights file holds ``modules["network"]``.
+    Every call goes through ``modules``: the engine may put wrapped networks (several processes, mixed precision,
+    compiled) there. The weights file holds ``modules["network"]``. An objective of depth also has
+    ``validation_losses(prediction, batch)``, (B,), of which rate schedule and choice of weights see the mean.
     """
 
     modules: dict[str, nn.Module]
@@ -186,16 +153,8 @@ class Objective(Protocol):
         """The updates of one batch. The engine takes each one before it asks for the next."""
 
 
-class DepthObjective(Objective, Protocol):
-    def validation_losses(self, prediction: Tensor, batch: FringeDepth) -> Tensor:
-        """Loss of every sample (B,), of which the rate schedule and the choice of the best weights see the mean."""
-
-
 class Regression:
-    """A network with one of the paper's losses on its output (Section 5.5).
-
-    Raises `RecipeError` for a loss or ``alpha`` that `losses.loss_function` refuses.
-    """
+    """A network with one of the paper's losses on its output; `RecipeError` as `loss_function`."""
 
     def __init__(self, network: nn.Module, loss_name: str, alpha: float | None = None) -> None:
         self.modules: dict[str, nn.Module] = {"network": network}
@@ -233,17 +192,16 @@ class AdversarialSettings:
 class Adversarial:
     """A generator against a discriminator that is trained too: least squares GAN, feature matching, depth terms.
 
-    ``generator`` maps a fringe image to depth, both in [0, 1], so the normalisation must be ``individual``.
-    ``discriminator`` takes (B, 2, H, W), fringe and depth, each in [-1, 1], and answers lists of
-    features, the scores last. A batch has two steps: the discriminator learns to tell the batch's depth from the
-    generator's; then the generator is judged by the updated discriminator. The generator runs forward once for both.
+    ``generator`` maps a fringe image to depth, both in [0, 1]; ``discriminator`` takes (B, 2, H, W), fringe and depth,
+    each in [-1, 1], to lists of features, the scores last. It learns first; the generator, run forward once for both,
+    is then judged by the updated one.
     """
 
     def __init__(
         self, generator: nn.Module, discriminator: nn.Module, settings: AdversarialSettings | None = None
     ) -> None:
         self.modules: dict[str, nn.Module] = {"network": generator, "discriminator": discriminator}
-        self.settings = AdversarialSettings() if settings is None else settings
+        self.settings = settings or AdversarialSettings()
 
     def steps(self, batch: FringeDepth) -> Iterator[Step]:
         prediction = self.modules["network"](batch.fringe)
@@ -263,7 +221,7 @@ class Adversarial:
         true = scores_against([[f[count:] for f in scale] for scale in answers], real=True)
         loss = (false + true) / 2
         logged = {"discriminator": loss, "discriminator_generated": false, "discriminator_real": true}
-        return "discriminator", loss, _detached(logged)
+        return "discriminator", loss, {name: value.detach() for name, value in logged.items()}
 
     def _generator_step(self, prediction: Tensor, generated: Tensor, real: Tensor, depth: Tensor) -> Step:
         with _fixed(self.modules["discriminator"]) as discriminator:
@@ -279,7 +237,7 @@ class Adversarial:
         }
         weights = asdict(self.settings)
         loss = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
-        return "network", loss, _detached({"loss": loss, **terms})
+        return "network", loss, {name: value.detach() for name, value in {"loss": loss, **terms}.items()}
 
 
 def _pairs(fringe: Tensor, depth: Tensor) -> Tensor:
@@ -287,16 +245,10 @@ def _pairs(fringe: Tensor, depth: Tensor) -> Tensor:
     return torch.cat([fringe, depth.to(fringe.dtype)], dim=1) * 2 - 1
 
 
-def _detached(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.detach() for name, value in values.items()}
-
-
 @contextmanager
 def _fixed(module: nn.Module) -> Iterator[nn.Module]:
-    """Within: gradients of forward passes flow through ``module`` but not into its parameters.
-
-    The graph records which parameters need a gradient, so they are free again before the backward pass.
-    """
+    """Within: gradients of forward passes flow through ``module`` but not into its parameters. The graph records that,
+    so they are free again before the backward pass."""
     free = [parameter for parameter in module.parameters() if parameter.requires_grad]
     for parameter in free:
         parameter.requires_grad_(False)

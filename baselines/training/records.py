@@ -1,7 +1,6 @@
-"""What a training writes down: its whole state in one file, its log, its curve, and the progress bar.
+"""What a training writes down: its checkpoint, its log, its curve, and the progress bar.
 
-The checkpoint is a safetensors file, never a pickle, with networks, optimisers, schedule and history. It is written
-after every interval, atomically; the history travels in it, so that the log is always that of the state.
+The checkpoint is a safetensors file, never a pickle, of networks, optimisers, schedule and history.
 """
 
 import hashlib
@@ -23,16 +22,14 @@ from fpp_ml_bench.files import write_atomically
 LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
 _FORMAT = "fpp-ml-bench training 1"
 State = dict[str, Tensor]
+Record = dict[str, Any]
 
 
 def optimizer_tensors(optimizer: Optimizer, prefix: str) -> State:
     """The optimiser's state as tensors, ``prefix.parameter number.key``."""
-    tensors: State = {}
-    for number, state in optimizer.state_dict()["state"].items():
-        for key, value in state.items():
-            if isinstance(value, Tensor):
-                tensors[f"{prefix}.{number}.{key}"] = value
-    return tensors
+    state = optimizer.state_dict()["state"]
+    items = ((f"{prefix}.{number}.{key}", v) for number, values in state.items() for key, v in values.items())
+    return {name: value for name, value in items if isinstance(value, Tensor)}
 
 
 def restore_optimizer(optimizer: Optimizer, tensors: State, prefix: str) -> None:
@@ -49,8 +46,7 @@ def save_checkpoint(path: Path, tensors: State, state: dict[str, Any]) -> None:
     """Write ``tensors`` and the JSON mapping ``state``, sealed with a digest of both."""
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps(state, allow_nan=False)
-    seal = _seal(contiguous, text)
-    write_atomically(path, save(contiguous, {"format": _FORMAT, "state": text, "sha256": seal}))
+    write_atomically(path, save(contiguous, {"format": _FORMAT, "state": text, "sha256": _seal(contiguous, text)}))
 
 
 def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
@@ -79,9 +75,6 @@ def _seal(tensors: State, text: str) -> str:
     return digest.hexdigest()
 
 
-Record = dict[str, Any]
-
-
 def write_log(folder: Path, history: list[Record]) -> None:
     """``log.jsonl``: a line for each record: step or epoch (from 1), rate, losses, scores in mm, seconds."""
     lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in history)
@@ -94,7 +87,7 @@ class Panel:
 
     title: str
     x_label: str
-    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    lines: dict[str, tuple[Sequence[float], Sequence[float]]]
     log: bool = False
 
     @classmethod

@@ -1,11 +1,8 @@
 """Trained weights on disk: one safetensors file with the tensors and the configuration of their network.
 
-The file's metadata is ``format`` (that of a `Family`: no reader takes a network of another kind for its own),
-``version`` and ``config``, a `ModelConfig` or `NetConfig` as JSON. Tensors of a depth network's file whose name starts
-with ``range_head.`` belong to the range heads (`RangeHeads`), all others are the network's ``state_dict``. Pickles
-(``.pt``, ``.pth``) are never opened: opening a pickle can run code.
-
-The same tensors and configuration give the same bytes.
+Its metadata are ``format`` (that of a `Family`), ``version`` and ``config``, a `ModelConfig` or `NetConfig` as JSON.
+Tensors named ``range_head.*`` belong to a depth network's range heads, all others are the network's ``state_dict``.
+Pickles are never opened: that can run code. The same tensors and configuration give the same bytes.
 """
 
 import json
@@ -56,16 +53,12 @@ class TrainingBenchmark:
 
 @checked_dataclass(frozen=True, config=_STRICT)
 class ModelConfig:
-    """What a trained network is, and what it was trained on.
+    """What a trained network is, and what it was trained on. ``ValueError`` for a wrong type or unknown value.
 
-    ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is the representation it puts out,
-    ``image_size`` (H, W) in px the only size it is meant for (the fringe period in px depends on the size).
-    ``data_config`` names the frames it was trained on, ``background_removed`` says that its input is 0 outside the
-    object. ``dataset_fingerprint`` is that of the training data, ``benchmark`` its name and version
-    (None for a dataset of the user's own, and in older files), ``recipe`` the resolved training recipe, ``epoch`` the
-    epoch of these weights, ``validation`` its scores.
-
-    Raises ``ValueError`` for a value of the wrong type, an unknown normalisation or configuration.
+    ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is what it puts out, ``image_size``
+    (H, W) in px the only size it is meant for. ``data_config`` names the frames it was trained on,
+    ``background_removed`` says that its input is 0 outside the object. ``benchmark`` is None for a dataset of the
+    user's own, and in older files; ``recipe`` the resolved recipe, ``validation`` the scores of these weights.
     """
 
     name: Text
@@ -150,11 +143,11 @@ def save_weights(
     """
     path = Path(path)
     if path.suffix != SUFFIX:
-        raise WeightsError(f"{_shown(path)}: expected a name that ends in {SUFFIX}; weights are saved as nothing else")
+        raise _fault(path, f": expected a name that ends in {SUFFIX}; weights are saved as nothing else")
     tensors = network.state_dict()
     clash = next((name for name in tensors if name.startswith(HEAD_PREFIX)), None)
     if clash is not None:
-        raise WeightsError(f"{_shown(path)}: the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
+        raise _fault(path, f": the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
     _check_tensors(path, config, tensors)
     head_tensors = {HEAD_PREFIX + name: tensor for name, tensor in (heads or {}).items()}
     _check_finite(path, head_tensors)
@@ -162,12 +155,8 @@ def save_weights(
 
 
 def open_weights(path: str | Path) -> WeightsFile:
-    """Everything in the weights file of a depth network, checked.
-
-    Raises `WeightsError`, naming file, expectation and finding, for a file that is absent, damaged, a pickle or
-    foreign, of another version, with unknown or missing keys in its configuration, with tensors that are not finite or
-    that do not fit the network that its configuration builds.
-    """
+    """Everything in the weights file of a depth network, checked. `WeightsError` as `read_file`, and for tensors that
+    are not finite or that do not fit the network that the configuration builds."""
     path = Path(path)
     config, tensors, digest = read_file(path, DEPTH_NETWORKS)
     head_tensors = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
@@ -207,11 +196,8 @@ def training_benchmark(fingerprint: str) -> TrainingBenchmark | None:
 
 def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest) -> str | None:
     """A sentence where weights are used on another version of the benchmark that they were trained on, or where nothing
-    is known about their training data; else None.
-
-    Only a named benchmark, or a dataset built with its settings, has scores that others compare with theirs. On
-    imported data or a dataset with settings of its own, and on another benchmark, nothing is said: the user chose it.
-    """
+    is known about their training data; else None. Only for a named benchmark, or a dataset built with its settings: on
+    imported data, a dataset with settings of its own and another benchmark the user chose so."""
     fingerprint = manifest.fingerprint
     used_on = benchmark_of(fingerprint) or intended_benchmark(manifest)
     if used_on is None or config.dataset_fingerprint == fingerprint:
@@ -219,17 +205,12 @@ def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest)
     trained_on = training_benchmark(config.dataset_fingerprint) or config.benchmark
     if trained_on is not None and trained_on.name != used_on.name:
         return None
-    training_data = (
-        f"dataset {config.dataset_fingerprint[:8]}, which is no benchmark of this version"
-        if trained_on is None
-        else trained_on.title
+    training_data = f"dataset {config.dataset_fingerprint[:8]}, which is no benchmark of this version"
+    dataset = f"dataset {fingerprint[:8]}, which has the settings of {used_on.title} but other bytes"
+    return (
+        f"trained on {training_data if trained_on is None else trained_on.title}; predicting on "
+        f"{used_on.title if used_on.fingerprint == fingerprint else dataset}"
     )
-    dataset = (
-        used_on.title
-        if used_on.fingerprint == fingerprint
-        else f"dataset {fingerprint[:8]}, which has the settings of {used_on.title} but other bytes"
-    )
-    return f"trained on {training_data}; predicting on {dataset}"
 
 
 def write_file(path: Path, family: Family, config: ModelConfig | NetConfig, tensors: "Mapping[str, Tensor]") -> str:
@@ -242,7 +223,7 @@ def write_file(path: Path, family: Family, config: ModelConfig | NetConfig, tens
     try:
         write_atomically(path, data)
     except OSError as error:
-        raise WeightsError(f"{_shown(path)} can't be written: {error.strerror}; give a folder that exists") from None
+        raise _fault(path, f" can't be written: {error.strerror}; give a folder that exists") from None
     return sha256(data).hexdigest()
 
 
@@ -257,34 +238,32 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
 
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "nothing"
-        raise WeightsError(f"{_shown(path)}: expected {family.kind} (*{SUFFIX}), found {actual} there")
+        raise _fault(path, f": expected {family.kind} (*{SUFFIX}), found {actual} there")
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise WeightsError(f"{_shown(path)} can't be read: {error.strerror}") from None
+        raise _fault(path, f" can't be read: {error.strerror}") from None
     metadata = _metadata(path, data, family)
     try:
         tensors = load(data)
     except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise WeightsError(f"{_shown(path)}: damaged ({printable(str(error), 200)}); copy or train it again") from None
+        raise _fault(path, f": damaged ({printable(str(error), 200)}); copy or train it again") from None
     try:
         config = family.config.validate_json(metadata.get("config", ""))
     except ValidationError as error:
         lines = "\n  ".join(problems_of(error))
-        raise WeightsError(
-            f"{_shown(path)}: its configuration is not valid; train or save it again:\n  {lines}"
-        ) from None
+        raise _fault(path, f": its configuration is not valid; train or save it again:\n  {lines}") from None
     return config, tensors, sha256(data).hexdigest()
 
 
 def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
     """The header's ``__metadata__``; refuses what is no file of ``family`` before anything is unpacked."""
     if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
-        raise WeightsError(
-            f"{_shown(path)}: expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a "
-            "pickle can run code; load it where you trust it and write it with "
-            "fpp_ml_bench.baselines.training.weights.save_weights"
-        )
+        raise _fault(
+            path, f": expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a pickle can "
+            "run code; load it where you trust it and write it with "
+            "fpp_ml_bench.baselines.training.weights.save_weights",
+        )  # fmt: skip
     try:
         length = int.from_bytes(data[:8], "little")
         if len(data) < 8 or length > len(data) - 8:
@@ -293,19 +272,14 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is no mapping")
     except (ValueError, AttributeError, RecursionError) as error:
-        raise WeightsError(
-            f"{_shown(path)}: damaged or no {family.file} ({printable(str(error), 200)}); copy or train it again"
-        ) from None
+        words = f": damaged or no {family.file} ({printable(str(error), 200)}); copy or train it again"
+        raise _fault(path, words) from None
+    form, version = (printable(str(metadata.get(key)), 60) for key in ("format", "version"))
     if metadata.get("format") != family.format:
-        raise WeightsError(
-            f"{_shown(path)}: expected weights of {family.format}, got format "
-            f"{printable(str(metadata.get('format')), 60)!r}: {family.cure}"
-        )
+        raise _fault(path, f": expected weights of {family.format}, got format {form!r}: {family.cure}")
     if metadata.get("version") != VERSION:
-        raise WeightsError(
-            f"{_shown(path)}: expected version {VERSION}, got {printable(str(metadata.get('version')), 60)!r}; read it "
-            "with the version of fpp-ml-bench that wrote it, or train again"
-        )
+        cure = "read it with the version of fpp-ml-bench that wrote it, or train again"
+        raise _fault(path, f": expected version {VERSION}, got {version!r}; {cure}")
     return metadata
 
 
@@ -319,33 +293,26 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
         network.check_size(*config.image_size)
         expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
-        raise WeightsError(
-            f"{_shown(path)}: its configuration makes no network: {printable(str(error), 300)}"
-        ) from None
+        raise _fault(path, f": its configuration makes no network: {printable(str(error), 300)}") from None
     options = ", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults"
     built = f"{config.network} with {printable(options, 200)}"
     for name in tensors:
         if name not in expected:
-            raise WeightsError(f"{_shown(path)}: tensor {printable(name, 100)} is none of {built}")
+            raise _fault(path, f": tensor {printable(name, 100)} is none of {built}")
     for name, tensor in expected.items():
         if name not in tensors:
-            raise WeightsError(f"{_shown(path)}: tensor {name} is missing, which {built} has; train or copy it again")
-        if (actual := _form(tensors[name])) != _form(tensor):
-            raise WeightsError(f"{_shown(path)}: tensor {name}: expected {_form(tensor)} for {built}, got {actual}")
+            raise _fault(path, f": tensor {name} is missing, which {built} has; train or copy it again")
+        wanted, actual = (f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (tensor, tensors[name]))
+        if actual != wanted:
+            raise _fault(path, f": tensor {name}: expected {wanted} for {built}, got {actual}")
     _check_finite(path, tensors)
-
-
-def _form(tensor: "Tensor") -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
 
 
 def _check_finite(path: Path, tensors: "Mapping[str, Tensor]") -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise WeightsError(
-                f"{_shown(path)}: tensor {printable(name, 100)} holds values that are not finite; the training "
-                "diverged or the file is damaged"
-            )
+            words = "holds values that are not finite; the training diverged or the file is damaged"
+            raise _fault(path, f": tensor {printable(name, 100)} {words}")
 
 
 def _ordered_header(data: bytes) -> bytes:
@@ -358,5 +325,5 @@ def _ordered_header(data: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + data[8 + length :]
 
 
-def _shown(path: Path) -> str:
-    return printable(str(path), 500)
+def _fault(path: Path, words: str) -> WeightsError:
+    return WeightsError(f"{printable(str(path), 500)}{words}")

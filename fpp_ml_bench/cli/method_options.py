@@ -3,22 +3,25 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fpp_ml_bench import baselines, decoding
 from fpp_ml_bench.baselines import networks, training
 from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
-from fpp_ml_bench.loaders import render
-
-if TYPE_CHECKING:
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
     "(single-shot phase; order, mask and correction learned), the name of weights that "
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
-_RECIPE_SUFFIXES = (".yaml", ".yml")
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "classical": ("steps", "direction", "fewest", "depth_noise"),
+    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
+    "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
+    "trained networks": ("depth_range", "frame", "device"),
+}
+"""Options that belong to one kind of method only, by their name in the parsed arguments."""
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -27,22 +30,17 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     classical = parser.add_argument_group("classical")
     classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
     classical.add_argument(
-        "--direction",
-        choices=("horizontal", "vertical", "both"),
+        "--direction", choices=("horizontal", "vertical", "both"),
         help="fringes to use: one direction is enough for a depth (default: both)",
-    )
+    )  # fmt: skip
     classical.add_argument(
-        "--fewest",
-        action="store_const",
-        const=True,
+        "--fewest", action="store_const", const=True,
         help="capture only the Gray frames that the rig's range needs: with both directions usually none",
-    )
+    )  # fmt: skip
     classical.add_argument(
-        "--depth-noise",
-        type=float,
-        metavar="MM",
+        "--depth-noise", type=float, metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
-    )
+    )  # fmt: skip
     phase = parser.add_argument_group("phase and phase-net")
     phase.add_argument(
         "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
@@ -51,17 +49,14 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)"
     )
     phase.add_argument(
-        "--error-mm",
-        type=float,
-        metavar="MM",
+        "--error-mm", type=float, metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
         "with a single fringe; may need the Gray code",
-    )
+    )  # fmt: skip
     phase.add_argument(
-        "--prior",
-        choices=("none", "standoff"),
+        "--prior", choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-    )
+    )  # fmt: skip
     phase.add_argument(
         "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
     )
@@ -69,52 +64,45 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
     )
     phase.add_argument(
-        "--weights",
-        metavar="FILE",
+        "--weights", metavar="FILE",
         help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
         "phase-net-fresh, trained on additional objects)",
-    )
+    )  # fmt: skip
     network = parser.add_argument_group("trained networks")
     network.add_argument(
-        "--range",
-        dest="depth_range",
-        choices=("oracle", "predicted", "mean"),
+        "--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
         "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
-    )
+    )  # fmt: skip
     network.add_argument("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
     network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
-def chosen_method(args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
+def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
     """The method that ``args`` name, for the rig of ``opened``.
 
     Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
     FppBenchError for an unknown method, and for an option that belongs to another one.
     """
-    method = _method(args, opened)
-    config = method.weights_config
-    if config is not None:
-        warning = training.training_data_warning(config, opened.manifest)
-        if warning is not None:
-            print(f"warning: {config.name} was {warning}", file=sys.stderr)
-    return method
-
-
-def _method(args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
-    kind = args.method if args.method in baselines.METHODS else "network"
-    weights = _weights(args.method, opened.size[1]) if kind == "network" else None
+    maker = _MAKERS.get(args.method)
+    weights = None if maker else _weights(args.method, opened.size[1])
+    own = _OPTIONS[args.method if maker else "trained networks"]
     for owner, options in _OPTIONS.items():
-        foreign = [option for option in options if getattr(args, option) is not None and option not in _OPTIONS[kind]]
+        foreign = [option for option in options if getattr(args, option) is not None and option not in own]
         if foreign:
-            raise PredictionError(
-                f"{_flag(foreign[0])} is an option of {_KINDS[owner]}, not of {args.method}; leave it out"
-            )
+            flag = "range" if foreign[0] == "depth_range" else foreign[0].replace("_", "-")
+            raise PredictionError(f"--{flag} is an option of {owner}, not of {args.method}; leave it out")
     if weights is not None:
-        return _network(weights, args, opened)
-    return baselines.load_method(kind, opened.rig, **_MAKERS[kind](args, opened))
+        method = _network(weights, args, opened)
+    else:
+        method = baselines.load_method(args.method, opened.rig, **_MAKERS[args.method](args, opened))
+    config = method.weights_config
+    warning = None if config is None else training.training_data_warning(config, opened.manifest)
+    if config is not None and warning is not None:
+        print(f"warning: {config.name} was {warning}", file=sys.stderr)
+    return method
 
 
 def weights_of_recipe(recipe: str, size: int) -> Path:
@@ -139,31 +127,31 @@ def weights_of_recipe(recipe: str, size: int) -> Path:
 def _weights(name: str, size: int) -> Path:
     """The weights file that METHOD means, where it is no method of its own."""
     row_of_a_table = name.split("/")[0] in training.TABLES and not name.endswith(training.SUFFIX)
-    if name.endswith(_RECIPE_SUFFIXES) or row_of_a_table:
+    if name.endswith((".yaml", ".yml")) or row_of_a_table:
         return weights_of_recipe(name, size)
     return baselines.known_weights(name)
 
 
-def _network(path: Path, args: argparse.Namespace, opened: "DatasetFolder") -> "baselines.Method":
+def _network(path: Path, args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
     model = networks.load(path, args.device)
     if model.config.image_size != opened.size:
+        trained_at, here = (f"{height}x{width}" for height, width in (model.config.image_size, opened.size))
         raise WeightsError(
-            f"{path}: was trained at {_size(model.config.image_size)} px (H x W), {opened.path} has images of "
-            f"{_size(opened.size)} px: the fringe period in px depends on the size, so a network works at one size "
-            "only; use weights trained at that size, or a dataset built at the weights' size"
+            f"{path}: was trained at {trained_at} px (H x W), {opened.path} has images of {here} px: "
+            "the fringe period in px depends on the size, so a network works at one size only; use weights trained "
+            "at that size, or a dataset built at the weights' size"
         )
     return networks.NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
 
 
-def _classical(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+def _classical(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
     steps = opened.sequence.steps if args.steps is None else args.steps
     if args.depth_noise is not None:
         steps = _steps_for(args, opened)
-    options = {"direction": args.direction or "both", "steps": steps, "threads": args.threads}
-    return {**options, **({"fewest": True} if args.fewest else {})}
+    return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 
-def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
+def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int:
     """Steps for ``--depth-noise``, by the noise that the dataset was built with."""
     depth_noise_mm = args.depth_noise
     noise_grey = opened.manifest.settings.get("noise_sigma_grey")
@@ -181,35 +169,24 @@ def _steps_for(args: argparse.Namespace, opened: "DatasetFolder") -> int:
     return steps
 
 
-def _phase(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
+def _phase(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    options: dict[str, Any] = {"direction": args.fringe, "prior": args.prior, "min_confidence": args.min_confidence}
-    options |= {"frames": args.frames, "error_mm": args.error_mm}
-    options["shading"] = None if args.no_shading is None else False
+    shading = None if args.no_shading is None else False
+    return _given(
+        direction=args.fringe, prior=args.prior, min_confidence=args.min_confidence, frames=args.frames,
+        error_mm=args.error_mm, shading=shading,
+    )  # fmt: skip
+
+
+def _phase_net(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
+    shading = None if args.no_shading is None else False
+    options = {"threads": args.threads, "min_confidence": args.min_confidence, "weights": args.weights}
+    return _given(direction=args.fringe, shading=shading, **options)
+
+
+def _given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _phase_net(args: argparse.Namespace, opened: "DatasetFolder") -> dict[str, Any]:
-    options = {"direction": args.fringe, "min_confidence": args.min_confidence, "weights": args.weights}
-    options["shading"] = None if args.no_shading is None else False
-    return {"threads": args.threads} | {name: value for name, value in options.items() if value is not None}
-
-
 _MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net}
-_OPTIONS: dict[str, tuple[str, ...]] = {
-    "classical": ("steps", "direction", "fewest", "depth_noise"),
-    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
-    "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
-    "network": ("depth_range", "frame", "device"),
-}
-"""Options that belong to one kind of method only, by their name in the parsed arguments."""
-_KINDS = {"classical": "classical", "phase": "phase", "phase-net": "phase-net", "network": "trained networks"}
-
-
-def _flag(option: str) -> str:
-    return {"depth_range": "--range"}.get(option, f"--{option.replace('_', '-')}")
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"

@@ -3,7 +3,7 @@
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from fpp_ml_bench import baselines
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
@@ -12,9 +12,6 @@ from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 SUMMARY = "Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."
 EXAMPLES = (
@@ -46,8 +43,6 @@ def _count(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Time the method, write the timing files, print the figures. Raises FppBenchError, before timing, for a file that
-    can't be written into."""
     from fpp_ml_bench.cli.console import progress_bar, show
 
     limit_threads(args.threads)
@@ -71,17 +66,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _table(title: str, timing: "result.Timing") -> "Table":
+def _table(title: str, timing: "result.Timing") -> Any:
     from rich.table import Table
     from rich.text import Text
 
     def mib(value: float | None) -> str:
         return "unknown" if value is None else f"{value:,.0f} MiB"
 
-    height, width = timing.image_size
-    machine = timing.hardware
-    table = Table(show_header=False, title=Text(f"{title}, measured here"), title_justify="left")
-    table.add_column(justify="left")
+    (height, width), machine = timing.image_size, timing.hardware
+    table = Table("", show_header=False, title=Text(f"{title}, measured here"), title_justify="left")
     table.add_column(justify="right", overflow="fold")
     ways = "at once" if timing.batched else "one after another"
     for name, value in (

@@ -15,9 +15,6 @@ EXAMPLES = (
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
 )
-MODEL = "model.safetensors"
-PHASE_NET = "phase-net"
-_OF_PHASE_NET = ("extra", "start", "steps", "unions", "rate")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,11 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
     )
     parser.add_argument(
-        "--minutes",
-        type=float,
-        metavar="M",
+        "--minutes", type=float, metavar="M",
         help="stop before an epoch that would not finish in time, everything saved",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added"
     )
@@ -44,11 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)"
     )
     parser.add_argument(
-        "--unions",
-        type=int,
-        metavar="N",
+        "--unions", type=int, metavar="N",
         help="phase-net: images that join several objects, made from each sample (default: as the shipped weights)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)"
     )
@@ -59,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
     """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
-    if args.recipe == PHASE_NET:
+    if args.recipe == "phase-net":
         return _phase_net(args)
-    for option in _OF_PHASE_NET:
+    for option in ("extra", "start", "steps", "unions", "rate"):
         if getattr(args, option) is not None:
             raise RecipeError(f"--{option} is an option of phase-net; leave it out")
     from accelerate import PartialState
@@ -75,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         return CHECK_FAILED
     weights = trained.weights
     if recipe.normalisation == "individual" and not recipe.background_removed:
-        weights = args.out / MODEL
+        weights = args.out / "model.safetensors"
         networks.save_with_heads(trained.weights, args.dataset, weights)
     print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
@@ -94,8 +87,8 @@ def _phase_net(args: argparse.Namespace) -> int:
         print_line=print,
     )  # fmt: skip
     if trained.weights is None:
-        steps = f"{trained.steps} of {recipe.steps} steps"
-        print(f"{args.out}: stopped after {steps}, all saved; run the same command to resume")
+        done = f"{trained.steps} of {recipe.steps} steps"
+        print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")
         return CHECK_FAILED
     scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
     print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")

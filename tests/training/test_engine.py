@@ -12,12 +12,11 @@ import pytest
 from conftest import TINY_SIZE
 
 from fpp_ml_bench.baselines.networks import load
-from fpp_ml_bench.baselines.training.data import epoch_order, spread
 from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, train
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT
+from fpp_ml_bench.baselines.training.epochs import Schedule, epoch_order, spread
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display
-from fpp_ml_bench.baselines.training.schedules import Schedule
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.result import mean_over_samples
