@@ -11,24 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines import phase_route
 from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import (
-    LARGE,
-    MARGIN_SCALE,
-    TAU,
-    Image,
-    Mask,
-    Measurement,
-    Observation,
-    Settings,
-    grid_of,
-    least_energy,
-    links_between,
-    of_choice,
-    spread_over_pixels,
-    wrapped,
-)
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, of_choice, wrapped
 from fpp_ml_bench.optics import Rig
 
 LEAST_ODDS = 1e-6
@@ -144,7 +130,7 @@ class NetworkRoute:
         observation = geometry.route.observe(image)
         base, margin = geometry.route.choose(observation)
         observation.watch.done("order")
-        if observation.empty:
+        if not observation.inside.any():
             return AnsweredObservation(observation, base, margin, None, None)
         scene = Scene.of(observation, base)
         answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
@@ -183,15 +169,15 @@ class NetworkRoute:
         if graph > 0:
             candidate = self._labelled(probabilities, scene, inside, observation, graph)
         probability = np.clip(of_choice(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
-        margin = np.float32(MARGIN_SCALE) * np.log(probability / (1 - probability))
+        margin = np.float32(phase_route.MARGIN_SCALE) * np.log(probability / (1 - probability))
         return scene.order + np.array(STEPS, np.int32)[candidate], np.maximum(margin, 0).astype(np.float32)
 
     def _labelled(
         self, probabilities: NDArray, scene: Scene, inside: Mask, observation: Observation, graph: float
     ) -> NDArray[np.intp]:
         """Index of each pixel's order, by least energy on a grid of every few pixels."""
-        stride = observation.question.stride
-        grid, size = grid_of(stride), (stride, stride)
+        stride = phase_route.stride_of(observation.period_px)
+        grid, size = phase_route.grid_of(stride), (stride, stride)
         weight = inside.astype(np.float32)
         share = cv2.blur(weight, size)
         cost = np.stack(
@@ -199,13 +185,13 @@ class NetworkRoute:
         )
         cost = (cost / np.maximum(share, 1e-3))[:, *grid] * np.float32(stride**2)
         grid_inside = inside[grid]
-        residual_at_zero_rad = observation.residual_at_zero_rad
-        coarse = (residual_at_zero_rad + TAU * scene.order)[grid]
+        coarse = (observation.layer.residual_phase(observation.phase_rad, 0.0) + TAU * scene.order)[grid]
         phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)
-        links = [link * np.float32(graph * stride) for link in links_between(grid_inside)]
-        cost = np.where(grid_inside, np.minimum(cost, LARGE), 0).astype(np.float32)
-        choice, margin = least_energy(cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad)
-        question = replace(observation.question, residual_rad=phases, inside=grid_inside)
-        order, _ = spread_over_pixels(question, choice, margin, residual_at_zero_rad)
+        links = [link * np.float32(graph * stride) for link in phase_route.links_between(grid_inside)]
+        cost = np.where(grid_inside, np.minimum(cost, phase_route.LARGE), 0).astype(np.float32)
+        choice, margin = phase_route.least_energy(
+            cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad
+        )
+        order, _ = phase_route.spread_over_pixels(observation, of_choice(phases, choice), margin, grid_inside)
         candidate = np.clip(order - scene.order, -1, 1) + 1
         return np.where(of_choice(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))

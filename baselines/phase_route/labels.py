@@ -1,15 +1,9 @@
-"""The candidate order of each pixel, by the least energy over the two or three candidates that the rig allows.
+"""The candidate order of each pixel by sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S").
 
-The energy is a sum over pixels of costs from brightness and priors, and over neighbours of the difference of their
-residual phases, linear up to a limit: surfaces are smooth, and where they jump, a jump of any height costs the same.
-For a single pixel smoothness is strong and brightness weak; plain belief propagation then keeps the result of its first
-sweep (it put a plane at 2.1 m a whole period too near although brightness favoured the right order at 97% of the
-pixels). Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") counts the evidence of every pixel once
-and finds the right order.
-
-It is written twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left
-and upper neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once. Maps are
-sheared for that: row d of a sheared map holds the nodes (i, d - i), at index i.
+Plain belief propagation keeps the result of its first sweep where smoothness is strong and brightness weak. Written
+twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left and upper
+neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once: row d of a sheared
+map holds the nodes (i, d - i), at index i.
 """
 
 import numpy as np

@@ -1,18 +1,11 @@
 """The object mask: pixels whose grey level the empty scene does not explain.
 
-The background plane's distance is calibrated, so its phase is known at every pixel, and so is its brightness except for
-three things: ambient light, the lamp's strength, and a slow change of its sheen across the image. `EmptyScene` fits
-them to the image's own background. Pixels that then differ from the prediction by more than noise are not background.
-The lamp's strength also turns an object's brightness into distance and slope (`orders.irradiance`): the paper's plane
-and objects are of the same material.
-
 Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
-is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete:
-the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it (`local_fit`). The
-prediction nearer to the pixel's grey level wins.
+is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete,
+the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it: the nearer wins.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -69,10 +62,6 @@ class Background:
     share: float
     weights: tuple[float, ...]
 
-    def at(self, crop: Crop) -> "Background":
-        """The fit for a part of the image."""
-        return replace(self, residual=self.residual[crop])
-
     @property
     def different(self) -> Mask:
         """Pixels (H, W) whose own grey level the empty scene does not explain."""
@@ -80,7 +69,9 @@ class Background:
 
 
 class EmptyScene:
-    """The background plane as a rig and direction show it; computed once, then fitted to every image.
+    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase
+    is calibrated, and so is its brightness except for ambient light, the lamp's strength and a slow change of its sheen
+    across the image, which are fitted.
 
     ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
     grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
@@ -106,16 +97,13 @@ class EmptyScene:
         if share < LEAST_SHARE:
             residual = grey - self.ambient_grey - self.strength * self._terms[0]
             return Background(self.ambient_grey, self.strength, DEFAULT_NOISE_GREY, residual, 0.0, (self.strength,))
-        rows, columns = (count * self._tile for count in plane_tiles.shape)
-        sampled = np.zeros(image.shape, dtype=bool)
-        sampled[:rows, :columns] = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
-        every = np.zeros_like(sampled)
-        every[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = True
-        sampled &= every
-        ones = np.ones(int(sampled.sum()))
-        terms = np.stack([ones] + [term[sampled] for term in self._terms], axis=1).astype(np.float64)
-        solution = np.linalg.lstsq(terms, grey[sampled].astype(np.float64), rcond=None)[0]
-        misfit = grey[sampled] - terms @ solution
+        plane_pixels = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
+        places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
+        row, column = (SAMPLE_STEP_PX * place for place in places)
+        sampled = grey[row, column].astype(np.float64)
+        terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
+        solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
+        misfit = sampled - terms @ solution
         noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
@@ -160,9 +148,9 @@ def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
     x, y = rig.camera.rays()
     centre = -rig.R.T @ rig.t
     # The plane's normal is the camera's axis, however the projector is rotated.
-    from_lamp = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
-    squared = from_lamp[0] ** 2 + from_lamp[1] ** 2 + from_lamp[2] ** 2
-    return from_lamp[2] / (squared * np.sqrt(squared))
+    right, down, ahead = x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]
+    squared = right**2 + down**2 + ahead**2
+    return ahead / (squared * np.sqrt(squared))
 
 
 def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
@@ -205,11 +193,8 @@ def unlit(grey: Image, background: Background, period_px: float) -> Mask:
 def refined(
     region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: NDArray, reach_px: float
 ) -> Mask:
-    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette.
-
-    ``predicted`` grey levels of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its
-    uncertainty in grey levels, beside the image's own noise.
-    """
+    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette; ``predicted`` grey levels
+    of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its noise, beside the image's."""
     noise = background.noise_grey
     as_plane = (background.residual / noise) ** 2
     with np.errstate(invalid="ignore"):
