@@ -44,10 +44,11 @@ def least_energy(
     return choice, np.minimum(margin, LARGE)
 
 
-def _sheared(image: NDArray, height: int, width: int) -> NDArray:
+def _sheared(image: NDArray) -> NDArray:
     """``image`` (height, width, ...) as (height + width - 1, height, ...), zeros where there is no node."""
+    height, width, *rest = image.shape
+    out = np.zeros((height + width - 1, height, *rest), image.dtype)
     i, j = np.indices((height, width))
-    out = np.zeros((height + width - 1, height, *image.shape[2:]), image.dtype)
     out[i + j, i] = image
     return out
 
@@ -57,12 +58,11 @@ def _straight(image: NDArray, height: int, width: int) -> NDArray:
     return image[i + j, i]
 
 
-def _links(link_x: Image, link_y: Image, height: int, width: int) -> dict[str, Image]:
-    """Weight towards each neighbour, 0 beyond the border, sheared."""
-    towards = {side: np.zeros((height, width), np.float32) for side in ("left", "right", "up", "down")}
-    towards["right"][:, : width - 1], towards["left"][:, 1:] = link_x, link_x
-    towards["down"][: height - 1], towards["up"][1:] = link_y, link_y
-    return {side: _sheared(weights, height, width) for side, weights in towards.items()}
+def _links(link_x: Image, link_y: Image) -> list[Image]:
+    """Weight towards the left, upper, right and lower neighbour, 0 beyond the border, sheared."""
+    before, after = (((0, 0), (1, 0)), ((1, 0), (0, 0))), (((0, 0), (0, 1)), ((0, 1), (0, 0)))
+    links = (link_x, link_y)
+    return [_sheared(np.pad(link, pad)) for side in (before, after) for link, pad in zip(links, side, strict=True)]
 
 
 def _send(
@@ -77,14 +77,13 @@ def _iterate(field: Field, rounds: int, messages: Image) -> None:
     """As `label_kernels.iterate`: ``messages`` (H, W, 4, K) are updated in place."""
     unary, phase, link_x, link_y, limit = field
     height, width, _ = unary.shape
-    towards = _links(link_x, link_y, height, width)
-    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
-    ahead = (towards["right"] > 0).astype(np.float32) + (towards["down"] > 0)
-    behind = (towards["left"] > 0).astype(np.float32) + (towards["up"] > 0)
-    share = np.maximum(np.maximum(ahead, behind), 1).astype(np.float32)
+    left, up, right, down = _links(link_x, link_y)
+    cost, phases, passed = (_sheared(maps) for maps in (unary, phase, messages))
+    ahead, behind = (np.add(across > 0, along > 0, dtype=np.float32) for across, along in ((right, down), (left, up)))
+    share = np.maximum(np.maximum(ahead, behind), np.float32(1))
     last = height + width - 2
-    forward = (range(last), 1, towards["right"], towards["down"], 2, slice(None, -1), slice(1, None))
-    backward = (range(last, 0, -1), -1, towards["left"], towards["up"], 0, slice(1, None), slice(None, -1))
+    forward = (range(last), 1, right, down, 2, slice(None, -1), slice(1, None))
+    backward = (range(last, 0, -1), -1, left, up, 0, slice(1, None), slice(None, -1))
     for _ in range(rounds):
         for diagonals, step, across, along, here, own, other in (forward, backward):
             there = 2 - here
@@ -106,16 +105,16 @@ def _decide(field: Field, messages: Image, choice: NDArray[np.int32], margin: Im
     """As `label_kernels.decide`: ``choice`` and ``margin`` (H, W) are written."""
     unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
-    towards = _links(link_x, link_y, height, width)
-    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
+    left, up, _, _ = _links(link_x, link_y)
+    cost, phases, passed = (_sheared(maps) for maps in (unary, phase, messages))
     labels, margins = np.zeros(cost.shape[:2], np.int32), np.zeros(cost.shape[:2], np.float32)
     chosen_phase = np.zeros(height, np.float32)
     for d in range(height + width - 1):
         total = cost[d] + (passed[d, :, 2] + passed[d, :, 3])
         if d:
-            total = total + np.minimum(np.abs(chosen_phase[:, None] - phases[d]), limit) * towards["left"][d][:, None]
+            total = total + np.minimum(np.abs(chosen_phase[:, None] - phases[d]), limit) * left[d][:, None]
             above = np.concatenate([chosen_phase[:1], chosen_phase[:-1]])
-            total = total + np.minimum(np.abs(above[:, None] - phases[d]), limit) * towards["up"][d][:, None]
+            total = total + np.minimum(np.abs(above[:, None] - phases[d]), limit) * up[d][:, None]
         labels[d] = total.argmin(axis=1)
         chosen_phase = np.take_along_axis(phases[d], labels[d][:, None].astype(np.intp), axis=1)[:, 0]
         ordered = np.sort(total, axis=1)

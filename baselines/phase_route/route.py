@@ -68,22 +68,21 @@ class PhaseRoute:
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         plane, layer = replace(background, residual=background.residual[crop]), self.layer.at(crop)
         capture = Capture(self.rig, self.period_px, images[0].shape, crop, greys, self.shifts_rad, plane, layer, watch)
-        given = None if mask is None else mask[crop]
-        mean_grey = None
         if capture.pixelwise:
+            given = None if mask is None else mask[crop]
             inside, fit, mean_grey = several_frames.pixel_fits(capture, self._scene, given, self._windows[1])
         else:
-            inside, fit = self._local_fits(capture, region[crop], given)
+            inside, fit = self._local_fits(capture, region[crop], given=mask is not None)
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - capture.layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
         (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
         candidates = capture.layer.orders_in_range(phase, (near - slack, far + slack))
         watch.done("candidates")
-        if mean_grey is None:
-            uncertainty = confidence.fit_uncertainty_rad(capture, fit, inside, slopes, self._windows[-1])
-        else:
+        if capture.pixelwise:
             uncertainty = confidence.pixel_uncertainty_rad(capture, fit, mean_grey)
+        else:
+            uncertainty = confidence.fit_uncertainty_rad(capture, fit, inside, slopes, self._windows[-1])
         clipped = confidence.clipped_share(capture, fit, inside, self._windows[1])
         watch.done("confidence")
         return Observation(
@@ -107,8 +106,8 @@ class PhaseRoute:
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
             raise DecodeError(
-                f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the "
-                f"object, got {np.shape(order)} and {np.shape(margin)}"
+                f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the object, got "
+                f"{np.shape(order)} and {np.shape(margin)}"
             )
         watch.done("order")
         depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
@@ -166,20 +165,23 @@ class PhaseRoute:
         rows = slice(max(top - pad, 0), min(top + height + pad, region.shape[0]))
         return rows, slice(max(left - pad, 0), min(left + width + pad, region.shape[1]))
 
-    def _local_fits(self, capture: Capture, region: Mask, mask: Mask | None) -> tuple[Mask, FringeFit]:
-        """Object mask (or ``mask``) and local fits of one or two frames; ``region``: where the first one differs."""
-        greys, background, watch = capture.greys, capture.background, capture.watch
-        if mask is not None:
-            fit = self._fit_phase(capture, mask)
-            watch.done("phase")
-            return mask, fit
-        dark = unlit(np.maximum.reduce(greys), background, self.period_px)
-        if len(greys) > 1:
-            region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
-        inside = region & ~dark
-        watch.done("mask")
-        fit = self._fit_phase(capture, inside)
+    def _local_fits(self, capture: Capture, region: Mask, given: bool) -> tuple[Mask, FringeFit]:
+        """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
+        where the first frame differs, or the ``given`` mask."""
+        greys, background, watch, inside = capture.greys, capture.background, capture.watch, region
+        if not given:
+            dark = unlit(np.maximum.reduce(greys), background, self.period_px)
+            if len(greys) > 1:
+                region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+            inside = region & ~dark
+            watch.done("mask")
+        phase = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
+        for window in self._windows[1:]:
+            fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, capture.shifts_rad)
+            phase = fit.phase_rad
         watch.done("phase")
+        if given:
+            return inside, fit
         if len(greys) == 1:
             bright = np.maximum(fit.brightness, 0)
             predicted = (background.ambient_grey + bright * (1 + np.cos(fit.phase_rad))).astype(np.float32)
@@ -188,12 +190,3 @@ class PhaseRoute:
         inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
         watch.done("mask")
         return inside, fit
-
-    def _fit_phase(self, capture: Capture, inside: Mask) -> FringeFit:
-        """The local fits to one or two frames; each window starts from the phase of the last."""
-        greys, ambient_grey = capture.greys, capture.background.ambient_grey
-        phase = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
-        for window in self._windows[1:]:
-            fit = fringe_fit(greys, inside, phase, ambient_grey, window, capture.shifts_rad)
-            phase = fit.phase_rad
-        return fit

@@ -2,7 +2,7 @@
 
 From three frames on the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so nothing mixes
 two surfaces at a depth edge, and object pixels are those whose frames the empty scene does not explain. Two frames
-leave one unknown too many, but a projected fringe goes down to black: its mean is its modulation plus the ambient light. With
+leave one unknown too many, but a fringe goes down to black: its mean is its modulation plus ambient light. With
 that constraint a window of a few px (`Settings.pair_window`) is enough.
 """
 
