@@ -25,14 +25,12 @@ from fpp_ml_bench.baselines.phase_route import (
 )
 from fpp_ml_bench.optics import Rig
 
-STEPS = (-1, 0, 1)
-"""The candidates: a period further than the base order, the base order, a period nearer."""
+STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
 SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
 """Directions (rows, columns, in rotated maps) from which a pixel may take its phase instead."""
 SIDE_PERIODS = 0.45
 """Distance, in periods, from which the phase is taken: the fit's window there hardly reaches beyond the pixel."""
-LARGEST_RAD = 1.5708
-"""Largest correction that is proposed."""
+LARGEST_RAD = 1.5708  # largest correction that is proposed
 AROUND_PX = 1.5
 """Gaussian over which the misfit of a proposal is averaged: the light of a single pixel fits many phases."""
 CHANNELS = (
@@ -45,15 +43,11 @@ CHANNELS = (
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 FIRST_MISFIT = FIRST_SIDE + len(SIDES)
 """First of the misfit channels: of no correction, and of each proposed correction."""
-SHADING = (6, 11, 12, 13)
-"""Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
-LEAST_WEIGHT = 0.02
-"""Least share of the fit's window that must lie on the object for the fit to count."""
-RELIEF_RAD = 1.5
-"""Unit of the channel ``relief``, small enough that the corrections show in it."""
+SHADING = (6, 11, 12, 13)  # channels that assume one albedo for all surfaces; 0 for predictions without brightness
+LEAST_WEIGHT = 0.02  # least share of the fit's window that must lie on the object for the fit to count
+RELIEF_RAD = 1.5  # unit of the channel ``relief``, small enough that the corrections show in it
 SINE_FLOOR = 0.1
-STEP_PX = 2
-"""Brightness of the candidates is computed on every second pixel."""
+STEP_PX = 2  # brightness of the candidates is computed on every second pixel
 _REAL_MAPS = ("light", "plane_light", "phase_rad", "bright", "weight")
 
 
@@ -178,7 +172,7 @@ def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[
 
 def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Image, Mask]:
     """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'): the
-    base order always does, also outside the working range. Without ``shading`` channels that assume one albedo are 0."""
+    base order always does, also outside the working range. Without ``shading`` those that assume one albedo are 0."""
     rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     candidates = [residual + rotation.sign * TAU * step for step in STEPS]

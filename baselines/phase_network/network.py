@@ -12,16 +12,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS
 from fpp_ml_bench.errors import NetworkError
 
-BLOCK = 2
-"""Pixels along the side of a block that the first layer takes as one."""
-COARSE = 4
-"""Pixels along a block that the order's branch averages."""
-ORDER_SHARE = 0.1
-"""Share of the order's gradient that reaches the branch of phase and mask."""
-TRUST = 6.0
-"""Start value of the factor by which a proposal's brightness misfit lowers its logit."""
-FIRST_BIAS = 2.5
-"""Start value of the biases of the base order and of no correction."""
+BLOCK = 2  # pixels along the side of a block that the first layer takes as one
+COARSE = 4  # pixels along a block that the order's branch averages
+ORDER_SHARE = 0.1  # share of the order's gradient that reaches the branch of phase and mask
+TRUST = 6.0  # start value of the factor by which a proposal's brightness misfit lowers its logit
+FIRST_BIAS = 2.5  # start value of the biases of the base order and of no correction
 
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
@@ -41,7 +36,7 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(_layers(fine + deep, fine) for deep, fine in pairwise(reversed(widths)))
 
     def forward(self, x: Tensor) -> Tensor:
-        skips = []
+        skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             skips.append(block(functional.max_pool2d(skips[-1], 2) if level else x))
         deep = skips.pop()

@@ -16,14 +16,10 @@ from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, of_choice, wrapped
 from fpp_ml_bench.optics import Rig
 
-LEAST_ODDS = 1e-6
-"""Least probability of a wrong order, whatever the network answers."""
-CORRECTED_SHARE = 0.3
-"""Share of a correction that counts as uncertainty of the phase."""
-IMPOSSIBLE = -np.inf
-"""Logit of an order that puts its pixel out of the working range."""
-DENIED = 5.0
-"""A pixel of the measured route's mask stays object unless its logit is this far below the threshold."""
+LEAST_ODDS = 1e-6  # least probability of a wrong order, whatever the network answers
+CORRECTED_SHARE = 0.3  # share of a correction that counts as uncertainty of the phase
+IMPOSSIBLE = -np.inf  # logit of an order that puts its pixel out of the working range
+DENIED = 5.0  # a pixel of the measured route's mask stays object unless its logit is this far below the threshold
 
 
 @dataclass(frozen=True)
@@ -165,9 +161,8 @@ class NetworkRoute:
         stride = phase_route.stride_of(observation.period_px)
         grid, size = phase_route.grid_of(stride), (stride, stride)
         weight = inside.astype(np.float32)
-        share = cv2.blur(weight, size)
         cost = np.stack([cv2.blur((-np.log(p + 1e-9) * weight).astype(np.float32), size) for p in probabilities])
-        cost = (cost / np.maximum(share, 1e-3))[:, *grid] * np.float32(stride**2)
+        cost = (cost / np.maximum(cv2.blur(weight, size), 1e-3))[:, *grid] * np.float32(stride**2)
         grid_inside = inside[grid]
         coarse = (observation.layer.residual_phase(observation.phase_rad, 0.0) + TAU * scene.order)[grid]
         phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)

@@ -17,12 +17,10 @@ from fpp_ml_bench.depth import depth_edges, object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
-EDGE_POINTS = 2000
-"""Pixels near depth edges that a sample holds, as centres of training windows."""
+EDGE_POINTS = 2000  # pixels near depth edges that a sample holds, as centres of training windows
 SHADOW_GREY = 6.0
 """Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""
-MOST_OBJECTS = 3
-"""Objects in one union, at most."""
+MOST_OBJECTS = 3  # objects in one union, at most
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from fpp_ml_bench.decoding import MIN_MODULATION, phase_weights
 
 LEAST_MARGIN = 0.1
 """Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""
-MARGIN_SCALE = 0.04
-"""Margin by which the odds of two orders grow e-fold."""
+MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
 """Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""

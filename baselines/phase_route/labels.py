@@ -15,8 +15,7 @@ from fpp_ml_bench.machine import numba_enabled
 Field = tuple[Image, Image, Image, Image, np.float32]
 
 ROUNDS = 10
-LARGE = np.float32(1e4)
-"""Cost of a candidate that does not exist."""
+LARGE = np.float32(1e4)  # cost of a candidate that does not exist
 
 
 def least_energy(

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
 
 WINDOW_SIGMAS = 3.0
-RIDGE = 1e-6
-"""Of the window's weight, added to the diagonal: fits of a few pixels stay finite."""
-LARGEST_STEP_RAD = 0.7
-"""Largest correction of the second fit: beyond it the linear model does not hold."""
+RIDGE = 1e-6  # of the window's weight, added to the diagonal: fits of a few pixels stay finite
+LARGEST_STEP_RAD = 0.7  # largest correction of the second fit: beyond it the linear model does not hold
 STEEPEST_RAD_PER_PX = 0.5
 """Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
 

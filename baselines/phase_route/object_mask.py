@@ -20,40 +20,30 @@ Crop = tuple[slice, slice]
 
 TILE_PX_PER_PERIOD = 1.1
 """Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
-TILE_NOISE_GREY = 3.0
-"""Largest misfit of a tile that may be background: three times the benchmark's noise."""
-LEAST_SHARE = 0.02
-"""Of the image's tiles that must show background for the image to calibrate itself."""
+TILE_NOISE_GREY = 3.0  # largest misfit of a tile that may be background: three times the benchmark's noise
+LEAST_SHARE = 0.02  # of the image's tiles that must show background for the image to calibrate itself
 STRENGTH_TOLERANCE = 0.4
 """Relative deviation of the lamp's strength in an image from the calibrated strength. A surface in the working range
 whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
 SAMPLE_STEP_PX = 5
-FLOOR_NOISE_GREY = 0.3
-"""Noise of rounding to whole grey levels."""
-DEFAULT_NOISE_GREY = 1.0
-"""Noise of an image that shows no background to measure it on."""
+FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
+DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
-OBJECT_BONUS = 4.0
-"""Added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object."""
+OBJECT_BONUS = 4.0  # added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object
 UNLIT_PERIODS = 0.8
-UNLIT_SIGMAS = 4.0
-"""Brightest grey level, above ambient light, of what counts as unlit."""
+UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit
 DARKEST_GREY = MIN_MODULATION / 4
 """An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no depth."""
-LEAST_AREA_PERIODS = 0.1
-"""Smallest object, and largest hole that is closed, in squares of one period."""
+LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in squares of one period
 
 
 @dataclass(frozen=True)
 class Background:
-    """Fit of the empty scene to one image, grey levels.
-
-    ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
-    ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
-    the calibrated constants were used; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
-    """
+    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
+    irradiance; ``residual`` float32 (H, W): image minus prediction; ``share``: of the tiles that show the plane, 0
+    where the calibrated constants were used; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
 
     ambient_grey: float
     strength: float

@@ -16,8 +16,7 @@ from fpp_ml_bench.loaders.render import Lighting
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 Prior = Literal["none", "standoff"]
-PIXELWISE = 3
-"""Frames from which on every pixel has a phase of its own."""
+PIXELWISE = 3  # frames from which on every pixel has a phase of its own
 _POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread", "white_grey"
 
 

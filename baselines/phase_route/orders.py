@@ -20,17 +20,14 @@ from fpp_ml_bench.baselines.phase_route.observation import Observation, Settings
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Rig
 
-NODES_PER_PERIOD = 7.5
-"""Grid points along a period: every third pixel at 960 px."""
+NODES_PER_PERIOD = 7.5  # grid points along a period: every third pixel at 960 px
 EVIDENCE_PERIODS = 2.0
 """Side of the square over which evidence for an order is averaged: a single pixel's brightness is too uncertain."""
-LEAST_BRIGHTNESS = 1e-3
-"""Least irradiance whose logarithm is taken, 1/m^2: a surface turned away."""
+LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a surface turned away
 JUMP_RAD_PER_PX, JUMP_LOG_PER_PX = 0.1, 0.06
 """Change of residual phase, and of log brightness, from which on two neighbours with a phase of their own lie on two
 surfaces."""
-JUMP_WEIGHT = 0.05
-"""Weight of the link between two such neighbours."""
+JUMP_WEIGHT = 0.05  # weight of the link between two such neighbours
 
 
 @dataclass(frozen=True)
@@ -38,8 +35,7 @@ class Question:
     """All that a `Chooser` may use: K candidates a pixel on the grid (h, w) of every ``stride``-th pixel, nearest order
     first. ``residual_rad``, ``depth_mm``, ``exists`` and ``irradiance`` (1/m^2) are (K, h, w); ``brightness``:
     measured, in 1/m^2; ``trust`` 0 to 1: weight of the brightness there (small at rims and on dark slopes); ``inside``:
-    object; ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree.
-    """
+    object; ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree."""
 
     residual_rad: Image
     depth_mm: Image
@@ -106,9 +102,7 @@ def irradiance(
     layer: CalibrationLayer, residual_rad: NDArray, slopes: tuple[Image, Image], rig: Rig, crop: Crop
 ) -> Image:
     """cos(theta) / r^2 in 1/m^2 that a matte surface receives from the projector, float32 (H, W); below 0: turned away.
-
-    ``residual_rad`` (H, W) of one candidate on the pixels ``crop`` of the image, ``slopes`` its change a px.
-    """
+    ``residual_rad`` (H, W) of one candidate on the pixels ``crop`` of the image, ``slopes`` its change a px."""
     x, y = (axis[crop].astype(np.float32) for axis in rig.camera.rays())
     z = (layer.depth_of_residual_mm(residual_rad) / MM_PER_M).astype(np.float32)
     if layer.lens is None:
@@ -179,16 +173,13 @@ def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Im
     """By how much the cost of the second-best order exceeds that of the choice, averaged over object pixels nearby."""
     if len(proof) == 1:
         return np.full(choice.shape, 2.0, np.float32)
-    own = of_choice(proof, choice)
     rivals = proof.copy()
     np.put_along_axis(rivals, choice[None].astype(np.intp), np.inf, axis=0)
-    gap = ((rivals.min(axis=0) - own) * question.inside).astype(np.float32)
+    gap = ((rivals.min(axis=0) - of_choice(proof, choice)) * question.inside).astype(np.float32)
     side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
-
-    def mean(values: Image) -> NDArray:
-        return cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
-
-    return mean(gap) / np.maximum(mean(question.inside.astype(np.float32)), 1e-3)
+    maps = (gap, question.inside.astype(np.float32))
+    mean_gap, share = (cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps)
+    return mean_gap / np.maximum(share, 1e-3)
 
 
 def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:

@@ -18,16 +18,12 @@ from fpp_ml_bench.optics import Rig
 
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
-MARGIN_PERIODS = 0.5
-"""Of the crop around the object: covers the windows, and the mask may grow into it."""
+MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
-HALF_CONFIDENCE_MM = 5.0
-"""Expected error of a pixel whose confidence is a half."""
-FRINGE_NOISE = 0.03
-"""Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
-PAIR_ROUNDS = 2
-"""Fits to two frames over the small window."""
+HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
+FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
+PAIR_ROUNDS = 2  # fits to two frames over the small window
 
 
 class PhaseRoute:

@@ -20,15 +20,12 @@ PAIR_DEGREES = 120.0
 """Phase shift between two frames: that of the first two of three, so that a third frame completes them."""
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
-PLANE_TOLERANCE_GREY = 0.3
-"""Error of the fitted empty scene, grey levels, beside noise."""
-SQUARE_PX = 5
-"""Side of the square over which faint differences are averaged."""
+PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
+SQUARE_PX = 5  # side of the square over which faint differences are averaged
 CLOSING_PERIODS = 0.2
 ALIKE = 0.2
 """Largest relative difference from the brightness around of an object pixel that the empty scene explains as well."""
-SPECK_PX = 6
-"""Smallest group of pixels that counts as object, and largest hole in it that is closed."""
+SPECK_PX = 6  # smallest group of pixels that counts as object, and largest hole in it that is closed
 DARK_SIGMAS = 4.0
 
 
