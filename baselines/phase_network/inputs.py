@@ -1,12 +1,8 @@
 """Input of the network: maps of one image that mean the same for any rig, fringe direction and distance.
 
-The measured route (`fpp_ml_bench.baselines.phase_route`) gives every pixel a wrapped phase and a first order, the
-*base order*. The network gets three candidates, the base order and its two neighbours: how bright the pixel would be
-with each order against how bright it is, and whether the order's depth lies in the working range. No map holds a
-distance, only what follows from one, so the network also works at distances that training did not show.
-
-Maps are rotated so that the fringe's phase grows downwards and a nearer surface has more phase. The same network then
-serves both fringe directions.
+The measured route gives every pixel a wrapped phase and a *base order*. The network gets that and its two neighbours:
+how bright the pixel would be with each against how bright it is, and whether the depth lies in the working range. No
+map holds a distance. Maps are rotated so that phase grows downwards and with nearness, whatever the fringe direction.
 """
 
 from collections.abc import Sequence
@@ -16,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines import phase_route
 from fpp_ml_bench.baselines.phase_route import (
-    LEAST_BRIGHTNESS,
     TAU,
     CalibrationLayer,
     Crop,
@@ -25,21 +21,16 @@ from fpp_ml_bench.baselines.phase_route import (
     Mask,
     Observation,
     PhaseRoute,
-    Settings,
-    grid_of,
-    irradiance,
     wrapped,
 )
 from fpp_ml_bench.optics import Rig
 
-STEPS = (-1, 0, 1)
-"""The candidates: a period further than the base order, the base order, a period nearer."""
+STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
 SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
 """Directions (rows, columns, in rotated maps) from which a pixel may take its phase instead."""
 SIDE_PERIODS = 0.45
 """Distance, in periods, from which the phase is taken: the fit's window there hardly reaches beyond the pixel."""
-LARGEST_RAD = 1.5708
-"""Largest correction that is proposed."""
+LARGEST_RAD = 1.5708  # largest correction that is proposed
 AROUND_PX = 1.5
 """Gaussian over which the misfit of a proposal is averaged: the light of a single pixel fits many phases."""
 CHANNELS = (
@@ -52,15 +43,11 @@ CHANNELS = (
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 FIRST_MISFIT = FIRST_SIDE + len(SIDES)
 """First of the misfit channels: of no correction, and of each proposed correction."""
-SHADING = (6, 11, 12, 13)
-"""Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
-LEAST_WEIGHT = 0.02
-"""Least share of the fit's window that must lie on the object for the fit to count."""
-RELIEF_RAD = 1.5
-"""Unit of the channel ``relief``, small enough that the corrections show in it."""
+SHADING = (6, 11, 12, 13)  # channels that assume one albedo for all surfaces; 0 for predictions without brightness
+LEAST_WEIGHT = 0.02  # least share of the fit's window that must lie on the object for the fit to count
+RELIEF_RAD = 1.5  # unit of the channel ``relief``, small enough that the corrections show in it
 SINE_FLOOR = 0.1
-STEP_PX = 2
-"""Brightness of the candidates is computed on every second pixel."""
+STEP_PX = 2  # brightness of the candidates is computed on every second pixel
 _REAL_MAPS = ("light", "plane_light", "phase_rad", "bright", "weight")
 
 
@@ -76,11 +63,9 @@ class Rotation:
     @classmethod
     def of(cls, layer: CalibrationLayer, direction: str) -> "Rotation":
         """From the calibration layer of a whole image."""
-        sign = 1.0 if float(np.median(layer.gain)) > 0 else -1.0
+        sign, vertical = 1.0 if float(np.median(layer.gain)) > 0 else -1.0, direction == "vertical"
         carrier = layer.infinity_rad + TAU * layer.infinity_order
-        axis = 1 if direction == "vertical" else 0
-        grows = float(np.median(np.diff(carrier, axis=axis))) * sign > 0
-        return cls(direction == "vertical", not grows, sign)
+        return cls(vertical, float(np.median(np.diff(carrier, axis=int(vertical)))) * sign <= 0, sign)
 
     def turn(self, image: NDArray) -> NDArray:
         """Maps (..., h, w) rotated for the network."""
@@ -107,7 +92,7 @@ class Geometry:
     rotation: Rotation
 
     @classmethod
-    def of(cls, rig: Rig, settings: Settings) -> "Geometry":
+    def of(cls, rig: Rig, settings: phase_route.Settings) -> "Geometry":
         route = PhaseRoute(rig, settings)
         return cls(rig, route, Rotation.of(route.layer, settings.direction))
 
@@ -167,38 +152,27 @@ class Scene:
         maps = {name: getattr(self, name)[rows, columns] for name in (*_REAL_MAPS, "order")}
         return replace(self, crop=crop, inside=inside, slopes=slopes, **maps)
 
-    def half(self) -> "Scene":
-        """The same in half precision, to save memory; call `single` before use."""
-        return self._as(np.float16, np.int16)
-
-    def single(self) -> "Scene":
-        """In single precision."""
-        return self._as(np.float32, np.int32)
-
-    def _as(self, real: type, whole: type) -> "Scene":
+    def single(self, real: type = np.float32, whole: type = np.int32) -> "Scene":
+        """In single precision, or in another."""
         maps = {name: getattr(self, name).astype(real) for name in _REAL_MAPS}
         slopes: tuple[Image, Image] = (self.slopes[0].astype(real), self.slopes[1].astype(real))
         return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
 
+    def half(self) -> "Scene":
+        """In half precision, to save memory; call `single` before use."""
+        return self.single(np.float16, np.int16)
 
-def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> list[Image]:
-    """`irradiance` with each of ``residuals_rad`` (h, w), on every `STEP_PX`-th pixel; `repeated` spreads it again."""
-    grid, where = grid_of(STEP_PX), grid_of(STEP_PX, scene.crop)
+
+def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> NDArray[np.float32]:
+    """`irradiance` (n, h', w') with each of ``residuals_rad`` (h, w), on every `STEP_PX`-th pixel."""
+    grid, where = phase_route.grid_of(STEP_PX), phase_route.grid_of(STEP_PX, scene.crop)
     layer, slopes = geometry.layer.at(where), (scene.slopes[0][grid], scene.slopes[1][grid])
-    return [irradiance(layer, residual_rad[grid], slopes, geometry.rig, where) for residual_rad in residuals_rad]
-
-
-def repeated(coarse: NDArray, shape: tuple[int, ...]) -> NDArray:
-    """Maps (..., h', w') of every `STEP_PX`-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
-    return coarse.repeat(STEP_PX, axis=-2).repeat(STEP_PX, axis=-1)[..., : shape[-2], : shape[-1]]
+    return np.stack([phase_route.irradiance(layer, rad[grid], slopes, geometry.rig, where) for rad in residuals_rad])
 
 
 def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Image, Mask]:
-    """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w').
-
-    The base order always exists, also where its depth lies outside the working range. Without ``shading`` the channels
-    that assume one albedo are 0.
-    """
+    """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'): the
+    base order always does, also outside the working range. Without ``shading`` those that assume one albedo are 0."""
     rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     candidates = [residual + rotation.sign * TAU * step for step in STEPS]
@@ -206,9 +180,9 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
         # Brightness with each candidate, in units of light; NaN where a candidate lies behind a device.
         light = coarse_irradiance(scene, geometry, [candidate.astype(np.float32) for candidate in candidates])
         exists = geometry.in_range(np.stack([layer.depth_of_residual_mm(candidate) for candidate in candidates]))
-    expected = repeated((np.stack(light) * rig.standoff_m**2).astype(np.float32), scene.light.shape)
+    expected = phase_route.repeated((light * rig.standoff_m**2).astype(np.float32), STEP_PX, scene.light.shape)
     exists[1] = True
-    floor = np.float32(LEAST_BRIGHTNESS * rig.standoff_m**2)
+    floor = np.float32(phase_route.LEAST_BRIGHTNESS * rig.standoff_m**2)
     bright = np.maximum(scene.bright, floor)
     with np.errstate(invalid="ignore"):
         ratio = np.log(bright / np.maximum(np.nan_to_num(expected, nan=1.0), floor))
@@ -235,19 +209,18 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
     return x, np.ascontiguousarray(rotation.turn(exists))
 
 
-def _around(misfit: NDArray) -> Image:
-    """Root mean square of a misfit in the pixel's surroundings."""
-    square = np.clip(misfit, -2, 2).astype(np.float32) ** 2
+def _misfit_around(light: Image, bright: Image, phase_rad: NDArray, valid: Mask | bool = True) -> Image:
+    """Root mean square, in the pixel's surroundings, by which light differs from a fringe's; 2 where not ``valid``."""
+    misfit = light / np.maximum(bright, np.float32(0.05)) - 1 - np.cos(phase_rad)
+    square = np.clip(np.where(valid, misfit, np.float32(2)), -2, 2).astype(np.float32) ** 2
     return np.sqrt(cv2.GaussianBlur(square, (0, 0), AROUND_PX, borderType=cv2.BORDER_REPLICATE))
 
 
 def _from_the_sides(scene: Scene, layer: CalibrationLayer, geometry: Geometry) -> Image:
     """The phase extrapolated to a pixel from each of `SIDES`, minus its own phase, and the misfit of its light with it:
     (17, h', w') float32, rotated. Beside a depth edge the window of a pixel covers two surfaces, a window further in
-    only one.
-    """
-    rotation, sign = geometry.rotation, np.float32(geometry.rotation.sign)
-    turn = rotation.turn
+    only one."""
+    rotation, turn, sign = geometry.rotation, geometry.rotation.turn, np.float32(geometry.rotation.sign)
     psi = turn(sign * wrapped(scene.phase_rad - layer.infinity_rad).astype(np.float32))
     phase = turn(sign * scene.phase_rad)
     reach = max(1, round(SIDE_PERIODS * geometry.route.period_px))
@@ -256,14 +229,13 @@ def _from_the_sides(scene: Scene, layer: CalibrationLayer, geometry: Geometry) -
     height, width = psi.shape
     padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
     light = turn(scene.light)
-    corrections, misfits = [], [_around(light / np.maximum(maps[3], np.float32(0.05)) - 1 - np.cos(phase))]
+    corrections, misfits = [], [_misfit_around(light, maps[3], phase)]
     for row, column in SIDES:
         dy, dx = round(row * reach), round(column * reach)
         side_maps = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
         on_object = side_maps[4] > 0
         step = wrapped(side_maps[0] - side_maps[1] * np.float32(dy) - side_maps[2] * np.float32(dx) - psi)
         step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * on_object
-        misfit = light / np.maximum(side_maps[3], np.float32(0.05)) - 1 - np.cos(phase + step)
         corrections.append(step)
-        misfits.append(_around(np.where(on_object, misfit, np.float32(2))))
+        misfits.append(_misfit_around(light, side_maps[3], phase + step, on_object))
     return np.stack(corrections + misfits).astype(np.float32)

@@ -1,10 +1,7 @@
-"""The network: a small U-Net on 2 x 2 blocks of pixels, with three answers for every pixel.
-
-They are a logit for each of three neighbouring orders, a logit for being object, and a correction of the phase within
-``bound_rad``.
-"""
+"""The network: a small U-Net on 2 x 2 blocks of pixels; order, object or not, and a phase correction a pixel."""
 
 from copy import deepcopy
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -15,16 +12,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS
 from fpp_ml_bench.errors import NetworkError
 
-BLOCK = 2
-"""Pixels along the side of a block that the first layer takes as one."""
-COARSE = 4
-"""Pixels along a block that the order's branch averages."""
-ORDER_SHARE = 0.1
-"""Share of the order's gradient that reaches the branch of phase and mask."""
-TRUST = 6.0
-"""Start value of the factor by which a proposal's brightness misfit lowers its logit."""
-FIRST_BIAS = 2.5
-"""Start value of the biases of the base order and of no correction."""
+BLOCK = 2  # pixels along the side of a block that the first layer takes as one
+COARSE = 4  # pixels along a block that the order's branch averages
+ORDER_SHARE = 0.1  # share of the order's gradient that reaches the branch of phase and mask
+TRUST = 6.0  # start value of the factor by which a proposal's brightness misfit lowers its logit
+FIRST_BIAS = 2.5  # start value of the biases of the base order and of no correction
 
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
@@ -40,20 +32,16 @@ class UNet(nn.Module):
 
     def __init__(self, inputs: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.encoder = nn.ModuleList(
-            _layers(inputs if level == 0 else widths[level - 1], width) for level, width in enumerate(widths)
-        )
-        self.decoder = nn.ModuleList(
-            _layers(widths[level] + widths[level + 1], widths[level]) for level in reversed(range(len(widths) - 1))
-        )
+        self.encoder = nn.ModuleList(map(_layers, (inputs, *widths), widths))
+        self.decoder = nn.ModuleList(_layers(fine + deep, fine) for deep, fine in pairwise(reversed(widths)))
 
     def forward(self, x: Tensor) -> Tensor:
-        skips, deep = [], x
+        skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
-            deep = block(functional.max_pool2d(deep, 2) if level else deep)
-            skips.append(deep)
-        for level, block in zip(reversed(range(len(skips) - 1)), self.decoder, strict=True):
-            deep = block(torch.cat([skips[level], functional.interpolate(deep, scale_factor=2.0)], dim=1))
+            skips.append(block(functional.max_pool2d(skips[-1], 2) if level else x))
+        deep = skips.pop()
+        for block in self.decoder:
+            deep = block(torch.cat([skips.pop(), functional.interpolate(deep, scale_factor=2.0)], dim=1))
         return deep
 
 
@@ -122,6 +110,5 @@ class PhaseNet(nn.Module):
         order = order + ORDER_SHARE * answers[:, :3] + (1 - ORDER_SHARE) * answers[:, :3].detach()
         proposed, misfits = x[:, FIRST_SIDE:FIRST_MISFIT], x[:, FIRST_MISFIT:]
         shares = torch.softmax(answers[:, 5:] - self.trust * misfits, dim=1)[:, 1:]
-        proposed_mean = (shares * proposed).sum(dim=1)
-        correction = proposed_mean + 0.5 * self.bound_rad * torch.tanh(answers[:, 4])
+        correction = (shares * proposed).sum(dim=1) + 0.5 * self.bound_rad * torch.tanh(answers[:, 4])
         return order, answers[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)

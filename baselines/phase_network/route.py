@@ -1,7 +1,6 @@
-"""The learned route: a measured phase, the network's order, mask and correction, and the calibration layer's depth.
+"""The learned route: a measured phase, the network's order, mask and bounded correction, the calibration layer's depth.
 
-The network can't give any other depth: the order is one of the candidates, the correction is bounded, and the
-calibration layer computes depth from both.
+The network can't give any other depth.
 """
 
 from dataclasses import dataclass, replace
@@ -11,44 +10,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines import phase_route
 from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import (
-    LARGE,
-    MARGIN_SCALE,
-    TAU,
-    Image,
-    Mask,
-    Measurement,
-    Observation,
-    Settings,
-    grid_of,
-    least_energy,
-    links_between,
-    of_choice,
-    spread_over_pixels,
-    wrapped,
-)
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, of_choice, wrapped
 from fpp_ml_bench.optics import Rig
 
-LEAST_ODDS = 1e-6
-"""Least probability of a wrong order, whatever the network answers."""
-CORRECTED_SHARE = 0.3
-"""Share of a correction that counts as uncertainty of the phase."""
-IMPOSSIBLE = -np.inf
-"""Logit of an order that puts its pixel out of the working range."""
-
-DENIED = 5.0
-"""A pixel of the measured route's mask stays object unless its logit is this far below the threshold."""
+LEAST_ODDS = 1e-6  # least probability of a wrong order, whatever the network answers
+CORRECTED_SHARE = 0.3  # share of a correction that counts as uncertainty of the phase
+IMPOSSIBLE = -np.inf  # logit of an order that puts its pixel out of the working range
+DENIED = 5.0  # a pixel of the measured route's mask stays object unless its logit is this far below the threshold
 
 
 @dataclass(frozen=True)
 class Answers:
-    """The network's answers in the image's own orientation, maps (h, w) of the scene's crop.
-
-    ``logits`` (3, h, w): of the base order minus one, the base order, and plus one; ``object_logit``;
-    ``correction_rad``: to be added to the wrapped phase.
-    """
+    """The network's answers in the image's own orientation, maps (h, w) of the scene's crop; ``logits`` (3, h, w): of
+    the base order minus one, the base order, and plus one; ``correction_rad``: to be added to the wrapped phase."""
 
     logits: Image
     object_logit: Image
@@ -58,32 +35,24 @@ class Answers:
 def network_answers(
     network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0
 ) -> Answers:
-    """Run ``network`` on a scene.
-
-    ``lead``: the base order's lead, added to its logit. Training windows get made-up wrong base orders (see `windows`),
-    so the network holds the base order wrong more often than it is; the lead, chosen on the validation split, makes up
-    for that."""
-    rotation = geometry.rotation
+    """Run ``network`` on a scene. ``lead`` is added to the base order's logit. Training windows get made-up wrong base
+    orders (see `windows`), so the network holds the base order wrong more often than it is; the lead, chosen on the
+    validation split, makes up for that."""
     x, exists = channels(scene, geometry, shading)
     _, height, width = x.shape
-    stride = network.stride
-    padded = np.pad(x, ((0, 0), (0, -height % stride), (0, -width % stride)))
+    padded = np.pad(x, ((0, 0), (0, -height % network.stride), (0, -width % network.stride)))
     with torch.inference_mode():
         batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
         order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(batch))
     order = np.where(exists, order + np.array([0, lead, 0], np.float32)[:, None, None], np.float32(IMPOSSIBLE))
-    back = rotation.back
-    signed = back(order) if rotation.sign > 0 else back(order)[::-1]
-    return Answers(
-        np.ascontiguousarray(signed), np.ascontiguousarray(back(inside)),
-        np.ascontiguousarray(back(correction)) * np.float32(rotation.sign),
-    )  # fmt: skip
+    sign = geometry.rotation.sign
+    order, inside, correction = (np.ascontiguousarray(geometry.rotation.back(m)) for m in (order, inside, correction))
+    return Answers(order if sign > 0 else np.ascontiguousarray(order[::-1]), inside, correction * np.float32(sign))
 
 
 def decided_order(answers: Answers, scene: Scene) -> NDArray[np.int32]:
     """The most likely order of every pixel, int32 (h, w)."""
-    steps = np.array(STEPS, np.int32)
-    return scene.order + steps[answers.logits.argmax(axis=0)]
+    return scene.order + np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)]
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
@@ -144,11 +113,11 @@ class NetworkRoute:
         observation = geometry.route.observe(image)
         base, margin = geometry.route.choose(observation)
         observation.watch.done("order")
-        if observation.empty:
-            return AnsweredObservation(observation, base, margin, None, None)
-        scene = Scene.of(observation, base)
-        answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
-        observation.watch.done("network")
+        scene = answers = None
+        if observation.inside.any():
+            scene = Scene.of(observation, base)
+            answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
+            observation.watch.done("network")
         return AnsweredObservation(observation, base, margin, scene, answers)
 
     def conclude(self, answered: AnsweredObservation, levers: Levers | None = None) -> Measurement:
@@ -169,9 +138,8 @@ class NetworkRoute:
             phase = wrapped(moved).astype(np.float32)
             order = order + np.rint((moved - phase) / TAU).astype(np.int32)
         uncertainty = (observation.uncertainty_rad + CORRECTED_SHARE * np.abs(correction)).astype(np.float32)
-        return route.conclude(
-            replace(observation, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty), order, margin
-        )
+        seen = replace(observation, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty)
+        return route.conclude(seen, order, margin)
 
     def _order(
         self, answers: Answers, scene: Scene, inside: Mask, observation: Observation, graph: float
@@ -183,29 +151,24 @@ class NetworkRoute:
         if graph > 0:
             candidate = self._labelled(probabilities, scene, inside, observation, graph)
         probability = np.clip(of_choice(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
-        margin = np.float32(MARGIN_SCALE) * np.log(probability / (1 - probability))
+        margin = np.float32(phase_route.MARGIN_SCALE) * np.log(probability / (1 - probability))
         return scene.order + np.array(STEPS, np.int32)[candidate], np.maximum(margin, 0).astype(np.float32)
 
     def _labelled(
         self, probabilities: NDArray, scene: Scene, inside: Mask, observation: Observation, graph: float
     ) -> NDArray[np.intp]:
         """Index of each pixel's order, by least energy on a grid of every few pixels."""
-        stride = observation.question.stride
-        grid, size = grid_of(stride), (stride, stride)
+        stride = phase_route.stride_of(observation.period_px)
+        grid, size = phase_route.grid_of(stride), (stride, stride)
         weight = inside.astype(np.float32)
-        share = cv2.blur(weight, size)
-        cost = np.stack(
-            [cv2.blur((-np.log(probability + 1e-9) * weight).astype(np.float32), size) for probability in probabilities]
-        )
-        cost = (cost / np.maximum(share, 1e-3))[:, *grid] * np.float32(stride**2)
+        cost = np.stack([cv2.blur((-np.log(p + 1e-9) * weight).astype(np.float32), size) for p in probabilities])
+        cost = (cost / np.maximum(cv2.blur(weight, size), 1e-3))[:, *grid] * np.float32(stride**2)
         grid_inside = inside[grid]
-        residual_at_zero_rad = observation.residual_at_zero_rad
-        coarse = (residual_at_zero_rad + TAU * scene.order)[grid]
+        coarse = (observation.layer.residual_phase(observation.phase_rad, 0.0) + TAU * scene.order)[grid]
         phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)
-        links = [link * np.float32(graph * stride) for link in links_between(grid_inside)]
-        cost = np.where(grid_inside, np.minimum(cost, LARGE), 0).astype(np.float32)
-        choice, margin = least_energy(cost, phases, links[0], links[1], self.geometry.route.settings.jump_rad)
-        question = replace(observation.question, residual_rad=phases, inside=grid_inside)
-        order, _ = spread_over_pixels(question, choice, margin, residual_at_zero_rad)
+        link_x, link_y = (link * np.float32(graph * stride) for link in phase_route.links_between(grid_inside))
+        cost = np.where(grid_inside, np.minimum(cost, phase_route.LARGE), 0).astype(np.float32)
+        choice, margin = phase_route.least_energy(cost, phases, link_x, link_y, self.geometry.route.settings.jump_rad)
+        order, _ = phase_route.spread_over_pixels(observation, of_choice(phases, choice), margin, grid_inside)
         candidate = np.clip(order - scene.order, -1, 1) + 1
         return np.where(of_choice(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))

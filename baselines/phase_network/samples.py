@@ -1,11 +1,8 @@
-"""Training samples: the measured route's scene of each image, with the true phase.
+"""Training samples: the measured route's scene of each image, with the true phase, in half precision.
 
-The route runs once an image; the maps that the network needs are held in half precision.
-
-Unions are several training objects in one image, for depth jumps and creases that no single object has. All objects of
-a dataset are captured by the same rig in the same light. Taking, at every pixel, the image whose surface is nearer
-gives what the rig would capture of all of them together (they may intersect), except for the shadows that they cast on
-one another. This needs no new object and no renderer.
+Unions are several training objects in one image, for depth jumps and creases that no single object has. All share
+rig and light: the image whose surface is nearer, at every pixel, is what the rig would capture of
+all of them together (they may intersect), except for the shadows that they cast on one another.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,17 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.inputs import Geometry, Scene
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice
 from fpp_ml_bench.depth import depth_edges, object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
-EDGE_POINTS = 2000
-"""Pixels near depth edges that a sample holds, as centres of training windows."""
+EDGE_POINTS = 2000  # pixels near depth edges that a sample holds, as centres of training windows
 SHADOW_GREY = 6.0
 """Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""
-MOST_OBJECTS = 3
-"""Objects in one union, at most."""
+MOST_OBJECTS = 3  # objects in one union, at most
 
 
 @dataclass(frozen=True)
@@ -82,13 +77,10 @@ def united(
 
     The nearest surface counts; without one, the first image's background, or another image's where it is in shadow.
     """
-    ranges = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm])
+    ranges, stacked = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm]), np.stack(images)
     nearest = ranges.argmin(axis=0)
-    depth = np.take_along_axis(ranges, nearest[None], axis=0)[0]
-    stacked = np.stack(images)
-    image = np.take_along_axis(stacked, nearest[None], axis=0)[0]
+    depth, image, darkest = of_choice(ranges, nearest), of_choice(stacked, nearest), stacked.min(axis=0)
     empty = np.isinf(depth)
-    darkest = stacked.min(axis=0)
     shadow = empty & (darkest + SHADOW_GREY < image)
     return np.where(shadow, darkest, image), np.where(empty, 0.0, depth).astype(np.float32)
 
@@ -99,8 +91,8 @@ def companions(objects: Mapping[str, str], sample: str, random: np.random.Genera
     ``objects``: the object of every sample to choose from."""
     members = [sample]
     for _ in range(int(random.integers(1, MOST_OBJECTS))):
-        shown_objects = {objects[member] for member in members}
-        candidates = [member for member, object_name in objects.items() if object_name not in shown_objects]
+        shown = {objects[member] for member in members}
+        candidates = [member for member, object_name in objects.items() if object_name not in shown]
         if candidates:
             members.append(candidates[int(random.integers(len(candidates)))])
     return members[1:]

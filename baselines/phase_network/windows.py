@@ -1,10 +1,9 @@
 """Windows of training samples, varied as other scenes would vary them.
 
-Whole objects are moved to another distance: the phase of every pixel changes by as much as that of the object's middle,
-its light changes as the calibrated lamp's would, and the measured route's errors stay as they were. Wrong base orders
-are made up in patches and whole windows, because the training objects have few of them. Columns are mirrored, which
-corresponds to a projector on the other side. Brightness varies a little, and sometimes the brightness channels are set
-to 0, so that the network also works without them.
+Whole objects are moved to another distance, with the light that the calibrated lamp would give and the measured route's
+errors as they were. Wrong base orders are made up in patches and whole windows, because the training objects have few.
+Columns are mirrored, as with a projector on the other side. Brightness varies a little, and sometimes the brightness
+channels are 0, so that the network also works without them.
 """
 
 from dataclasses import dataclass, replace
@@ -13,25 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_network.inputs import (
-    CHANNELS,
-    FIRST_MISFIT,
-    FIRST_SIDE,
-    SIDES,
-    Geometry,
-    Scene,
-    channels,
-    coarse_irradiance,
-    repeated,
-)
+from fpp_ml_bench.baselines.phase_network import inputs
+from fpp_ml_bench.baselines.phase_network.inputs import FIRST_MISFIT, FIRST_SIDE, SIDES, Geometry, Scene
 from fpp_ml_bench.baselines.phase_network.samples import Sample
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice, repeated
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Direction
 
 IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
-_MIRRORED = CHANNELS.index("slope across")
+_MIRRORED = inputs.CHANNELS.index("slope across")
 _PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
 _SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
 
@@ -66,12 +56,9 @@ class Window:
 
 
 def draw(
-    samples: list[Sample],
-    geometries: dict[Direction, Geometry],
-    size: int,
-    vary: Variation,
+    samples: list[Sample], geometries: dict[Direction, Geometry], size: int, vary: Variation,
     random: np.random.Generator,
-) -> Window:
+) -> Window:  # fmt: skip
     """A random window of ``size`` px of one of ``samples``."""
     sample = samples[random.integers(len(samples))]
     geometry = geometries[sample.direction]
@@ -82,7 +69,7 @@ def draw(
     if moved:
         scene = _moved(scene, missing, target, geometry, vary, random)
     scene, missing = _wrong(scene, missing, geometry, vary, random)
-    x, exists = channels(scene, geometry, shading=random.random() >= vary.no_shading)
+    x, exists = inputs.channels(scene, geometry, shading=random.random() >= vary.no_shading)
     missing = geometry.rotation.turn(missing) * np.float32(geometry.rotation.sign)
     window = _labelled(x, exists, missing, geometry.rotation.turn(target), size, mask_valid=not moved)
     return _mirrored(window) if random.random() < vary.mirror else window
@@ -111,10 +98,9 @@ def _moved(
     depth_m = random.uniform(near + vary.margin_mm, far - vary.margin_mm) / MM_PER_M
     delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
     with np.errstate(all="ignore"):
-        lit = coarse_irradiance(scene, geometry, (true_rad, true_rad + delta))
-        before, after = (np.maximum(light, 1e-3) for light in lit)
+        before, after = np.maximum(inputs.coarse_irradiance(scene, geometry, (true_rad, true_rad + delta)), 1e-3)
         ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
-    ratio = repeated(ratio, scene.light.shape).astype(np.float32)
+    ratio = repeated(ratio, inputs.STEP_PX, scene.light.shape).astype(np.float32)
     ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
     true_phase = scene.phase_rad + missing
     light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
@@ -132,8 +118,7 @@ def _wrong(
 ) -> tuple[Scene, Image]:
     """Wrong base orders, where the working range allows them."""
     height, width = scene.light.shape
-    off = np.zeros((height, width), np.int32)
-    middle = 0
+    off, middle = np.zeros((height, width), np.int32), 0
     if random.random() < vary.wrong_window:
         middle = int(random.choice((-1, 1)))
         off += middle

@@ -3,11 +3,10 @@ from .calibration_layer import CalibrationLayer as CalibrationLayer
 from .calibration_layer import Image as Image
 from .calibration_layer import Mask as Mask
 from .calibration_layer import wrapped as wrapped
-from .calibration_layer_torch import TorchCalibrationLayer as TorchCalibrationLayer
 from .confidence import MARGIN_SCALE as MARGIN_SCALE
-from .frame_choice import FewestFrames as FewestFrames
 from .labels import LARGE as LARGE
 from .labels import least_energy as least_energy
+from .method import FewestFrames as FewestFrames
 from .method import PhaseMethod as PhaseMethod
 from .object_mask import Crop as Crop
 from .observation import PIXELWISE as PIXELWISE
@@ -20,5 +19,7 @@ from .orders import grid_of as grid_of
 from .orders import irradiance as irradiance
 from .orders import links_between as links_between
 from .orders import of_choice as of_choice
+from .orders import repeated as repeated
 from .orders import spread_over_pixels as spread_over_pixels
+from .orders import stride_of as stride_of
 from .route import PhaseRoute as PhaseRoute

@@ -1,14 +1,9 @@
 """The fixed calibration layer: wrapped phase and fringe order to depth, in closed form, for any rig.
 
-With ``a = R (x, y, 1)`` a camera pixel's ray is seen by the projector at ``(Z a_i + t_i) / (Z a_2 + t_2)`` (see
-`fpp_ml_bench.decoding`), and far out at ``a_i / a_2``. What is left when the phase of that point at infinity is
-taken off the absolute phase,
-
-    psi = Phi - Phi_infinity = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2),
-
-is the residual phase: for the paper's rig ``-2 pi f_p C / (P Z)``. It varies as slowly as 1 / Z does, and gives depth
-back without subtracting large numbers, so that float32 is enough. Everything here is arithmetic: NumPy arrays and torch
-tensors pass through the same lines (`fpp_ml_bench.baselines.phase_route.calibration_layer_torch` holds the buffers).
+With ``a = R (x, y, 1)`` the projector sees a pixel's ray at ``(Z a_i + t_i) / (Z a_2 + t_2)``, and far out at
+``a_i / a_2``. The residual phase is the absolute phase minus that of the point at infinity,
+``psi = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2)``, for the paper's rig ``-2 pi f_p C / (P Z)``. It varies
+as slowly as 1 / Z does, and gives depth back without subtracting large numbers, so that float32 is enough.
 """
 
 from collections.abc import Iterable
@@ -45,8 +40,17 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class Candidates:
+    """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``, int32 (H, W) each;
+    where none does, ``count`` is 0, and ``first`` is the order nearest to the range's middle."""
+
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
 class CalibrationLayer:
-    """Constants of one rig and fringe direction for every pixel; float64 maps of the image's shape.
+    """Constants of one rig and fringe direction for every pixel: float64 maps of the image's shape, or torch tensors.
 
     ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
     phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
@@ -80,15 +84,8 @@ class CalibrationLayer:
         lens = None
         if device.is_distorted and is_distorted(device.distortion):
             lens = Lens(a, rig.translation_m, axis, device.distortion)
-        return cls(
-            infinity_rad=infinity - TAU * order,
-            infinity_order=order,
-            gain=per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2]),
-            forward=a[2],
-            back_m=float(rig.t[2]),
-            rad_per_unit=per_unit,
-            lens=lens,
-        )
+        gain = per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2])
+        return cls(infinity - TAU * order, order, gain, a[2], float(rig.t[2]), per_unit, lens)
 
     @property
     def maps(self) -> tuple[Any, ...]:
@@ -97,7 +94,7 @@ class CalibrationLayer:
         return (self.infinity_rad, self.infinity_order, self.gain, self.forward, *rays)
 
     def with_maps(self, maps: Iterable[Any]) -> "CalibrationLayer":
-        """The same constants with other ``maps``, in the order of `maps`: parts of them, or tensors."""
+        """The same constants with other ``maps``, in the order of `maps`."""
         infinity, order, gain, forward, *rays = maps
         lens = replace(self.lens, rays=tuple(rays)) if self.lens is not None else None
         return CalibrationLayer(infinity, order, gain, forward, self.back_m, self.rad_per_unit, lens)
@@ -105,6 +102,13 @@ class CalibrationLayer:
     def at(self, where: Any) -> "CalibrationLayer":
         """The layer of a part of the image: ``where`` indexes the maps (slices, a mask)."""
         return self.with_maps(values[where] for values in self.maps)
+
+    def tensors(self, dtype: Any = None, device: Any = None) -> "CalibrationLayer":
+        """The layer on torch tensors; gradients flow through depth to the phase. ``dtype`` float32 (None) keeps a
+        micrometre; float64 equals the NumPy layer to 1e-6 mm."""
+        import torch
+
+        return self.with_maps(torch.tensor(m, dtype=dtype or torch.float32, device=device) for m in self.maps)
 
     def residual_phase(self, phase_rad: Any, order: Any) -> Any:
         """psi in rad from wrapped phase (rad) and order (whole numbers): small numbers are subtracted, then whole
@@ -116,7 +120,7 @@ class CalibrationLayer:
         z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
         residual = self.gain / (self.forward * z + self.back_m)
         if self.lens is not None:
-            residual = residual + self._lens_shift(z)
+            residual = residual + self._lens_shift(self.lens, z)
         return residual + self.infinity_rad + TAU * self.infinity_order
 
     def depth_mm(self, phase_rad: Any, order: Any) -> Any:
@@ -129,47 +133,24 @@ class CalibrationLayer:
         ideal = residual_rad
         if self.lens is not None:
             for _ in range(FIXED_POINT_STEPS):
-                ideal = residual_rad - self._lens_shift((self.gain / ideal - self.back_m) / self.forward)
+                ideal = residual_rad - self._lens_shift(self.lens, (self.gain / ideal - self.back_m) / self.forward)
         return (self.gain / ideal - self.back_m) / self.forward * MM_PER_M
 
-    def _lens_shift(self, z: Any) -> Any:
+    def _lens_shift(self, lens: Lens, z: Any) -> Any:
         """Phase by which the projector's lens displaces a point at z metres on the ray."""
-        lens = self.lens
-        if lens is None:
-            return 0.0 * z
         ahead = z * lens.rays[2] + lens.t[2]
         point = [(z * lens.rays[i] + lens.t[i]) / ahead for i in range(2)]
         moved = distortion_polynomial(point[0], point[1], lens.coefficients)
         return self.rad_per_unit * (moved[lens.axis] - point[lens.axis])
 
-
-@dataclass(frozen=True)
-class Candidates:
-    """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``, int32 (H, W) each.
-
-    Where none does, ``count`` is 0, and ``first`` is the order nearest to the range's middle.
-    """
-
-    first: NDArray[np.int32]
-    count: NDArray[np.int32]
-
-    @property
-    def most(self) -> int:
-        """The largest number of candidates that any pixel has."""
-        return int(self.count.max(initial=0))
-
-
-def orders_in_range(layer: CalibrationLayer, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
-    """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none.
-
-    Their number is the rig's `periods_in_range`, rounded up at some pixels and down at others.
-    """
-    phase = np.asarray(phase_rad, dtype=np.float64)
-    ends = [layer.absolute_phase(end) for end in range_mm]
-    low, high = np.minimum(*ends), np.maximum(*ends)
-    defined = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
-    phase, low, high = (np.where(defined, values, 0.0) for values in (phase, low, high))
-    first, last = np.ceil((low - phase) / TAU), np.floor((high - phase) / TAU)
-    count = np.where(defined, np.maximum(last - first + 1, 0), 0)
-    first = np.where(count > 0, first, np.rint(((low + high) / 2 - phase) / TAU))
-    return Candidates(first.astype(np.int32), count.astype(np.int32))
+    def orders_in_range(self, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
+        """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none."""
+        phase = np.asarray(phase_rad, dtype=np.float64)
+        ends = [self.absolute_phase(end) for end in range_mm]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        defined = np.isfinite(phase) & np.isfinite(low) & np.isfinite(high)
+        phase, low, high = (np.where(defined, values, 0.0) for values in (phase, low, high))
+        first, last = np.ceil((low - phase) / TAU), np.floor((high - phase) / TAU)
+        count = np.where(defined, np.maximum(last - first + 1, 0), 0)
+        first = np.where(count > 0, first, np.rint(((low + high) / 2 - phase) / TAU))
+        return Candidates(first.astype(np.int32), count.astype(np.int32))

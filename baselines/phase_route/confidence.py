@@ -1,9 +1,8 @@
 """The expected error of each pixel in mm, and the reasons not to trust a pixel.
 
-The expected error adds three parts. Noise and misfit of the local fit: the window's rms misfit over brightness is a
-phase error, and the calibration layer's slope turns it into depth. The rim: where half the window lies off the object,
-the fit extrapolates instead of averaging. The order: its margin gives the probability of being a period off, whose
-error in mm is known. The confidence, 1 / (1 + error / 5 mm), lies between 0 and 1.
+The error adds noise and misfit of the local fit (its rms misfit over brightness is a phase error, which the calibration
+layer's slope turns into depth), the rim (there the fit extrapolates instead of averaging), and the order (its margin
+gives the probability of being a period off, whose error in mm is known).
 """
 
 import cv2
@@ -17,11 +16,9 @@ from fpp_ml_bench.baselines.phase_route.observation import Capture, Observation,
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding import MIN_MODULATION, phase_weights
 
-HALF_CONFIDENCE_MM = 5.0
 LEAST_MARGIN = 0.1
 """Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""
-MARGIN_SCALE = 0.04
-"""Margin by which the odds of two orders grow e-fold."""
+MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
 """Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""
@@ -40,10 +37,9 @@ def fit_uncertainty_rad(
     averaged = background.noise_grey**2 / (2 * np.pi * window.sigma_px**2 * np.maximum(fit.weight, 0.05))
     systematic = np.maximum(power - background.noise_grey**2, 0)
     sigma_phase = np.sqrt(averaged + systematic) / bright
-    steep = np.hypot(slopes[0], slopes[1])
+    steep = np.hypot(*slopes)
     rim = np.clip(1 - fit.weight, 0, 1)
-    expected: Image = sigma_phase * (0.3 + rim) + steep * rim  # type: ignore[assignment]  # float32 all through
-    return expected
+    return sigma_phase * (0.3 + rim) + steep * rim  # type: ignore[return-value]  # float32 all through
 
 
 def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) -> Image:
@@ -63,10 +59,8 @@ def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) ->
 
 def clipped_share(capture: Capture, fit: FringeFit, inside: Mask, window: Window) -> Image:
     """Share of the window's weight on the object that is saturated in any of the frames, float32 (h, w)."""
-    anywhere = np.any([grey >= GREY_LEVELS for grey in capture.greys], axis=0)
-    clipped = window.moment((anywhere & inside).astype(np.float32))
-    share: Image = (clipped / np.maximum(fit.weight, 1e-3)).astype(np.float32)
-    return share
+    clipped = np.any([grey >= GREY_LEVELS for grey in capture.greys], axis=0) & inside
+    return (window.moment(clipped.astype(np.float32)) / np.maximum(fit.weight, 1e-3)).astype(np.float32)
 
 
 def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
@@ -77,18 +71,11 @@ def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    error_mm, doubt_mm = (
-        np.where(observation.inside, part_mm, 0).astype(np.float32)
-        for part_mm in (
-            mm_per_rad * (observation.uncertainty_rad + TAU * wrong_chance), mm_per_rad * TAU * wrong_chance,
-        )
-    )  # fmt: skip
-    return error_mm, doubt_mm
-
-
-def confidence_of(error_mm: Image) -> Image:
-    """1 / (1 + error / 5 mm), float32."""
-    return (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)
+    error_mm = mm_per_rad * (observation.uncertainty_rad + TAU * wrong_chance)
+    doubt_mm = mm_per_rad * TAU * wrong_chance
+    outside = ~observation.inside
+    error_mm[outside] = doubt_mm[outside] = 0
+    return error_mm.astype(np.float32), doubt_mm.astype(np.float32)
 
 
 def reasons(
@@ -96,9 +83,7 @@ def reasons(
 ) -> NDArray[np.uint8]:
     """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
 
-    A depth outside the working range is a reason also where another order would give a depth inside: a chooser that
-    corrects the phase can leave the range that its orders were chosen for.
-    """
+    A chooser that corrects the phase can leave the range that its orders were chosen for."""
     near, far = observation.rig.working_range_mm
     outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
     slopes, period_px = observation.slopes, observation.period_px
@@ -109,17 +94,14 @@ def reasons(
     frequency = np.hypot(along, across)
     widest = disk(THIN_PERIODS / 2 * period_px)
     thick = cv2.morphologyEx(observation.inside.astype(np.uint8), cv2.MORPH_OPEN, widest) > 0
-    reason_map = np.full(observation.inside.shape, Reason.MEASURED, np.uint8)
-    checks = (
-        (confidence < settings.min_confidence, Reason.UNSURE),
-        (margin < LEAST_MARGIN, Reason.AMBIGUOUS),
-        ((frequency < SLOWEST) | (frequency > FASTEST), Reason.TOO_STEEP),
-        (~thick, Reason.THIN),
-        ((observation.candidates.count == 0) | outside, Reason.OUT_OF_RANGE),
-        (observation.clipped_share > SATURATED_SHARE, Reason.SATURATED),
-        (observation.fit.brightness < MIN_MODULATION, Reason.LOW_MODULATION),
-        (~observation.inside, Reason.BACKGROUND),
-    )
-    for pixels, reason in checks:
-        reason_map[pixels] = reason
-    return reason_map
+    by_reason = {
+        Reason.BACKGROUND: ~observation.inside,
+        Reason.LOW_MODULATION: observation.fit.brightness < MIN_MODULATION,
+        Reason.SATURATED: observation.clipped_share > SATURATED_SHARE,
+        Reason.OUT_OF_RANGE: (observation.candidates.count == 0) | outside,
+        Reason.THIN: ~thick,
+        Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
+        Reason.AMBIGUOUS: margin < LEAST_MARGIN,
+        Reason.UNSURE: confidence < settings.min_confidence,
+    }
+    return np.select(list(by_reason.values()), [np.uint8(reason) for reason in by_reason], np.uint8(Reason.MEASURED))

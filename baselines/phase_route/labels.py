@@ -1,15 +1,9 @@
-"""The candidate order of each pixel, by the least energy over the two or three candidates that the rig allows.
+"""The candidate order of each pixel by sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S").
 
-The energy is a sum over pixels of costs from brightness and priors, and over neighbours of the difference of their
-residual phases, linear up to a limit: surfaces are smooth, and where they jump, a jump of any height costs the same.
-For a single pixel smoothness is strong and brightness weak; plain belief propagation then keeps the result of its first
-sweep (it put a plane at 2.1 m a whole period too near although brightness favoured the right order at 97% of the
-pixels). Sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S") counts the evidence of every pixel once
-and finds the right order.
-
-It is written twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left
-and upper neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once. Maps are
-sheared for that: row d of a sheared map holds the nodes (i, d - i), at index i.
+Plain belief propagation keeps the result of its first sweep where smoothness is strong and brightness weak. Written
+twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left and upper
+neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once: row d of a sheared
+map holds the nodes (i, d - i), at index i.
 """
 
 import numpy as np
@@ -21,8 +15,7 @@ from fpp_ml_bench.machine import numba_enabled
 Field = tuple[Image, Image, Image, Image, np.float32]
 
 ROUNDS = 10
-LARGE = np.float32(1e4)
-"""Cost of a candidate that does not exist."""
+LARGE = np.float32(1e4)  # cost of a candidate that does not exist
 
 
 def least_energy(
@@ -50,10 +43,11 @@ def least_energy(
     return choice, np.minimum(margin, LARGE)
 
 
-def _sheared(image: NDArray, height: int, width: int) -> NDArray:
+def _sheared(image: NDArray) -> NDArray:
     """``image`` (height, width, ...) as (height + width - 1, height, ...), zeros where there is no node."""
+    height, width, *rest = image.shape
+    out = np.zeros((height + width - 1, height, *rest), image.dtype)
     i, j = np.indices((height, width))
-    out = np.zeros((height + width - 1, height, *image.shape[2:]), image.dtype)
     out[i + j, i] = image
     return out
 
@@ -63,12 +57,11 @@ def _straight(image: NDArray, height: int, width: int) -> NDArray:
     return image[i + j, i]
 
 
-def _links(link_x: Image, link_y: Image, height: int, width: int) -> dict[str, Image]:
-    """Weight towards each neighbour, 0 beyond the border, sheared."""
-    towards = {side: np.zeros((height, width), np.float32) for side in ("left", "right", "up", "down")}
-    towards["right"][:, : width - 1], towards["left"][:, 1:] = link_x, link_x
-    towards["down"][: height - 1], towards["up"][1:] = link_y, link_y
-    return {side: _sheared(weights, height, width) for side, weights in towards.items()}
+def _links(link_x: Image, link_y: Image) -> list[Image]:
+    """Weight towards the left, upper, right and lower neighbour, 0 beyond the border, sheared."""
+    before, after = (((0, 0), (1, 0)), ((1, 0), (0, 0))), (((0, 0), (0, 1)), ((0, 1), (0, 0)))
+    links = (link_x, link_y)
+    return [_sheared(np.pad(link, pad)) for side in (before, after) for link, pad in zip(links, side, strict=True)]
 
 
 def _send(
@@ -83,14 +76,13 @@ def _iterate(field: Field, rounds: int, messages: Image) -> None:
     """As `label_kernels.iterate`: ``messages`` (H, W, 4, K) are updated in place."""
     unary, phase, link_x, link_y, limit = field
     height, width, _ = unary.shape
-    towards = _links(link_x, link_y, height, width)
-    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
-    ahead = (towards["right"] > 0).astype(np.float32) + (towards["down"] > 0)
-    behind = (towards["left"] > 0).astype(np.float32) + (towards["up"] > 0)
-    share = np.maximum(np.maximum(ahead, behind), 1).astype(np.float32)
+    left, up, right, down = _links(link_x, link_y)
+    cost, phases, passed = (_sheared(maps) for maps in (unary, phase, messages))
+    ahead, behind = (np.add(across > 0, along > 0, dtype=np.float32) for across, along in ((right, down), (left, up)))
+    share = np.maximum(np.maximum(ahead, behind), np.float32(1))
     last = height + width - 2
-    forward = (range(last), 1, towards["right"], towards["down"], 2, slice(None, -1), slice(1, None))
-    backward = (range(last, 0, -1), -1, towards["left"], towards["up"], 0, slice(1, None), slice(None, -1))
+    forward = (range(last), 1, right, down, 2, slice(None, -1), slice(1, None))
+    backward = (range(last, 0, -1), -1, left, up, 0, slice(1, None), slice(None, -1))
     for _ in range(rounds):
         for diagonals, step, across, along, here, own, other in (forward, backward):
             there = 2 - here
@@ -112,16 +104,16 @@ def _decide(field: Field, messages: Image, choice: NDArray[np.int32], margin: Im
     """As `label_kernels.decide`: ``choice`` and ``margin`` (H, W) are written."""
     unary, phase, link_x, link_y, limit = field
     height, width, count = unary.shape
-    towards = _links(link_x, link_y, height, width)
-    cost, phases, passed = (_sheared(maps, height, width) for maps in (unary, phase, messages))
+    left, up, _, _ = _links(link_x, link_y)
+    cost, phases, passed = (_sheared(maps) for maps in (unary, phase, messages))
     labels, margins = np.zeros(cost.shape[:2], np.int32), np.zeros(cost.shape[:2], np.float32)
     chosen_phase = np.zeros(height, np.float32)
     for d in range(height + width - 1):
         total = cost[d] + (passed[d, :, 2] + passed[d, :, 3])
         if d:
-            total = total + np.minimum(np.abs(chosen_phase[:, None] - phases[d]), limit) * towards["left"][d][:, None]
+            total = total + np.minimum(np.abs(chosen_phase[:, None] - phases[d]), limit) * left[d][:, None]
             above = np.concatenate([chosen_phase[:1], chosen_phase[:-1]])
-            total = total + np.minimum(np.abs(above[:, None] - phases[d]), limit) * towards["up"][d][:, None]
+            total = total + np.minimum(np.abs(above[:, None] - phases[d]), limit) * up[d][:, None]
         labels[d] = total.argmin(axis=1)
         chosen_phase = np.take_along_axis(phases[d], labels[d][:, None].astype(np.intp), axis=1)[:, 0]
         ordered = np.sort(total, axis=1)

@@ -1,13 +1,9 @@
-"""Local least squares of a fringe under a Gaussian window: phase, brightness and their uncertainty at every pixel.
+"""Local least squares of a fringe under a Gaussian window, which never reaches across the object mask.
 
-First fit, no photometry needed: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a
-carrier (a plane at the standoff) whose phase the solution corrects by ``atan2(-S, C)``. Second fit, once the carrier
-follows the surface: ``I - ambient = g (1 + cos(theta + d))`` with g a plane. A projected fringe goes down to black, so
-its mean and its modulation are the same number g; with that constraint a slope of brightness is not taken for phase.
-
-A fit needs only moments of masked images under the window, and a Gaussian window is separable: 19 images, each filtered
-along rows and columns. The window never reaches across the object mask; Fourier methods do, which doubles their error
-(docs/phase_route.md).
+First fit: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a carrier (a plane at the
+standoff) whose phase the solution corrects by ``atan2(-S, C)``. Second fit: ``I - ambient = g (1 + cos(theta + d))``
+with g a plane. A projected fringe goes down to black, so its mean and its modulation are the same number g; with that
+constraint a slope of brightness is not taken for phase.
 """
 
 from collections.abc import Sequence
@@ -20,10 +16,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
 
 WINDOW_SIGMAS = 3.0
-RIDGE = 1e-6
-"""Of the window's weight, added to the diagonal: fits of a few pixels stay finite."""
-LARGEST_STEP_RAD = 0.7
-"""Largest correction of the second fit: beyond it the linear model does not hold."""
+RIDGE = 1e-6  # of the window's weight, added to the diagonal: fits of a few pixels stay finite
+LARGEST_STEP_RAD = 0.7  # largest correction of the second fit: beyond it the linear model does not hold
 STEEPEST_RAD_PER_PX = 0.5
 """Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
 
@@ -48,20 +42,16 @@ class Window:
 @dataclass(frozen=True)
 class FringeFit:
     """``phase_rad`` float32 (H, W), not wrapped: carrier plus correction; ``brightness`` g, grey levels (a white
-    pattern's is twice as much), and its slopes a px; ``weight``: share of the window that lies on the object."""
+    pattern's is twice as much); ``weight``: share of the window that lies on the object."""
 
     phase_rad: Image
     brightness: Image
-    slope_x: Image
-    slope_y: Image
     weight: Image
 
 
 def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
-    """Solve one small symmetric system a pixel by elimination without pivoting; ``rows``: from the diagonal on.
-
-    Both arguments are overwritten. The windows' normal matrices are positive; `RIDGE` keeps them so in float32.
-    """
+    """Solve one small symmetric system a pixel by elimination without pivoting; ``rows``: from the diagonal on. Both
+    arguments are overwritten. The windows' normal matrices are positive; `RIDGE` keeps them so in float32."""
     size = len(right)
     ridge = RIDGE * rows[0][0] + np.float32(1e-9)
     for row in rows:
@@ -86,8 +76,7 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
     cosine, sine = np.cos(carrier_rad).astype(np.float32), np.sin(carrier_rad).astype(np.float32)
     by_cosine, by_sine = weight * cosine, weight * sine
     m = window.moment
-    w00 = m(weight)
-    cc = m(by_cosine * cosine)
+    w00, cc = m(weight), m(by_cosine * cosine)
     rows = [
         [w00, m(weight, 1, 0), m(weight, 0, 1), m(by_cosine), m(by_sine)],
         [m(weight, 2, 0), m(weight, 1, 1), m(by_cosine, 1, 0), m(by_sine, 1, 0)],
@@ -102,7 +91,7 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
 
 def fringe_fit(
     greys: Sequence[Image], inside: Mask, carrier_rad: Image, ambient: float, window: Window,
-    shifts_rad: Sequence[float] = (0.0,),
+    shifts_rad: Sequence[float],
 ) -> FringeFit:  # fmt: skip
     """Fit of g (1 + cos(carrier + shift + d)), g a plane, around each pixel of ``greys``, float32 (H, W) each: one
     image, or several whose fringes are shifted by ``shifts_rad``."""
@@ -121,11 +110,9 @@ def fringe_fit(
         [m(rr, 0, 2), m(rs, 0, 1)],
         [m(ss)],
     ]
-    g, gx, gy, s = solve_symmetric(rows, [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)])
+    g, _, _, s = solve_symmetric(rows, [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)])
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-    scale = np.float32(1 / window.sigma_px)
-    phase = (carrier_rad + step).astype(np.float32)
-    return FringeFit(phase, g, gx * scale, gy * scale, m(weight))
+    return FringeFit((carrier_rad + step).astype(np.float32), g, m(weight))
 
 
 def phase_slopes(residual_rad: Image, inside: Mask, smooth_px: float) -> tuple[Image, Image]:

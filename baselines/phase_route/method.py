@@ -1,16 +1,29 @@
-"""The phase route as a method of ``fpp-bench predict``: one captured fringe or a few, metric depth, nothing learned."""
+"""The phase route as methods of ``fpp-bench predict``: with given frames, or with the fewest that a scene needs.
 
-from dataclasses import asdict
+The fewest are decided while capturing, without ground truth. Capture one fringe and measure: the measurement gives its
+expected error, from its phase and from its order. While that error is too large, capture the frames that reduce it
+(more fringes for the phase, the Gray code for the order) and measure again. No captured frame is wasted.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.phase_route.observation import Measurement, Settings
+from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics import Rig
+
+ORDER_SHARE = (0.16, 0.10, 0.05)
+"""Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
+(``benchmarks/frames_choice.py --calibrate`` measures it again). The margin of an order overestimates the probability
+that it is wrong; these factors correct that."""
 
 
 class PhaseMethod(Method):
@@ -41,8 +54,7 @@ class PhaseMethod(Method):
         return self.route.measure(self._images(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        images = self._images(frames)
-        return self.route.observe(images if len(images) > 1 else images[0]).crop
+        return self.route.observe(self._images(frames)).crop
 
     def _images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = []
@@ -57,3 +69,120 @@ class PhaseMethod(Method):
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
         return self.measure(frames).depth_mm
+
+
+@dataclass(frozen=True)
+class Look:
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: ``phase_mm`` from the phase and
+    ``order_mm`` from the order; ``gray``: whether the Gray code is among the frames."""
+
+    frames: int
+    gray: bool
+    phase_mm: float
+    order_mm: float
+
+    @classmethod
+    def of(cls, measurement: Measurement, count: int) -> "Look":
+        on_object = measurement.depth_mm > 0
+        if not on_object.any():
+            return cls(count, False, 0.0, 0.0)
+        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
+        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
+        return cls(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
+
+    @property
+    def expected_mm(self) -> float:
+        return self.phase_mm + self.order_mm
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
+
+    depth_mm: NDArray[np.float32]
+    frames_used: tuple[int, ...]
+    looks: tuple[Look, ...]
+
+    def report(self) -> dict[str, Any]:
+        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
+        looks = [
+            {"frames": look.frames, "gray_code": look.gray, "expected_error_mm": round(look.expected_mm, 4),
+             "by_phase_mm": round(look.phase_mm, 4), "by_order_mm": round(look.order_mm, 4)}
+            for look in self.looks
+        ]  # fmt: skip
+        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
+        return last | {"frames_used": list(self.frames_used), "looks": looks}
+
+
+def levels_of(steps: int) -> tuple[int, ...]:
+    """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
+    multiple of three, else 1 and then all."""
+    if steps % PIXELWISE:
+        return (1, steps)
+    levels = [1, 2, PIXELWISE]
+    for fringes in (6, steps):
+        if fringes > levels[-1] and set(steps_of(steps, levels[-1])) <= set(steps_of(steps, fringes)):
+            levels.append(fringes)
+    return tuple(levels)
+
+
+class FewestFrames(Method):
+    """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
+    third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
+    never read. Further options are those of `Settings`, ``frames`` aside.
+
+    Raises `PredictionError` for an error that is no positive number of mm, and as `PhaseMethod`.
+    """
+
+    name = "phase"
+    reports = True
+
+    def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
+        if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
+            raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
+        if "frames" in options:
+            raise PredictionError("frames and error_mm: give one of them; error_mm chooses the frames itself")
+        self.rig, self.error_mm = rig, float(error_mm)
+        self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
+        self.options = self.methods[1].options
+        self.gray = tuple(rig.sequence.gray(self.options.direction))
+        fringes = {index for method in self.methods.values() for index in method.frames_used}
+        self.frames_used = tuple(sorted(fringes | set(self.gray)))  # all that a scene may need; most need few of them
+        self.title = f"Phase route, fewest {self.options.direction} fringes for {error_mm:g} mm, nothing learned"
+        settings = self.methods[1].settings
+        self.settings = {"error_mm": self.error_mm} | {key: settings[key] for key in settings if key != "frames"}
+
+    def choose(self, frames: Frames) -> FrameChoice:
+        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""
+        looks: list[Look] = []
+        gray = False
+        for count, method in self.methods.items():
+            measurement = method.measure(frames)
+            depth_mm, used, look = measurement.depth_mm, method.frames_used, Look.of(measurement, count)
+            if not gray:
+                looks.append(look)
+                # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
+                # is left.
+                phase_done = look.phase_mm <= self.error_mm or count == max(self.methods)
+                gray = look.expected_mm > self.error_mm and count >= PIXELWISE and phase_done
+            if gray:
+                depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
+                used = tuple(sorted({*used, *self.gray}))
+                looks.append(replace(look, frames=len(used), gray=True, order_mm=0.0))
+            if looks[-1].expected_mm <= self.error_mm:
+                break
+        return FrameChoice(depth_mm, used, tuple(looks))
+
+    def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Depth as `predict`, and the sample's report (see `FrameChoice.report`)."""
+        choice = self.choose(frames)
+        return choice.depth_mm, choice.report()
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background."""
+        return self.choose(frames).depth_mm
+
+    def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+        """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""
+        counts = [int(report["frames"]) for report in reports]
+        return {"frames_mean": round(float(np.mean(counts)), 3), "frames_most": max(counts)}

@@ -1,18 +1,11 @@
 """The object mask: pixels whose grey level the empty scene does not explain.
 
-The background plane's distance is calibrated, so its phase is known at every pixel, and so is its brightness except for
-three things: ambient light, the lamp's strength, and a slow change of its sheen across the image. `EmptyScene` fits
-them to the image's own background. Pixels that then differ from the prediction by more than noise are not background.
-The lamp's strength also turns an object's brightness into distance and slope (`orders.irradiance`): the paper's plane
-and objects are of the same material.
-
 Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
-is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete:
-the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it (`local_fit`). The
-prediction nearer to the pixel's grey level wins.
+is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete,
+the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it: the nearer wins.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,40 +20,30 @@ Crop = tuple[slice, slice]
 
 TILE_PX_PER_PERIOD = 1.1
 """Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
-TILE_NOISE_GREY = 3.0
-"""Largest misfit of a tile that may be background: three times the benchmark's noise."""
-LEAST_SHARE = 0.02
-"""Of the image's tiles that must show background for the image to calibrate itself."""
+TILE_NOISE_GREY = 3.0  # largest misfit of a tile that may be background: three times the benchmark's noise
+LEAST_SHARE = 0.02  # of the image's tiles that must show background for the image to calibrate itself
 STRENGTH_TOLERANCE = 0.4
 """Relative deviation of the lamp's strength in an image from the calibrated strength. A surface in the working range
 whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
 SAMPLE_STEP_PX = 5
-FLOOR_NOISE_GREY = 0.3
-"""Noise of rounding to whole grey levels."""
-DEFAULT_NOISE_GREY = 1.0
-"""Noise of an image that shows no background to measure it on."""
+FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
+DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
-OBJECT_BONUS = 4.0
-"""Added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object."""
+OBJECT_BONUS = 4.0  # added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object
 UNLIT_PERIODS = 0.8
-UNLIT_SIGMAS = 4.0
-"""Brightest grey level, above ambient light, of what counts as unlit."""
+UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit
 DARKEST_GREY = MIN_MODULATION / 4
 """An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no depth."""
-LEAST_AREA_PERIODS = 0.1
-"""Smallest object, and largest hole that is closed, in squares of one period."""
+LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in squares of one period
 
 
 @dataclass(frozen=True)
 class Background:
-    """Fit of the empty scene to one image, grey levels.
-
-    ``ambient_grey``; ``strength``: grey levels that a white pattern gives per 1/m^2 of irradiance; ``noise_grey``;
-    ``residual`` float32 (H, W): image minus prediction; ``share``: of the image's tiles that show the plane, 0 where
-    the calibrated constants were used; ``weights``: of the terms 1, x, y, x^2, xy, y^2 of the lamp's light.
-    """
+    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
+    irradiance; ``residual`` float32 (H, W): image minus prediction; ``share``: of the tiles that show the plane, 0
+    where the calibrated constants were used; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
 
     ambient_grey: float
     strength: float
@@ -69,10 +52,6 @@ class Background:
     share: float
     weights: tuple[float, ...]
 
-    def at(self, crop: Crop) -> "Background":
-        """The fit for a part of the image."""
-        return replace(self, residual=self.residual[crop])
-
     @property
     def different(self) -> Mask:
         """Pixels (H, W) whose own grey level the empty scene does not explain."""
@@ -80,7 +59,9 @@ class Background:
 
 
 class EmptyScene:
-    """The background plane as a rig and direction show it; computed once, then fitted to every image.
+    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase
+    is calibrated, and so is its brightness except for ambient light, the lamp's strength and a slow change of its sheen
+    across the image, which are fitted.
 
     ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
     grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
@@ -106,16 +87,13 @@ class EmptyScene:
         if share < LEAST_SHARE:
             residual = grey - self.ambient_grey - self.strength * self._terms[0]
             return Background(self.ambient_grey, self.strength, DEFAULT_NOISE_GREY, residual, 0.0, (self.strength,))
-        rows, columns = (count * self._tile for count in plane_tiles.shape)
-        sampled = np.zeros(image.shape, dtype=bool)
-        sampled[:rows, :columns] = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
-        every = np.zeros_like(sampled)
-        every[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX] = True
-        sampled &= every
-        ones = np.ones(int(sampled.sum()))
-        terms = np.stack([ones] + [term[sampled] for term in self._terms], axis=1).astype(np.float64)
-        solution = np.linalg.lstsq(terms, grey[sampled].astype(np.float64), rcond=None)[0]
-        misfit = grey[sampled] - terms @ solution
+        plane_pixels = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
+        places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
+        row, column = (SAMPLE_STEP_PX * place for place in places)
+        sampled = grey[row, column].astype(np.float64)
+        terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
+        solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
+        misfit = sampled - terms @ solution
         noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
@@ -160,9 +138,9 @@ def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
     x, y = rig.camera.rays()
     centre = -rig.R.T @ rig.t
     # The plane's normal is the camera's axis, however the projector is rotated.
-    from_lamp = [x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]]
-    squared = from_lamp[0] ** 2 + from_lamp[1] ** 2 + from_lamp[2] ** 2
-    return from_lamp[2] / (squared * np.sqrt(squared))
+    right, down, ahead = x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]
+    squared = right**2 + down**2 + ahead**2
+    return ahead / (squared * np.sqrt(squared))
 
 
 def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
@@ -205,11 +183,8 @@ def unlit(grey: Image, background: Background, period_px: float) -> Mask:
 def refined(
     region: Mask, background: Background, predicted: Image, grey: Image, fringe_noise: NDArray, reach_px: float
 ) -> Mask:
-    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette.
-
-    ``predicted`` grey levels of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its
-    uncertainty in grey levels, beside the image's own noise.
-    """
+    """Mask (H, W) by the better of the two predictions within ``reach_px`` of the silhouette; ``predicted`` grey levels
+    of the object's fringe, NaN where nothing near predicts it; ``fringe_noise``: its noise, beside the image's."""
     noise = background.noise_grey
     as_plane = (background.residual / noise) ** 2
     with np.errstate(invalid="ignore"):

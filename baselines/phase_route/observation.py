@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import IntEnum
 from time import perf_counter
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +16,22 @@ from fpp_ml_bench.loaders.render import Lighting
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 Prior = Literal["none", "standoff"]
-PRIORS: tuple[Prior, ...] = ("none", "standoff")
-PIXELWISE = 3
-"""Frames from which on every pixel has a phase of its own."""
-_POSITIVE = (
-    "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread", "white_grey",
-)  # fmt: skip
+PIXELWISE = 3  # frames from which on every pixel has a phase of its own
+_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread", "white_grey"
 
 
 @dataclass(frozen=True)
 class Settings:
     """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
-    the order may use: ``shading`` and ``prior``; ``min_confidence``: pixels below it are 0 (0: dense, every object
-    pixel gets a depth). The default values were chosen on train and validation objects.
+    the order may use: ``shading`` and ``prior`` ("standoff": objects are near the rig's standoff, true of fixed
+    placement); ``min_confidence``: pixels below it are 0 (0: dense, every object pixel gets a depth). The defaults
+    were chosen on train and validation objects.
 
-    ``prior`` "standoff" assumes that objects are near the rig's standoff, which is true of fixed placement;
-    "none" leaves only the working range. Windows are in image px per fringe period: of the first fit, of the second,
-    of the last one to two frames, and of the slopes. Costs (no unit): ``shading_cost`` a pixel for each
-    ``shading_spread`` of log brightness, up to ``shading_limit`` of them; ``prior_cost`` a pixel for each 100 mm;
-    ``jump_rad``: a jump of phase between neighbours from which on it costs no more. ``slack_mm`` widens the working
-    range for noise at its ends. ``white_grey`` and ``ambient_grey`` calibrate images that show no background (see
-    `EmptyScene`).
+    Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
+    (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
+    ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
+    more. ``slack_mm`` widens the working range for noise at its ends. ``white_grey`` and ``ambient_grey`` calibrate
+    images that show no background (see `EmptyScene`).
     """
 
     direction: Direction = "horizontal"
@@ -60,8 +55,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.direction not in DIRECTIONS:
             raise PredictionError(f"direction {self.direction!r}: one fringe is {' or '.join(DIRECTIONS)}, not both")
-        if self.prior not in PRIORS:
-            raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(PRIORS)}")
+        if self.prior not in get_args(Prior):
+            raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
         if not 0 <= self.min_confidence < 1:
             raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
         for name in _POSITIVE:
@@ -69,7 +64,7 @@ class Settings:
                 raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
 
 
-class Stopwatch:
+class Watch:
     """Seconds of each stage since the last."""
 
     def __init__(self) -> None:
@@ -93,39 +88,18 @@ class Capture:
 
     rig: Rig
     period_px: float
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     crop: Crop
     greys: tuple[Image, ...]
     shifts_rad: tuple[float, ...]
     background: Background
     layer: CalibrationLayer
-    watch: Stopwatch
+    watch: Watch
 
     @property
     def pixelwise(self) -> bool:
         """Whether there are frames enough for every pixel to have a phase of its own."""
         return len(self.greys) >= PIXELWISE
-
-
-@dataclass(frozen=True)
-class Question:
-    """K candidates a pixel on the grid (h, w), nearest order first: ``residual_rad``, ``depth_mm``, ``exists`` and
-    ``irradiance`` (1/m^2) are (K, h, w); ``brightness``: measured, in the same 1/m^2; ``trust`` 0 to 1: weight of the
-    brightness there (small at rims and on dark slopes); ``inside``: object; ``stride``: image px a grid step;
-    ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree.
-    """
-
-    residual_rad: Image
-    depth_mm: Image
-    exists: Mask
-    irradiance: Image
-    brightness: Image
-    trust: Image
-    inside: Mask
-    stride: int
-    period_px: float
-    smooth_x: Image | float
-    smooth_y: Image | float
 
 
 @dataclass(frozen=True)
@@ -135,7 +109,7 @@ class Observation(Capture):
     ``inside``: object; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in
     [-pi, pi]; ``slopes``: change of the residual phase in rad a px along x and y; ``uncertainty_rad`` float32: of the
     phase, order aside; ``clipped_share`` float32: of the window's weight, what is saturated; ``candidates``: the orders
-    that the working range allows; ``question``: the same on a grid, for a `Chooser`.
+    that the working range allows.
     """
 
     inside: Mask
@@ -145,18 +119,6 @@ class Observation(Capture):
     uncertainty_rad: Image
     clipped_share: Image
     candidates: Candidates
-    question: Question
-
-    @property
-    def residual_at_zero_rad(self) -> NDArray[np.float64]:
-        """Residual phase (h, w) at order 0."""
-        residual: NDArray[np.float64] = self.layer.residual_phase(self.phase_rad, 0.0)
-        return residual
-
-    @property
-    def empty(self) -> bool:
-        """Whether there is no object."""
-        return not self.inside.any()
 
 
 class Reason(IntEnum):
@@ -165,8 +127,7 @@ class Reason(IntEnum):
     BACKGROUND: the empty scene explains it. LOW_MODULATION: too dark for a fringe, in shadow or turned away.
     SATURATED: clipped grey levels in the window. OUT_OF_RANGE: no order puts it in the working range. THIN: the object
     is thinner than half a period there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves.
-    AMBIGUOUS: the candidate orders can't be told apart. UNSURE: the expected error alone is too large.
-    """
+    AMBIGUOUS: the candidate orders can't be told apart. UNSURE: the expected error alone is too large."""
 
     MEASURED = 0
     BACKGROUND = 1

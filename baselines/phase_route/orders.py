@@ -1,43 +1,54 @@
-"""The choice of each pixel's fringe order, without learning.
+"""The choice of each pixel's fringe order, without learning: by brightness and smoothness (docs/phase_route.md).
 
-`Question` holds all that a chooser may use, on a grid of every `stride`-th pixel: for each candidate order its residual
-phase, its depth and the brightness that it predicts, and the measured brightness. `by_shading_and_smoothness` minimises
-an energy; a learned chooser with the same signature can replace it (`PhaseRoute(rig, settings, chooser)`).
-
-Shading: the phase fixes how fast 1/Z changes along the surface whatever the order; the order fixes Z itself. Together
-they give distance and normal of every candidate, and so the brightness of a matte surface there: cos(theta) / r^2 of
-the light that the background plane has calibrated. A surface one order nearer is closer to the lamp and also turned
-more towards it, so the candidates differ by a third in brightness. This cue assumes the same albedo for plane and
-objects, which is true of the paper's scenes (Section 2.2) but not of painted objects: `PhaseMethod(shading=False)`
-works without it.
+The phase fixes how fast 1/Z changes along the surface, the order fixes Z itself: together they give distance and normal
+of every candidate, and so the brightness of a matte surface there. That assumes the same albedo for plane and objects,
+which is true of the paper's scenes (Section 2.2) but not of painted objects: `PhaseMethod(shading=False)`.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates, Image, Mask
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.object_mask import Crop
-from fpp_ml_bench.baselines.phase_route.observation import Capture, Question, Settings
+from fpp_ml_bench.baselines.phase_route.observation import Observation, Settings
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Rig
 
-NODES_PER_PERIOD = 7.5
-"""Grid points along a period: every third pixel at 960 px."""
+NODES_PER_PERIOD = 7.5  # grid points along a period: every third pixel at 960 px
 EVIDENCE_PERIODS = 2.0
 """Side of the square over which evidence for an order is averaged: a single pixel's brightness is too uncertain."""
-LEAST_BRIGHTNESS = 1e-3
-"""Least irradiance whose logarithm is taken, 1/m^2: a surface turned away."""
+LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a surface turned away
 JUMP_RAD_PER_PX, JUMP_LOG_PER_PX = 0.1, 0.06
 """Change of residual phase, and of log brightness, from which on two neighbours with a phase of their own lie on two
 surfaces."""
-JUMP_WEIGHT = 0.05
-"""Weight of the link between two such neighbours."""
+JUMP_WEIGHT = 0.05  # weight of the link between two such neighbours
+
+
+@dataclass(frozen=True)
+class Question:
+    """All that a `Chooser` may use: K candidates a pixel on the grid (h, w) of every ``stride``-th pixel, nearest order
+    first. ``residual_rad``, ``depth_mm``, ``exists`` and ``irradiance`` (1/m^2) are (K, h, w); ``brightness``:
+    measured, in 1/m^2; ``trust`` 0 to 1: weight of the brightness there (small at rims and on dark slopes); ``inside``:
+    object; ``smooth_x`` (h, w - 1) and ``smooth_y`` (h - 1, w): how much neighbours should agree."""
+
+    residual_rad: Image
+    depth_mm: Image
+    exists: Mask
+    irradiance: Image
+    brightness: Image
+    trust: Image
+    inside: Mask
+    stride: int
+    period_px: float
+    smooth_x: Image | float
+    smooth_y: Image | float
+
 
 Chooser = Callable[[Question, Rig, Settings], tuple[NDArray[np.int32], Image]]
 """Index of the chosen candidate int32 (h, w), and how clearly it won, float32: 0 for a tie, 1 or more for certain."""
@@ -60,40 +71,38 @@ def of_choice(values: NDArray, choice: NDArray) -> NDArray:
     return np.take_along_axis(values, choice[None].astype(np.intp), axis=0)[0]
 
 
-def question_of(
-    capture: Capture, phase_rad: Image, fit: FringeFit, slopes: tuple[Image, Image], candidates: Candidates,
-    inside: Mask,
-) -> Question:  # fmt: skip
-    """The question for what was measured in a capture, maps (h, w) of its crop."""
-    stride = max(1, round(capture.period_px / NODES_PER_PERIOD))
-    grid, where, rig = grid_of(stride), grid_of(stride, capture.crop), capture.rig
-    layer = capture.layer.at(grid)
-    count = np.maximum(candidates.count[grid], 1)
-    first, phase = candidates.first[grid], phase_rad[grid]
+def stride_of(period_px: float) -> int:
+    """Image px a step of the grid on which orders are chosen."""
+    return max(1, round(period_px / NODES_PER_PERIOD))
+
+
+def question_of(seen: Observation) -> Question:
+    """The question for what was measured in a capture."""
+    stride = stride_of(seen.period_px)
+    grid, where, rig, fit = grid_of(stride), grid_of(stride, seen.crop), seen.rig, seen.fit
+    layer = seen.layer.at(grid)
+    count = np.maximum(seen.candidates.count[grid], 1)
+    first, phase = seen.candidates.first[grid], seen.phase_rad[grid]
     steps = range(int(count.max(initial=1)))
     residual = np.stack([layer.residual_phase(phase, first + k) for k in steps]).astype(np.float32)
-    grid_slopes = slopes[0][grid], slopes[1][grid]
+    grid_slopes = seen.slopes[0][grid], seen.slopes[1][grid]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         light = np.stack([irradiance(layer, candidate, grid_slopes, rig, where) for candidate in residual])
         depth = np.stack([layer.depth_of_residual_mm(candidate) for candidate in residual]).astype(np.float32)
-    brightness = fit.brightness[grid] / np.float32(capture.background.strength / 2)
+    brightness = fit.brightness[grid] / np.float32(seen.background.strength / 2)
     trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * np.clip(brightness * rig.standoff_m**2, 0.02, 1) ** 2
     exists = np.stack([k < count for k in steps])
     # Jumps between neighbours show where every pixel has a phase of its own.
-    smooth = _smooth_links(residual[0], brightness, stride) if capture.pixelwise else (1.0, 1.0)
-    return Question(
-        residual, depth, exists, light, brightness, trust.astype(np.float32), inside[grid], stride, capture.period_px,
-        *smooth,
-    )  # fmt: skip
+    smooth = _smooth_links(residual[0], brightness, stride) if seen.pixelwise else (1.0, 1.0)
+    trust, inside = trust.astype(np.float32), seen.inside[grid]
+    return Question(residual, depth, exists, light, brightness, trust, inside, stride, seen.period_px, *smooth)
 
 
 def irradiance(
     layer: CalibrationLayer, residual_rad: NDArray, slopes: tuple[Image, Image], rig: Rig, crop: Crop
 ) -> Image:
     """cos(theta) / r^2 in 1/m^2 that a matte surface receives from the projector, float32 (H, W); below 0: turned away.
-
-    ``residual_rad`` (H, W) of one candidate on the pixels ``crop`` of the image, ``slopes`` its change a px.
-    """
+    ``residual_rad`` (H, W) of one candidate on the pixels ``crop`` of the image, ``slopes`` its change a px."""
     x, y = (axis[crop].astype(np.float32) for axis in rig.camera.rays())
     z = (layer.depth_of_residual_mm(residual_rad) / MM_PER_M).astype(np.float32)
     if layer.lens is None:
@@ -101,10 +110,8 @@ def irradiance(
     else:
         rate = (layer.depth_of_residual_mm(residual_rad + 1e-3) / MM_PER_M - z) / 1e-3
     # At a fixed psi depth still changes with the pixel where the projector is rotated against the camera.
-    zx, zy = (
-        (rate * slope + _drift(layer, residual_rad, z, axis, crop)).astype(np.float32)
-        for axis, slope in ((1, slopes[0]), (0, slopes[1]))
-    )
+    drifts = [_drift(layer, residual_rad, z, axis, crop) for axis in (1, 0)]
+    zx, zy = ((rate * slope + drift).astype(np.float32) for slope, drift in zip(slopes, drifts, strict=True))
     dx, dy = np.float32(1 / rig.camera.fx), np.float32(1 / rig.camera.fy)
     # Tangents of the surface Z (x, y, 1) along the image's rows and columns, and their cross product.
     ax, ay, az = zx * x + z * dx, zx * y, zx
@@ -133,9 +140,7 @@ def _smooth_links(residual_rad: Image, brightness: Image, stride: int) -> tuple[
     log_brightness = np.log(np.maximum(brightness, LEAST_BRIGHTNESS))
     links = []
     for axis in (1, 0):
-        change = np.diff(residual_rad, axis=axis)
-        change -= np.float32(TAU) * np.rint(change / np.float32(TAU))
-        jump = np.abs(change) > JUMP_RAD_PER_PX * stride
+        jump = np.abs(wrapped(np.diff(residual_rad, axis=axis))) > JUMP_RAD_PER_PX * stride
         jump |= np.abs(np.diff(log_brightness, axis=axis)) > JUMP_LOG_PER_PX * stride
         links.append(np.where(jump, np.float32(JUMP_WEIGHT), np.float32(1)))
     return links[0], links[1]
@@ -146,9 +151,8 @@ def by_shading_and_smoothness(question: Question, rig: Rig, settings: Settings) 
     cost = np.zeros_like(question.residual_rad)
     if settings.shading:
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.maximum(question.brightness, LEAST_BRIGHTNESS) / np.maximum(
-                question.irradiance, LEAST_BRIGHTNESS
-            )
+            expected = np.maximum(question.irradiance, LEAST_BRIGHTNESS)
+            ratio = np.maximum(question.brightness, LEAST_BRIGHTNESS) / expected
             misfit = np.abs(np.log(np.nan_to_num(ratio, nan=1.0))) / np.float32(settings.shading_spread)
         cost += np.float32(settings.shading_cost) * np.minimum(misfit, settings.shading_limit) * question.trust
     if settings.prior == "standoff":
@@ -169,33 +173,29 @@ def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Im
     """By how much the cost of the second-best order exceeds that of the choice, averaged over object pixels nearby."""
     if len(proof) == 1:
         return np.full(choice.shape, 2.0, np.float32)
-    own = of_choice(proof, choice)
     rivals = proof.copy()
     np.put_along_axis(rivals, choice[None].astype(np.intp), np.inf, axis=0)
-    gap = ((rivals.min(axis=0) - own) * question.inside).astype(np.float32)
+    gap = ((rivals.min(axis=0) - of_choice(proof, choice)) * question.inside).astype(np.float32)
     side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
+    maps = (gap, question.inside.astype(np.float32))
+    mean_gap, share = (cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps)
+    return mean_gap / np.maximum(share, 1e-3)
 
-    def mean(values: Image) -> NDArray:
-        return cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
 
-    return mean(gap) / np.maximum(mean(question.inside.astype(np.float32)), 1e-3)
+def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
+    """Maps (..., h', w') of every ``stride``-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
+    return coarse.repeat(stride, axis=-2).repeat(stride, axis=-1)[..., : shape[-2], : shape[-1]]
 
 
 def spread_over_pixels(
-    question: Question, choice: NDArray[np.int32], margin: Image, residual_at_zero_rad: NDArray
+    seen: Observation, chosen_rad: Image, margin: Image, inside: Mask
 ) -> tuple[NDArray[np.int32], Image]:
-    """Order of every pixel, int32 (H, W), and its margin: the order whose residual phase is nearest to that of the
-    grid point's choice.
-
-    ``residual_at_zero_rad`` (H, W): residual phase at order 0.
-    """
-    chosen_rad = of_choice(question.residual_rad, choice)
-    if question.inside.any() and not question.inside.all():
-        y, x = distance_transform_edt(~question.inside, return_distances=False, return_indices=True)
+    """Order of every pixel, int32 (H, W), and its margin: the order whose residual phase is nearest to that which was
+    chosen at the grid point; ``inside``: object on the grid."""
+    if inside.any() and not inside.all():
+        y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
         chosen_rad, margin = chosen_rad[y, x], margin[y, x]
-    height, width = residual_at_zero_rad.shape
-    residual_rad, fine_margin = (
-        grid_map.repeat(question.stride, axis=0).repeat(question.stride, axis=1)[:height, :width]
-        for grid_map in (chosen_rad, margin)
-    )
-    return np.rint((residual_rad - residual_at_zero_rad) / TAU).astype(np.int32), fine_margin
+    residual_at_zero_rad = seen.layer.residual_phase(seen.phase_rad, 0.0)
+    stride, shape = stride_of(seen.period_px), residual_at_zero_rad.shape
+    order = np.rint((repeated(chosen_rad, stride, shape) - residual_at_zero_rad) / TAU).astype(np.int32)
+    return order, repeated(margin, stride, shape)

@@ -1,47 +1,29 @@
-"""The route itself: fringe -> mask and phase -> candidates -> order -> calibration layer -> depth.
-
-Each stage is a function in a module of its own; this module passes arrays from stage to stage and times the stages.
-What depends on the rig alone is computed once.
-"""
+"""The route itself: fringe -> mask and phase -> candidates -> order -> calibration layer -> depth."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import confidence, orders, several_frames
-from fpp_ml_bench.baselines.phase_route.calibration_layer import (
-    CalibrationLayer,
-    Candidates,
-    Image,
-    Mask,
-    orders_in_range,
-    wrapped,
-)
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, phase_slopes
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, fringe_fit, phase_slopes
 from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, Crop, EmptyScene, object_region, refined, unlit
-from fpp_ml_bench.baselines.phase_route.observation import (
-    Capture,
-    Measurement,
-    Observation,
-    Reason,
-    Settings,
-    Stopwatch,
-)
+from fpp_ml_bench.baselines.phase_route.observation import Capture, Measurement, Observation, Reason, Settings, Watch
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
-MARGIN_PERIODS = 0.5
-"""Of the crop around the object: covers the windows, and the mask may grow into it."""
+MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
-FRINGE_NOISE = 0.03
-"""Uncertainty of a fringe extrapolated beyond its window, as a share of its brightness."""
-PAIR_ROUNDS = 2
-"""Fits to two frames over the small window."""
+HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
+FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
+PAIR_ROUNDS = 2  # fits to two frames over the small window
 
 
 class PhaseRoute:
@@ -50,8 +32,7 @@ class PhaseRoute:
     def __init__(
         self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness
     ) -> None:
-        self.rig, self.settings, self.chooser = rig, settings or Settings(), chooser
-        settings = self.settings
+        self.rig, self.settings, self.chooser = rig, (settings := settings or Settings()), chooser
         self.layer = CalibrationLayer.of(rig, settings.direction)
         self.period_px = rig.image_px_per_period(settings.direction)
         rig.check_sampling()
@@ -74,46 +55,44 @@ class PhaseRoute:
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask, phase and candidate orders of captured fringes; arguments as of `measure`."""
         images = self._checked(image)
-        watch = Stopwatch()
+        watch = Watch()
         background = self._scene.fit(images[0])
         watch.done("background")
         region = object_region(background, self.period_px) if mask is None else mask
         crop = self._crop(region)
         watch.done("mask")
-        capture = Capture(
-            self.rig, self.period_px, (region.shape[0], region.shape[1]), crop,
-            tuple(frame[crop].astype(np.float32) for frame in images), self.shifts_rad, background.at(crop),
-            self.layer.at(crop), watch,
-        )  # fmt: skip
-        given = None if mask is None else mask[crop]
-        mean_grey = None
+        greys = tuple(frame[crop].astype(np.float32) for frame in images)
+        plane, layer = replace(background, residual=background.residual[crop]), self.layer.at(crop)
+        capture = Capture(self.rig, self.period_px, images[0].shape, crop, greys, self.shifts_rad, plane, layer, watch)
         if capture.pixelwise:
+            given = None if mask is None else mask[crop]
             inside, fit, mean_grey = several_frames.pixel_fits(capture, self._scene, given, self._windows[1])
         else:
-            inside, fit = self._local_fits(capture, region[crop], given)
+            inside, fit = self._local_fits(capture, region[crop], given=mask is not None)
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - capture.layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
-        near, far = self.rig.working_range_mm
-        slack = self.settings.slack_mm
-        candidates = orders_in_range(capture.layer, phase, (near - slack, far + slack))
-        question = orders.question_of(capture, phase, fit, slopes, candidates, inside)
+        (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
+        candidates = capture.layer.orders_in_range(phase, (near - slack, far + slack))
         watch.done("candidates")
-        if mean_grey is None:
-            uncertainty = confidence.fit_uncertainty_rad(capture, fit, inside, slopes, self._windows[-1])
-        else:
+        if capture.pixelwise:
             uncertainty = confidence.pixel_uncertainty_rad(capture, fit, mean_grey)
+        else:
+            uncertainty = confidence.fit_uncertainty_rad(capture, fit, inside, slopes, self._windows[-1])
         clipped = confidence.clipped_share(capture, fit, inside, self._windows[1])
         watch.done("confidence")
         return Observation(
             **vars(capture), inside=inside, fit=fit, phase_rad=phase, slopes=slopes, uncertainty_rad=uncertainty,
-            clipped_share=clipped, candidates=candidates, question=question,
+            clipped_share=clipped, candidates=candidates,
         )  # fmt: skip
 
     def choose(self, observation: Observation) -> tuple[NDArray[np.int32], Image]:
         """The chooser's order of every pixel of the observation's crop (h, w), and its margin."""
-        choice, margin = self.chooser(observation.question, self.rig, self.settings)
-        return orders.spread_over_pixels(observation.question, choice, margin, observation.residual_at_zero_rad)
+        question = orders.question_of(observation)
+        observation.watch.done("candidates")
+        choice, margin = self.chooser(question, self.rig, self.settings)
+        chosen_rad = orders.of_choice(question.residual_rad, choice)
+        return orders.spread_over_pixels(observation, chosen_rad, margin, question.inside)
 
     def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
@@ -123,15 +102,15 @@ class PhaseRoute:
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
             raise DecodeError(
-                f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the "
-                f"object, got {np.shape(order)} and {np.shape(margin)}"
+                f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the object, got "
+                f"{np.shape(order)} and {np.shape(margin)}"
             )
         watch.done("order")
         depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
         depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
         watch.done("depth")
         error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
-        sureness = confidence.confidence_of(error_mm)
+        sureness = (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)
         reason = confidence.reasons(observation, margin, sureness, depth_mm, self.settings)
         watch.done("confidence")
 
@@ -175,31 +154,30 @@ class PhaseRoute:
         return images
 
     def _crop(self, region: Mask) -> Crop:
-        rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
-        if not rows.size:
+        left, top, width, height = cv2.boundingRect(region.astype(np.uint8))
+        if not width:
             return slice(0, 1), slice(0, 1)
         pad = int(np.ceil(MARGIN_PERIODS * self.period_px))
-        height, width = region.shape
-        return (
-            slice(max(int(rows[0]) - pad, 0), min(int(rows[-1]) + pad + 1, height)),
-            slice(max(int(columns[0]) - pad, 0), min(int(columns[-1]) + pad + 1, width)),
-        )
+        rows = slice(max(top - pad, 0), min(top + height + pad, region.shape[0]))
+        return rows, slice(max(left - pad, 0), min(left + width + pad, region.shape[1]))
 
-    def _local_fits(self, capture: Capture, region: Mask, mask: Mask | None) -> tuple[Mask, FringeFit]:
-        """Object mask (or ``mask``) and local fits of one or two frames; ``region``: where the first of them
-        differs."""
-        greys, background, watch = capture.greys, capture.background, capture.watch
-        if mask is not None:
-            fit = self._fit_phase(capture, mask)
-            watch.done("phase")
-            return mask, fit
-        dark = unlit(np.maximum.reduce(greys), background, self.period_px)
-        if len(greys) > 1:
-            region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
-        inside = region & ~dark
-        watch.done("mask")
-        fit = self._fit_phase(capture, inside)
+    def _local_fits(self, capture: Capture, region: Mask, given: bool) -> tuple[Mask, FringeFit]:
+        """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
+        where the first frame differs, or the ``given`` mask."""
+        greys, background, watch, inside = capture.greys, capture.background, capture.watch, region
+        if not given:
+            dark = unlit(np.maximum.reduce(greys), background, self.period_px)
+            if len(greys) > 1:
+                region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+            inside = region & ~dark
+            watch.done("mask")
+        phase = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
+        for window in self._windows[1:]:
+            fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, capture.shifts_rad)
+            phase = fit.phase_rad
         watch.done("phase")
+        if given:
+            return inside, fit
         if len(greys) == 1:
             bright = np.maximum(fit.brightness, 0)
             predicted = (background.ambient_grey + bright * (1 + np.cos(fit.phase_rad))).astype(np.float32)
@@ -208,9 +186,3 @@ class PhaseRoute:
         inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
         watch.done("mask")
         return inside, fit
-
-    def _fit_phase(self, capture: Capture, inside: Mask) -> FringeFit:
-        """The local fits to one or two frames."""
-        greys, ambient_grey = capture.greys, capture.background.ambient_grey
-        first = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
-        return several_frames.pair_fit(greys, capture.shifts_rad, inside, first, ambient_grey, self._windows[1:])

@@ -1,22 +1,16 @@
-"""Phase and object mask from two or more frames of one direction, with no or little averaging over pixels.
+"""Which frames to capture, and phase and object mask from two or more of one direction.
 
-From three frames on the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel and without any
-window, so nothing mixes two surfaces at a depth edge. Two frames leave one unknown too many, but a projected fringe
-goes down to black: its mean is its modulation plus the calibrated ambient light, and with that constraint two grey
-levels give brightness and phase. The sign stays open: the local fit over a window decides it. The result is poor where
-both grey levels are dark; a window of a few px bridges such pixels (`Settings.pair_window`).
-
-The object mask is then decided for every pixel alone: object pixels are those whose frames the empty scene does not
-explain.
+From three frames on the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so nothing mixes
+two surfaces at a depth edge, and object pixels are those whose frames the empty scene does not explain. Two frames
+leave one unknown too many, but a fringe goes down to black: its mean is its modulation plus ambient light. With
+that constraint a window of a few px (`Settings.pair_window`) is enough.
 """
-
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, fringe_fit
+from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, EmptyScene, closed, without_small
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Capture
 from fpp_ml_bench.decoding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
@@ -26,23 +20,19 @@ PAIR_DEGREES = 120.0
 """Phase shift between two frames: that of the first two of three, so that a third frame completes them."""
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
-PLANE_TOLERANCE_GREY = 0.3
-"""Error of the fitted empty scene, grey levels, beside noise."""
-SQUARE_PX = 5
-"""Side of the square over which faint differences are averaged."""
+PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
+SQUARE_PX = 5  # side of the square over which faint differences are averaged
 CLOSING_PERIODS = 0.2
 ALIKE = 0.2
 """Largest relative difference from the brightness around of an object pixel that the empty scene explains as well."""
-SPECK_PX = 6
-"""Smallest group of pixels that counts as object, and largest hole in it that is closed."""
+SPECK_PX = 6  # smallest group of pixels that counts as object, and largest hole in it that is closed
 DARK_SIGMAS = 4.0
 
 
 def steps_of(steps: int, frames: int) -> tuple[int, ...]:
     """Which of ``steps`` phase shifts ``frames`` of them are: 0 alone, 0 and a third, or `choose_steps`.
 
-    Raises `PredictionError` for a number of frames that can't be had.
-    """
+    Raises `PredictionError` for a number of frames that can't be had."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or not 1 <= frames <= steps:
         raise PredictionError(
             f"frames {frames!r}: expected a whole number from 1 to the {steps} sinusoids of a direction that were "
@@ -53,29 +43,15 @@ def steps_of(steps: int, frames: int) -> tuple[int, ...]:
     return choose_steps(steps, frames)
 
 
-def pair_fit(
-    greys: Sequence[Image], shifts_rad: Sequence[float], inside: Mask, carrier_rad: Image, ambient: float,
-    windows: Sequence[Window],
-) -> FringeFit:  # fmt: skip
-    """Fits of g (1 + cos(phase + shift)) to all ``greys`` at once; each window starts from the phase of the last."""
-    for window in windows:
-        fit = fringe_fit(greys, inside, carrier_rad, ambient, window, shifts_rad)
-        carrier_rad = fit.phase_rad
-    return fit
-
-
 def pixel_fits(capture: Capture, scene: EmptyScene, mask: Mask | None, window: Window) -> tuple[Mask, FringeFit, Image]:
     """Object mask (or ``mask``), phase and modulation of every pixel by N-step least squares, and its mean grey level.
-
-    The fit's weight is the share of ``window`` on the object, which the use of its slopes needs.
-    """
+    The fit's weight is the share of ``window`` on the object, which the use of its slopes needs."""
     fitted = wrapped_phase(capture.greys, capture.shifts_rad, np.float32)
     phase, modulation, mean = (np.asarray(values, np.float32) for values in fitted)
     capture.watch.done("phase")
     inside = lit_object(capture, scene, modulation) if mask is None else mask
     capture.watch.done("mask")
-    flat = np.zeros_like(phase)
-    return inside, FringeFit(phase, modulation, flat, flat, window.moment(inside.astype(np.float32))), mean
+    return inside, FringeFit(phase, modulation, window.moment(inside.astype(np.float32))), mean
 
 
 def differs(capture: Capture, scene: EmptyScene) -> Mask:

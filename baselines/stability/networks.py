@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks import build
 from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision
-from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings, TorchCalibrationLayer
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
 from fpp_ml_bench.errors import FppBenchError, PredictionError
@@ -239,10 +239,11 @@ def loss_gradient(name: str) -> Outcome:
 )  # fmt: skip
 def layer_gradient(direction: Direction) -> Outcome:
     rig = paper_rig(16)
-    layer = TorchCalibrationLayer(rig, direction, torch.float64)
-    total = torch.from_numpy(CalibrationLayer.of(rig, direction).absolute_phase(1800.0))  # type: ignore[arg-type]
+    exact = CalibrationLayer.of(rig, direction)  # type: ignore[arg-type]
+    layer = exact.tensors(torch.float64)
+    total = torch.from_numpy(exact.absolute_phase(1800.0))
     order = torch.floor(total / (2 * math.pi) + 0.5)
-    return directional(lambda phase: layer(phase, order).sum(), total - 2 * math.pi * order)
+    return directional(lambda phase: layer.depth_mm(phase, order).sum(), total - 2 * math.pi * order)
 
 
 @NETWORKS.family(

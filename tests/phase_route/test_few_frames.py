@@ -11,10 +11,9 @@ import pytest
 from synthetic import make
 
 from fpp_ml_bench.baselines.method import Method, load_method
-from fpp_ml_bench.baselines.phase_route.frame_choice import FewestFrames, levels_of
-from fpp_ml_bench.baselines.phase_route.local_fit import Window
-from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
-from fpp_ml_bench.baselines.phase_route.several_frames import pair_fit, steps_of
+from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, fringe_fit
+from fpp_ml_bench.baselines.phase_route.method import FewestFrames, PhaseMethod, levels_of
+from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -91,13 +90,20 @@ def test_two_frames_solve_the_tied_fringe() -> None:
     shifts = (0.0, 2 * np.pi / 3)
     greys = [(6 + bright * (1 + np.cos(phase + shift))).astype(np.float32) for shift in shifts]
     start = phase + np.float32(0.35) * np.cos(x / 9).astype(np.float32)
-    fit = pair_fit(greys, shifts, np.ones(phase.shape, bool), start, 6.0, [Window(1.5)] * 3)
+
+    def fitted(frames: int) -> FringeFit:
+        carrier = start
+        for _ in range(3):
+            fit = fringe_fit(greys[:frames], np.ones(phase.shape, bool), carrier, 6.0, Window(1.5), shifts[:frames])
+            carrier = fit.phase_rad
+        return fit
+
+    fit = fitted(2)
     inner = (slice(6, -6), slice(6, -6))
     assert np.abs(fit.phase_rad - phase)[inner].max() < 0.08  # where both are dark; a hundredth elsewhere
     assert np.abs(fit.phase_rad - phase)[inner].mean() < 0.01
     assert np.abs(fit.brightness - bright)[inner].mean() < 0.2
-    single = pair_fit(greys[:1], shifts[:1], np.ones(phase.shape, bool), start, 6.0, [Window(1.5)] * 3)
-    assert np.abs(single.phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
+    assert np.abs(fitted(1).phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, orders_in_range
-from fpp_ml_bench.baselines.phase_route.calibration_layer_torch import TorchCalibrationLayer
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.decoding import decode_stack, depth_from_coordinate
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -78,31 +77,29 @@ def test_layer_to_50_digits() -> None:
 
 
 def test_torch_equals_numpy_and_has_gradients(rig: Rig) -> None:
-    layer, module = CalibrationLayer.of(rig, "horizontal"), TorchCalibrationLayer(rig, "horizontal", torch.float64)
+    layer = CalibrationLayer.of(rig, "horizontal")
+    tensors = layer.tensors(torch.float64)
     absolute = layer.absolute_phase(depths(rig))
     order = np.floor(absolute / TAU)
     phase = torch.tensor(absolute - TAU * order)
-    depth_mm = module(phase, torch.tensor(order)).numpy()
+    depth_mm = tensors.depth_mm(phase, torch.tensor(order)).numpy()
     assert np.abs(depth_mm - layer.depth_mm(phase.numpy(), order)).max() < 1e-6
-    assert not list(module.parameters())
     checked = torch.zeros_like(phase, dtype=torch.bool)
     checked[::40, ::40] = True
 
     def depth_m(part: torch.Tensor) -> torch.Tensor:
-        return module(phase.masked_scatter(checked, part), torch.tensor(order))[checked] / 1000
+        return tensors.depth_mm(phase.masked_scatter(checked, part), torch.tensor(order))[checked] / 1000
 
     assert torch.autograd.gradcheck(depth_m, phase[checked].clone().requires_grad_(), eps=1e-6, atol=1e-6)
 
 
 def test_float32_keeps_a_hundredth_of_a_millimetre() -> None:
     rig = paper_rig(SIZE)
-    layer, module = CalibrationLayer.of(rig, "vertical"), TorchCalibrationLayer(rig, "vertical")
+    layer = CalibrationLayer.of(rig, "vertical")
     z = depths(rig)
     absolute = layer.absolute_phase(z)
     order = np.floor(absolute / TAU)
-    depth_mm = module(
-        torch.tensor(absolute - TAU * order, dtype=torch.float32), torch.tensor(order, dtype=torch.float32)
-    )
+    depth_mm = layer.tensors().depth_mm(torch.tensor(absolute - TAU * order).float(), torch.tensor(order).float())
     assert depth_mm.dtype == torch.float32
     assert np.abs(depth_mm.numpy() - z).max() < 2e-3
     # The same from the absolute phase in float32 loses most of that: why the residual form exists.
@@ -129,7 +126,7 @@ def test_layer_agrees_with_the_decoder_on_a_real_stack(opened: DatasetFolder) ->
 def test_candidates_are_the_orders_whose_depth_is_in_range(rig: Rig, direction: str) -> None:
     layer = CalibrationLayer.of(rig, direction)
     phase = np.random.default_rng(1).uniform(-np.pi, np.pi, (SIZE, SIZE))
-    candidates = orders_in_range(layer, phase, rig.working_range_mm)
+    candidates = layer.orders_in_range(phase, rig.working_range_mm)
     near, far = rig.working_range_mm
     middle = np.rint((layer.absolute_phase((near + far) / 2) - phase) / TAU)
     counted = np.zeros((SIZE, SIZE), int)
@@ -147,12 +144,12 @@ def test_a_range_of_less_than_a_period_leaves_none_or_one() -> None:
     rig = paper_rig(SIZE)
     layer = CalibrationLayer.of(rig, "vertical")
     phase = np.linspace(-np.pi, np.pi, SIZE * SIZE).reshape(SIZE, SIZE)
-    candidates = orders_in_range(layer, phase, (1750.0, 1850.0))
+    candidates = layer.orders_in_range(phase, (1750.0, 1850.0))
     assert set(np.unique(candidates.count)) == {0, 1}
     nearest = layer.depth_mm(phase, candidates.first)
     assert np.abs(nearest - 1800).max() < 200
-    unknown = orders_in_range(layer, np.full((SIZE, SIZE), np.nan), (1500.0, 2100.0))
-    assert unknown.most == 0
+    unknown = layer.orders_in_range(np.full((SIZE, SIZE), np.nan), (1500.0, 2100.0))
+    assert not unknown.count.any()
 
 
 def test_unknown_direction_is_refused() -> None:
