@@ -138,12 +138,11 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
             moved_surface = rendering.moved(surface, renderer.rig, direction, rendering.times(amplitude, field))
             lit = renderer.light(moved_surface)
             before = sample.scene.lit
-            phase, light = (
-                replace(phase_of, gain=light_of.gain, ambient=light_of.ambient)
-                for phase_of, light_of in ((lit, before), (before, lit))
+            phase, light, both = (
+                replace(sample.scene, lit=replace(one, gain=brightness.gain, ambient=brightness.ambient))
+                for one, brightness in ((lit, before), (before, lit), (lit, lit))
             )
-            scenes = (replace(sample.scene, lit=changed) for changed in (phase, light, lit))
-            yield Move(name, amplitude, *scenes, depth_mm=moved_surface.depth_mm(renderer.shape))
+            yield Move(name, amplitude, phase, light, both, moved_surface.depth_mm(renderer.shape))
 
 
 def _largest_shift_rad(

@@ -125,7 +125,7 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already. ``ValueError``: NaN or inf."""
+    """Write ``PROBE.json`` into ``folder``, which holds its pictures. Raises ``ValueError`` for NaN and infinity."""
     _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": asdict(finding)})
 
 
@@ -186,7 +186,7 @@ def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Findin
         (
             question, finding,
             [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
-            [(table.title, table.header, [list(map(cell_text, row)) for row in table.rows]) for table in finding.tables],
+            [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables],
         )
         for question, finding in findings
     ]  # fmt: skip

@@ -112,10 +112,8 @@ class Subject:
             yield names, self.input_batch([self.captured(dataset, name) for name in names])
 
     def represent(self, frames: Frames) -> NDArray[np.float32]:
-        """The network's output float32 (H, W) in its ``normalisation``.
-
-        Raises `DiagnosisError` without a network or its frame, and for an output of another shape or not finite.
-        """
+        """The network's output float32 (H, W) in its ``normalisation``. Raises `DiagnosisError` without a network, and
+        for an output of another shape or not finite."""
         network, _ = self.networks()
         batch = self.input_batch([frames])
         with torch.inference_mode():
