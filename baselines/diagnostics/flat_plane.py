@@ -1,15 +1,9 @@
 """The flat plane (paper Section 7.3): fringes on a surface without features, at a known distance and tilt.
 
 The paper shows a network a plane at 1.8 m in front of the background. Here planes have several distances and tilts,
-each in three outlines: filling the frame (no edge at all), a rectangle in front of the background (the paper's scene),
-and cut to the silhouettes of test objects (a familiar outline around an unfamiliar surface). They are rendered with the
-dataset's own light and sensor.
-
-A pixel of the plane is *collapsed to background* if its prediction is nearer to background than to any object: below
-0.1 for a normalised prediction (background is 0; the paper reports a mean of 0.088), below half of the near end of the
-working range for mm. The same share over the test objects is the control. For an individually normalised network the
-prediction is its own output, without range heads. A plane that faces the camera has no depth range (D_min = D_max), so
-normalised predictions are converted to mm by the mean D_min and D_max of the test split, the same for every plane.
+each filling the frame (no edge at all), as a rectangle in front of the background (the paper's scene), and cut to the
+silhouettes of test objects. For an individually normalised network the prediction is its own output, without range
+heads, converted to mm by the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
 """
 
 from collections import defaultdict
@@ -56,7 +50,7 @@ class Scale:
 
     @property
     def limit(self) -> float:
-        """Predictions below it are background."""
+        """Predictions below it, which are nearer to background than to any object, collapsed to background."""
         return NORMALISED_BACKGROUND if self.normalised else self.near_mm / 2
 
 

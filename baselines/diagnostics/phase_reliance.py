@@ -1,36 +1,9 @@
 """The phase-reliance score (own definition): how far a prediction follows the fringe's phase and nothing else, 0 to 1.
 
-For a sample, take its target pixels and all moves of the phase within the object. Brightness is kept, so only the phase
-changes. Let t be the change of depth that a move implies and d the change of the prediction. With sums over pixels and
-moves,
-
-    gain = <d, t> / <t, t>,  purity = <d, t> / sqrt(<d, d> <t, t>),
-    follows = purity min(gain, 1 / gain), 0 where <d, t> is not positive.
-
-It is 1 for a prediction that changes by exactly t, and 0 for a prediction that does not change or whose change is
-uncorrelated with t. Under other outlines, over the pixels whose phase stays the same,
-
-    change = rms(d) / rms(t),  ignores outline = 1 - change, 0 where the change is above 1,
-
-so it is 0 for a method that changes as much with the outline as it should with the phase. The sample's score is the
-product of the two. The method's score is the mean over samples, with a bootstrap over objects.
-
-The score uses the units of the prediction. For mm, t is in mm. A prediction normalised to the sample's depth range is
-compared with the truth normalised as in training, each scene by its own range, which a perfect network would predict.
-Where another outline changes that range, both a constant prediction and one that follows the range count as ignoring
-the outline.
-
-A pixel without a prediction (0 where the unit is mm) does not follow. A pixel that loses its prediction under another
-outline counts as a change by rms(t).
-
-*Order-free* values allow errors of whole periods: with p the phase of a prediction in mm, Dp its change and Dt the
-expected change,
-
-    follows = 1 - (1 - <cos(Dp - Dt)>) / (1 - <cos Dt>), at least 0,
-    change = rms(2 sin(Dp / 2)) / rms(2 sin(Dt / 2)),
-
-where <> is the mean. A single fringe does not determine its order, so a method that reads the phase may still be wrong
-by a period. A random prediction gets no credit: its <cos(Dp - Dt)> is 0, below that of a constant prediction.
+A sample's score is the product of `follows`, over moves of the phase within the object, and of 1 - `relative_change`
+under other outlines over the same phase, at least 0. The method's score is the mean over samples, with a bootstrap over
+objects. docs/reliance.md defines and explains it: units, missing predictions, and *order-free* values, which allow
+errors of whole periods.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -75,7 +48,8 @@ class Change:
 
 
 def follows(changes: Sequence[Change]) -> float | None:
-    """Purity times min(gain, 1 / gain) of the ``changes``; None where no change is expected."""
+    """Purity <d, t> / sqrt(<d, d> <t, t>) times min(gain, 1 / gain), gain = <d, t> / <t, t>, over all pixels of
+    ``changes``, with d the actual and t the expected change; 0 where <d, t> is not positive, None where t is 0."""
     product, actual, expected = (
         sum(float(getattr(change, a) @ getattr(change, b)) for change in changes)
         for a, b in (("actual", "expected"), ("actual", "actual"), ("expected", "expected"))
@@ -107,7 +81,8 @@ def relative_change(changes: Sequence[Change], unit: float) -> float | None:
 
 
 def order_free_follows(changes: Sequence[Change]) -> float | None:
-    """`follows` for changes of phase in rad, modulo whole periods; without a prediction the change is 0."""
+    """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 - <cos t>), at least 0.
+    A random prediction gets no credit: its <cos(d - t)> is 0, below that of a constant prediction."""
     actual, expected = (np.concatenate([getattr(change, key) for change in changes]) for key in ("actual", "expected"))
     standing_still = 1 - float(np.mean(np.cos(expected))) if expected.size else 0.0
     if standing_still <= 0:

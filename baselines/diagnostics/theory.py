@@ -1,14 +1,8 @@
-"""The paper's two theorems (Section 4.2), checked numerically; the subject is not used.
+"""The paper's two theorems (Section 4.2), checked numerically (docs/reliance.md); the subject is not used.
 
-*A single fringe does not determine depth.* Two surfaces are rendered, a whole period apart on every ray. Their frames
-of that direction are the same bytes, noise included. Brightness would distinguish them, so at each pixel the brighter
-surface gets a lower albedo, by the factor that inverse square law and tilt require. The ambient light is a constant of
-this benchmark and does not depend on the surface. The frames of the other direction differ.
-
-*An error of one period costs Z^2.* The depth error of an order error of one period, at distances from 0.3 to 10 m along
-the camera's axis, through the calibration layer. In closed form, with kappa = P / (f_p b) for the paper's rig, it is
-Z^2 kappa / (1 -+ Z kappa), one sign for each side. The exponent of Z is 2 +- Z kappa / (1 -+ Z kappa), and 2 only where
-Z kappa, the error relative to the disparity, is small.
+*A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
+direction, noise included, if at each pixel the brighter one gets a lower albedo. *An error of one period costs Z^2*,
+and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,19 +54,13 @@ class Twins:
     def to_dict(self) -> dict[str, Any]:
         inside = self.depths_mm[0] > 0
         distance_mm = np.abs(self.depths_mm[1] - self.depths_mm[0])[inside]
+        pairs = {"": self.frames, "_noiseless": self.noiseless, "_other_direction": self.other_frames}
         return {
-            "sample": self.sample,
-            "direction": self.direction,
-            "frame": self.frame,
-            "object_pixels": int(inside.sum()),
-            "differing_pixels": int(np.not_equal(*self.frames).sum()),
-            "differing_pixels_noiseless": int(np.not_equal(*self.noiseless).sum()),
-            "differing_pixels_other_direction": int(np.not_equal(*self.other_frames).sum()),
-            "depth_apart_mean_mm": float(distance_mm.mean()),
-            "depth_apart_least_mm": float(distance_mm.min()),
-            "paint_least": float(self.paint.min()),
-            "paint_most": float(self.paint.max()),
-        }
+            "sample": self.sample, "direction": self.direction, "frame": self.frame, "object_pixels": int(inside.sum()),
+            **{f"differing_pixels{which}": int(np.not_equal(*pair).sum()) for which, pair in pairs.items()},
+            "depth_apart_mean_mm": float(distance_mm.mean()), "depth_apart_least_mm": float(distance_mm.min()),
+            "paint_least": float(self.paint.min()), "paint_most": float(self.paint.max()),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
