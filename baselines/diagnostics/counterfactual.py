@@ -1,9 +1,7 @@
 """Counterfactual scenes (own probe): does the predicted depth follow the fringe's phase, or the object's outline?
 
-Each test object is rendered again with a single property changed: its phase but not its outline or brightness, its
-outline but not its phase, no fringes inside or outside it, fringes of the other direction or of another pitch. The
-correct change of depth is known for each scene. A score compares it with the change of the prediction
-(`fpp_ml_bench.baselines.diagnostics.phase_reliance`).
+Each test object is rendered again with a single property changed, so that the correct change of depth is known. A score
+compares it with the change of the prediction (`fpp_ml_bench.baselines.diagnostics.phase_reliance`).
 """
 
 from collections.abc import Sequence
@@ -72,21 +70,19 @@ def summary(reliance: Reliance) -> str:
     parts, (low, high), order_free = reliance.parts, reliance.interval, reliance.order_free_score
     interval = f" (95% interval {low:.2f} to {high:.2f})" if low is not None and high is not None else ""
     whole_periods = "" if order_free is None else f"; {order_free:.2f} ignoring errors of whole periods"
+    verdict = "It reads the phase in part." if reliance.score >= 0.1 else "It does not follow the phase."
     if reliance.score >= 0.5 or (order_free or 0.0) >= 0.5:
         verdict = "It reads the phase."
-    else:
-        verdict = "It reads the phase in part." if reliance.score >= 0.1 else "It does not follow the phase."
+    phase, light, outline = (
+        "not measured" if value is None else f"{value:.2f}"
+        for value in (parts.follows_phase, parts.follows_light, parts.change_outline)
+    )
     text = (
         f"Phase reliance {reliance.score:.2f}{interval}{whole_periods}. The prediction follows a change of phase "
-        f"within the object by {_two(parts.follows_phase)}, and a change of brightness alone by "
-        f"{_two(parts.follows_light)}. Another outline over the same phase changes it by {_two(parts.change_outline)} "
-        f"of what a moved phase does. {verdict}"
+        f"within the object by {phase}, and a change of brightness alone by {light}. Another outline over the same "
+        f"phase changes it by {outline} of what a moved phase does. {verdict}"
     )
     return f"{text} {warning}" if (warning := caution(reliance.objects)) else text
-
-
-def _two(value: float | None) -> str:
-    return "not measured" if value is None else f"{value:.2f}"
 
 
 def tables(reliance: Reliance, samples: Sequence[SampleReliance]) -> list[Table]:
@@ -94,8 +90,7 @@ def tables(reliance: Reliance, samples: Sequence[SampleReliance]) -> list[Table]
     shown = ("follows_phase", "follows_light", "change_outline")
     return [
         Table(
-            "Parts of the score, and further measurements",
-            ("Part", "Mean over samples"),
+            "Parts of the score, and further measurements", ("Part", "Mean over samples"),
             [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()],
         ),
         Table(
@@ -103,7 +98,7 @@ def tables(reliance: Reliance, samples: Sequence[SampleReliance]) -> list[Table]
             ("Sample", "Score", "Whole periods aside", "Follows phase", "Follows brightness", "Change by outline"),
             [(s.sample, s.score, s.order_free_score, *(s.parts.get(part) for part in shown)) for s in samples],
         ),
-    ]
+    ]  # fmt: skip
 
 
 def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Path) -> Figure:
@@ -161,9 +156,9 @@ def _figure_columns(
 ) -> list[tuple[str, Scene, NDArray[np.float64], NDArray[np.bool_]]]:
     """Scenes of the figure: title, scene, its true depth in the prediction's units, and the mask of that depth."""
     columns = [("as it is", scenes.original.scene, truth, target)]
+    first = {move.name: move for move in reversed(scenes.moves_within())}
     for name in ("ramp across", "ramp down", "bump"):
-        move = next((move for move in scenes.moves if move.name == name), None)
-        if move is not None:
+        if move := first.get(name):
             columns.append((f"phase moved:\n{name}", move.phase, predictor.true_depth(move.depth_mm, target), target))
     for change in scenes.outline_changes:
         mask = change.scene.mask & (change.depth_mm > 0)
@@ -184,13 +179,13 @@ def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance], folder: P
     """Bars of the parts, with a point for each sample."""
     sheet = Sheet(1, 2, 9.2, 3.2)
     sides = (
-        (_FOLLOWS, "Follows, share of the expected change", sheet.COLOURS["phase"], 1.05),
-        (_CHANGES, "Changes, relative to a moved phase", sheet.COLOURS["depth"], None),
+        (_FOLLOWS, "Follows, share of the expected change", "phase", 1.05),
+        (_CHANGES, "Changes, relative to a moved phase", "depth", None),
     )
     for axis, (names, title, colour, top) in zip(sheet.axes[0], sides, strict=True):
         measured = {key: name for key, name in names.items() if getattr(reliance.parts, key) is not None}
         values = [getattr(reliance.parts, key) for key in measured]
-        axis.bar(range(len(measured)), values, 0.6, color=colour, alpha=0.75)
+        axis.bar(range(len(measured)), values, 0.6, color=sheet.COLOURS[colour], alpha=0.75)
         for number, key in enumerate(measured):
             points = [value for sample in samples if (value := sample.parts.get(key)) is not None]
             axis.plot([number] * len(points), points, ".", color=sheet.INK, markersize=4, alpha=0.6)

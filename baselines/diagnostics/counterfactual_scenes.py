@@ -12,17 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
-    Field,
-    Projected,
-    Scene,
-    SceneRenderer,
-    Surface,
-    constant,
-    moved,
-    surface_of_sample,
-    times,
-)
+from fpp_ml_bench.baselines.diagnostics import scene_renderer as rendering
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import Field, Projected, Scene, SceneRenderer, Surface
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
@@ -57,20 +48,9 @@ class Original:
     depth_mm: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class OutlineChange:
-    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
-    after."""
-
-    name: str
-    scene: Scene
-    unchanged: NDArray[np.bool_]
-    depth_mm: NDArray[np.float64]
-
-
 def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Original:
     """``sample`` as the dataset shows it."""
-    record, surface = dataset.measured(sample), surface_of_sample(dataset, sample)
+    record, surface = dataset.measured(sample), rendering.surface_of_sample(dataset, sample)
     target = object_mask(dataset.depth_mm(sample))
     stream = (dataset.manifest.settings.get("seed", 0), record["object"], record["view"])
     scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), target, stream)
@@ -94,6 +74,17 @@ class Move:
 
 
 @dataclass(frozen=True)
+class OutlineChange:
+    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
+    after."""
+
+    name: str
+    scene: Scene
+    unchanged: NDArray[np.bool_]
+    depth_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Counterfactuals:
     """All scenes of a sample. ``direction``: fringe direction whose phase is moved."""
 
@@ -112,13 +103,8 @@ class Counterfactuals:
 def counterfactuals(
     dataset: DatasetFolder, renderer: SceneRenderer, sample: str, direction: Direction, outline_samples: Sequence[str]
 ) -> Counterfactuals:
-    """Every scene of ``sample``, which may be cut to the outlines of ``outline_samples``.
-
-    Raises `DiagnosisError` for a sample without an object.
-    """
+    """Every scene of ``sample``, which shows an object and may be cut to the outlines of ``outline_samples``."""
     sample_scene = original(dataset, renderer, sample)
-    if not sample_scene.target.any():
-        raise DiagnosisError(f"{dataset.path}: {sample} shows no object; choose samples that do")
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
     return Counterfactuals(
         original=sample_scene,
@@ -130,22 +116,15 @@ def counterfactuals(
     )
 
 
-# ---- the phase moved
-
-
 def fields(surface: Surface) -> dict[str, Field]:
     """Shifts of at most 1 over the object's bounding box: constant, ramps across and down, a bump in the centre."""
     middle = [(axis.min() + axis.max()) / 2 for axis in (surface.x, surface.y)]
     half = [max((axis.max() - axis.min()) / 2, 1e-9) for axis in (surface.x, surface.y)]
-
-    def scaled(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        return (x - middle[0]) / half[0], (y - middle[1]) / half[1]
-
     return {
-        "constant": constant,
-        "ramp across": lambda x, y: scaled(x, y)[0],
-        "ramp down": lambda x, y: scaled(x, y)[1],
-        "bump": lambda x, y: np.exp(-2.0 * (scaled(x, y)[0] ** 2 + scaled(x, y)[1] ** 2)),
+        "constant": rendering.constant,
+        "ramp across": lambda x, y: (x - middle[0]) / half[0],
+        "ramp down": lambda x, y: (y - middle[1]) / half[1],
+        "bump": lambda x, y: np.exp(-2.0 * (((x - middle[0]) / half[0]) ** 2 + ((y - middle[1]) / half[1]) ** 2)),
     }
 
 
@@ -156,17 +135,14 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
             amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
-            moved_surface = moved(surface, renderer.rig, direction, times(amplitude, field))
+            moved_surface = rendering.moved(surface, renderer.rig, direction, rendering.times(amplitude, field))
             lit = renderer.light(moved_surface)
             before = sample.scene.lit
-            yield Move(
-                name,
-                amplitude,
-                phase=replace(sample.scene, lit=replace(lit, gain=before.gain, ambient=before.ambient)),
-                light=replace(sample.scene, lit=replace(before, gain=lit.gain, ambient=lit.ambient)),
-                both=replace(sample.scene, lit=lit),
-                depth_mm=moved_surface.depth_mm(renderer.shape),
+            phase, light, both = (
+                replace(sample.scene, lit=replace(one, gain=brightness.gain, ambient=brightness.ambient))
+                for one, brightness in ((lit, before), (before, lit), (lit, lit))
             )
+            yield Move(name, amplitude, phase, light, both, moved_surface.depth_mm(renderer.shape))
 
 
 def _largest_shift_rad(
@@ -181,9 +157,6 @@ def _largest_shift_rad(
     with np.errstate(divide="ignore", invalid="ignore"):
         limits = np.where(shift > 0, high / shift, np.where(shift < 0, low / shift, np.inf))
     return float(np.clip(limits.min(), 0.0, LARGEST_SHIFT_RAD))
-
-
-# ---- another outline
 
 
 def outline_changes(
@@ -208,15 +181,14 @@ def outline_changes(
 
 def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_]) -> OutlineChange:
     """The surface extended beyond its outline with depth and brightness of the nearest target pixel."""
+    surface = sample.surface
     distance_px, nearest = distance_transform_edt(~sample.target, return_indices=True)
     ring = (distance_px > 0) & (distance_px <= GROWTH * np.sqrt(sample.target.sum())) & ~inside
     surface_index = np.full(renderer.shape, -1)
-    surface_index.ravel()[sample.surface.pixels] = np.arange(sample.surface.pixels.size)
+    surface_index.ravel()[surface.pixels] = np.arange(surface.pixels.size)
     source = surface_index[tuple(nearest)][ring]
     x, y = (rays[ring] for rays in renderer.rig.camera.rays())
-    both = sample.surface.joined(
-        Surface(np.flatnonzero(ring), x, y, sample.surface.depth_m[source], sample.surface.normals[source])
-    )
+    both = surface.joined(Surface(np.flatnonzero(ring), x, y, surface.depth_m[source], surface.normals[source]))
     gain = np.concatenate([sample.scene.lit.gain, sample.scene.lit.gain[source]])
     lit = replace(renderer.light(both), gain=gain)
     scene = replace(sample.scene, pixels=both.pixels.astype(np.uint32), lit=lit, mask=sample.target | ring)
@@ -224,10 +196,8 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
 
 
 def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
-    lookup = {
-        name: replace(entry, index=entry.index[selection], weight=entry.weight[selection])
-        for name, entry in lit.lookup.items()
-    }
+    lookup = {key: replace(one, index=one.index[selection], weight=one.weight[selection])
+              for key, one in lit.lookup.items()}  # fmt: skip
     return replace(lit, lookup=lookup, gain=lit.gain[selection], ambient=lit.ambient[selection])
 
 
@@ -250,9 +220,6 @@ def _ellipse(sample: Original) -> NDArray[np.bool_]:
     centre = points.mean(axis=0)
     radius = np.hypot((rows - centre[0]) / spread[0], (columns - centre[1]) / spread[1])
     return np.asarray(radius <= np.quantile(radius[sample.target], KEPT_SHARE))
-
-
-# ---- the scenes of a dataset
 
 
 def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple[str, list[str]]]:
@@ -289,10 +256,9 @@ class SceneSet:
     def scenes(self, direction: Direction) -> Iterator[Counterfactuals]:
         """The scenes of every sample, with the phase of ``direction`` moved."""
         for sample, outline_samples in self.samples:
-            key = sample, direction
-            scenes = self._stored.get(key) or counterfactuals(
-                self.dataset, self.renderer, sample, direction, outline_samples
-            )
+            scenes = self._stored.get((sample, direction))
+            if scenes is None:
+                scenes = counterfactuals(self.dataset, self.renderer, sample, direction, outline_samples)
             if self.dataset.size[1] <= _STORED_PX:
-                self._stored[key] = scenes
+                self._stored[sample, direction] = scenes
             yield scenes

@@ -59,12 +59,9 @@ def diagnose(
 ) -> Diagnosis:  # fmt: skip
     """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``.
 
-    A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the same. Findings of other
-    probes in ``out`` join the report. ``progress`` is called with a probe before it runs. ``command`` is quoted in the
-    report as the way to make it again.
-
-    Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes; findings made before an
-    error stay in ``out``.
+    A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the same; those of other
+    probes join the report. ``progress`` is called with a probe before it runs. ``command`` is quoted in the report.
+    Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes; earlier findings stay.
     """
     _prepare(out)
     selected = checked_names(probe_names)
@@ -79,25 +76,24 @@ def diagnose(
             results.append(ProbeResult(probe, *stored, reused=True))
         elif name in selected:
             started = perf_counter()
-            reason = probe.applies_to(subject)
-            if reason is None:
-                finding = probe.run(subject, dataset, settings, out, progress(probe))
-            else:
+            if reason := probe.applies_to(subject):
                 finding = Finding(probe.name, probe.title, "", skipped=reason)
+            else:
+                finding = probe.run(subject, dataset, settings, out, progress(probe))
             seconds = round(perf_counter() - started, 2)
             save_finding(out, key, finding, seconds)
             results.append(ProbeResult(probe, finding, seconds, reused=False))
     context = _context(subject, dataset, settings, command)
     findings = {
-        result.finding.probe: {
-            "title": result.finding.title, "summary": result.finding.summary, "skipped": result.finding.skipped,
-            "seconds": result.seconds, "values": result.finding.values,
+        one.finding.probe: {
+            "title": one.finding.title, "summary": one.finding.summary, "skipped": one.finding.skipped,
+            "seconds": one.seconds, "values": one.finding.values,
         }
-        for result in results
+        for one in results
     }  # fmt: skip
     content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
-    write_json(out / JSON_FILE, content)
-    html = report_page(context, [(result.probe.question, result.finding) for result in results], out)
+    _write_json(out / JSON_FILE, content)
+    html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
     write_atomically(out / REPORT_FILE, html.encode("utf-8"))
     return Diagnosis(tuple(results), out / REPORT_FILE, out / JSON_FILE)
 
@@ -107,8 +103,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     unknown name."""
     for name in names:
         if name not in PROBES:
-            suggestions = get_close_matches(name, PROBES, n=1)
-            hint = f"did you mean {suggestions[0]!r}? " if suggestions else ""
+            hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))
             raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
     return tuple(name for name in PROBES if not names or name in names)
 
@@ -130,16 +125,11 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` into ``folder`` atomically; its pictures must be there already.
-
-    Raises ``ValueError`` for a value that JSON can't hold, NaN and infinity included.
-    """
-    content = {"key": key, "seconds": round(seconds, 2), "finding": asdict(finding)}
-    write_json(folder / f"{finding.probe}.json", content)
+    """Write ``PROBE.json`` into ``folder``, which holds its pictures. Raises ``ValueError`` for NaN and infinity."""
+    _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": asdict(finding)})
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write ``content`` atomically. Raises ``ValueError`` for NaN and infinity."""
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(path, (text + "\n").encode("utf-8"))
 
@@ -190,44 +180,19 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
 
 
 def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
-    """The report: a section for each finding with its question and its pictures from ``folder``.
-
-    ``context`` is what ``diagnose.json`` says about subject, dataset, settings and machine.
-    """
-    subject, dataset, hardware = context["subject"], context["dataset"], context["hardware"]
-    (height, width), frames = dataset["size"], subject["frames_used"]
-    frames_text = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
-    settings = ", ".join(f"{name} {value}" for name, value in context["settings"].items() if value is not None)
-    software = ", ".join(f"{name} {value}" for name, value in context["software"].items())
-    body = render(
-        "fpp_ml_bench.baselines.diagnostics",
-        "diagnosis.html",
-        subject=subject,
-        intro=(
-            f"{subject['title']}; {frames_text} per sample, {subject['direction']} fringes",
-            f"{dataset['name']} ({dataset['fingerprint'][:8]}), {sum(dataset['samples'].values())} samples of "
-            f"{width} x {height} px",
-        ),
-        sections=[
-            {
-                "question": question,
-                "finding": finding,
-                "figures": [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
-                "tables": [
-                    (table.title, table.header, [[cell_text(cell) for cell in row] for row in table.rows])
-                    for table in finding.tables
-                ],
-            }
-            for question, finding in findings
-        ],
-        command=context["command"],
-        made=(
-            f"Settings: {settings}. Layers: {', '.join(subject['layers']) or 'none'}.",
-            f"{software}; {hardware['cpu']}, {hardware['cores']} cores.",
-            "All values are in diagnose.json beside this page.",
-        ),
-    )
-    return page(f"{subject['name']}: diagnosis", body, _STYLE, description=f"What {subject['name']} read")
+    """The report: a section for each finding with its question and its pictures from ``folder``; ``context`` is what
+    ``diagnose.json`` says about subject, dataset, settings and machine."""
+    sections = [
+        (
+            question, finding,
+            [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
+            [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables],
+        )
+        for question, finding in findings
+    ]  # fmt: skip
+    body = render("fpp_ml_bench.baselines.diagnostics", "diagnosis.html", sections=sections, **context)
+    name = context["subject"]["name"]
+    return page(f"{name}: diagnosis", body, _STYLE, description=f"What {name} read")
 
 
 def cell_text(cell: str | float | None) -> str:

@@ -1,20 +1,12 @@
 """What probes read from a frozen network: activations of its layers, the true maps as targets, and fits between them.
 
-*Linear probes* have a weight per channel, the same at every pixel (a 1 x 1 convolution), in closed form. The normal
-equations are accumulated batch by batch in float64: activations need not be in memory together, and the solution is the
-same as for all of them at once.
-
+*Linear probes* have a weight per channel, the same at every pixel (a 1 x 1 convolution), in closed form.
 *Four-convolution probes* are the paper's (Section 7.1), which gives only "four convolutional layers"; the other choices
-are ours. A 1 x 1 convolution to `WIDTH` channels, two of 3 x 3, and a 1 x 1 to the target, with ReLU between them. The
-first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is 5 x 5
-grid points. Activations and targets are resized to a grid of a quarter of the image's sides (`grid_step`): area means
-to shrink, bilinear to enlarge. Channels are standardised over the training samples. Adam with cosine decay. All probes
-learn from one forward pass of the network over a batch, so no activations are stored.
+are ours. Both learn from the network's batches as they come, so no activations are stored.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -48,15 +40,14 @@ BATCH = 4
 _LEAST_SPREAD = 1e-6
 
 
-# ---- activations
-
-
-@contextmanager
-def tapped(layers: dict[str, nn.Module], reduce: Callable[[Tensor], Tensor]) -> Iterator[dict[str, Tensor]]:
-    """Yields a dict that each forward pass in this block fills with ``reduce(activations)`` of every layer, by name.
+def activations_of(
+    network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor, reduce: Callable[[Tensor], Tensor], name: str
+) -> dict[str, Tensor]:
+    """``reduce(activations)`` of every layer by its name, of one forward pass of the network called ``name``.
 
     ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
-    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w).
+    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or that the pass does not reach, and
+    for an output that is not a depth map.
     """
     activations: dict[str, Tensor] = {}
 
@@ -71,25 +62,15 @@ def tapped(layers: dict[str, nn.Module], reduce: Callable[[Tensor], Tensor]) -> 
 
     handles = [layer.register_forward_hook(hook(name)) for name, layer in layers.items()]
     try:
-        yield activations
+        with torch.no_grad():
+            checked_output(network(fringe), fringe, name)
     finally:
         for handle in handles:
             handle.remove()
-
-
-def run_network(
-    network: nn.Module, fringe: Tensor, activations: dict[str, Tensor], layers: Sequence[str], name: str
-) -> None:
-    """One forward pass that fills ``activations`` of ``layers``.
-
-    Raises `DiagnosisError` for an output that is not a depth map, and for a layer that the pass does not reach.
-    """
-    activations.clear()
-    with torch.no_grad():
-        checked_output(network(fringe), fringe, name)
-    unreached = [layer for layer in layers if layer not in activations]
-    if unreached:
-        raise DiagnosisError(f"{name}: layer {unreached[0]!r} takes no part in a forward pass; leave it out")
+    for layer in layers:
+        if layer not in activations:
+            raise DiagnosisError(f"{name}: layer {layer!r} takes no part in a forward pass; leave it out")
+    return activations
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
@@ -102,22 +83,15 @@ def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
 
 
 def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, P, C).
-
-    A layer as large as the image is read directly; others are interpolated bilinearly between their pixel centres.
-    """
+    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, P, C); those of layers
+    of another size are interpolated bilinearly between their pixel centres."""
     if tuple(features.shape[2:]) == size:
         flat = features.flatten(2)
         return flat.gather(2, pixels[:, None].expand(-1, flat.shape[1], -1)).transpose(1, 2)
     rows, columns = pixels // size[1], pixels % size[1]
     position = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
-    values = functional.grid_sample(
-        features, position[:, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
+    values = functional.grid_sample(features, position[:, None], "bilinear", "border", align_corners=False)
     return values[:, :, 0].transpose(1, 2)
-
-
-# ---- targets
 
 
 @dataclass(frozen=True)
@@ -168,23 +142,18 @@ def normalised_depth(depth_mm: Image) -> Image:
 
 
 def edge_map(depth_mm: NDArray) -> Image:
-    """Sobel gradient magnitude (3 x 3) of a depth map (H, W), divided by its largest value: float32 in [0, 1].
-
-    The paper specifies only "Sobel filtering of the ground truth depth"; the scale is ours. A constant map gives 0.
-    """
+    """Sobel gradient magnitude (3 x 3) of a depth map (H, W), float32, divided by its largest value, a scale that the
+    paper leaves open; 0 for a constant map."""
     depth = np.asarray(depth_mm, dtype=np.float32)
-    across = cv2.Sobel(depth, cv2.CV_32F, 1, 0, ksize=3)
-    down = cv2.Sobel(depth, cv2.CV_32F, 0, 1, ksize=3)
+    across, down = (cv2.Sobel(depth, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1)))
     strength = np.hypot(across, down).astype(np.float32)
     top = float(strength.max())
     return (strength / top).astype(np.float32) if top > 0 else strength
 
 
 def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W).
-
-    The fraction is the wrapped phase / 2 pi and the integer part the fringe order. NaN where depth is 0.
-    """
+    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W):
+    its integer part is the fringe order, the fraction the wrapped phase / 2 pi. NaN where depth is 0."""
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) / MM_PER_M
     projected = rig.project(np.stack([x * z, y * z, z], axis=-1))
@@ -197,11 +166,8 @@ def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
     return periods_at(plane, rig, direction)
 
 
-# ---- linear probes
-
-
 class NormalEquations:
-    """Sums of products of N observations of C features and T targets."""
+    """Linear probes: sums of products of N observations of C features and T targets, float64."""
 
     def __init__(self, features: int, targets: int) -> None:
         self.count = 0
@@ -222,9 +188,7 @@ class NormalEquations:
 
     def solve(self, strength: float = RIDGE) -> Tensor:
         """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
-        the squared weights of standardised features; the bias is free. Raises ``ValueError`` without observations."""
-        if not self.count:
-            raise ValueError("a linear probe needs observations, but none were added")
+        the squared weights of standardised features; the bias is free."""
         mean, target = self.inner[-1, :-1] / self.count, self.target_mean
         spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
         scale = torch.where(spread > 1e-9 * (1 + mean.abs()), spread, torch.full_like(spread, torch.inf))
@@ -244,9 +208,6 @@ def _with_bias_column(features: Tensor) -> Tensor:
     return torch.cat([features.double(), torch.ones(len(features), 1, dtype=torch.float64)], dim=1)
 
 
-# ---- four-convolution probes
-
-
 def grid_step(size: tuple[int, int]) -> int:
     """Image px per grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
     return max(SHARE, -(-max(size) // LONGEST))
@@ -257,21 +218,17 @@ class Moments:
     """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
 
     count: int = 0
-    total: Tensor | None = None
-    square: Tensor | None = None
+    total: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
+    square: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
 
     def add(self, features: Tensor) -> None:
         """Add a batch (B, C, h, w)."""
         flat = features.double().transpose(0, 1).flatten(1)
-        total, square = flat.sum(1), flat.square().sum(1)
         self.count += flat.shape[1]
-        self.total = total if self.total is None else self.total + total
-        self.square = square if self.square is None else self.square + square
+        self.total, self.square = self.total + flat.sum(1), self.square + flat.square().sum(1)
 
     def standard(self) -> tuple[Tensor, Tensor]:
         """Mean and 1 / standard deviation, float32 (C,); 0 for a constant channel, which removes it."""
-        if self.total is None or self.square is None:
-            raise ValueError("moments need at least one batch")
         mean = self.total / self.count
         spread = (self.square / self.count - mean * mean).clamp(min=0).sqrt()
         factor = torch.where(spread > _LEAST_SPREAD * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
@@ -279,18 +236,17 @@ class Moments:
 
 
 class ConvolutionProbe(nn.Module):
-    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``."""
+    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
 
-    mean: Tensor
-    factor: Tensor
+    The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
+    5 x 5 grid points.
+    """
 
     def __init__(self, moments: Moments, target_mean: float) -> None:
         super().__init__()
-        mean, factor = moments.standard()
-        self.register_buffer("mean", mean[:, None, None])
-        self.register_buffer("factor", factor[:, None, None])
+        self.mean, self.factor = (part[:, None, None] for part in moments.standard())
         self.body = nn.Sequential(
-            nn.Conv2d(len(mean), WIDTH, 1), nn.ReLU(),
+            nn.Conv2d(len(self.mean), WIDTH, 1), nn.ReLU(),
             nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
             nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
             nn.Conv2d(WIDTH, 1, 1),
@@ -304,19 +260,16 @@ class ConvolutionProbe(nn.Module):
 
 
 class ProbeSet:
-    """Probes that are trained together, one for each (features, target, seed).
-
-    ``seeds``: number of seeds by features; ``steps``: number of training steps, for the learning rate schedule.
-    """
+    """Four-convolution probes that are trained together, one for each (features, target, seed), with Adam and cosine
+    decay over ``steps``. ``seeds``: number of seeds by features."""
 
     def __init__(
-        self, moments: Mapping[Source, Moments], target_means: Mapping[str, float], seeds: Mapping[Source, int],
-        steps: int,
-    ) -> None:  # fmt: skip
+        self, moments: Mapping[Source, Moments], means: Mapping[str, float], seeds: Mapping[Source, int], steps: int
+    ) -> None:
         self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
         for features in moments:
             for seed in range(seeds[features]):
-                for target, mean in target_means.items():
+                for target, mean in means.items():
                     with torch.random.fork_rng(devices=[]):
                         torch.manual_seed(seed)
                         self.probes[features, target, seed] = ConvolutionProbe(moments[features], mean)

@@ -1,17 +1,12 @@
 """The flat plane (paper Section 7.3): fringes on a surface without features, at a known distance and tilt.
 
 The paper shows a network a plane at 1.8 m in front of the background. Here planes have several distances and tilts,
-each in three outlines: filling the frame (no edge at all), a rectangle in front of the background (the paper's scene),
-and cut to the silhouettes of test objects (a familiar outline around an unfamiliar surface). They are rendered with the
-dataset's own light and sensor.
-
-A pixel of the plane is *collapsed to background* if its prediction is nearer to background than to any object: below
-0.1 for a normalised prediction (background is 0; the paper reports a mean of 0.088), below half of the near end of the
-working range for mm. The same share over the test objects is the control. For an individually normalised network the
-prediction is its own output, without range heads. A plane that faces the camera has no depth range (D_min = D_max), so
-normalised predictions are converted to mm by the mean D_min and D_max of the test split, the same for every plane.
+each filling the frame (no edge at all), as a rectangle in front of the background (the paper's scene), and cut to the
+silhouettes of test objects. For an individually normalised network the prediction is its own output, without range
+heads, converted to mm by the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,17 +50,13 @@ class Scale:
 
     @property
     def limit(self) -> float:
-        """Predictions below it are background."""
+        """Predictions below it, which are nearer to background than to any object, collapsed to background."""
         return NORMALISED_BACKGROUND if self.normalised else self.near_mm / 2
-
-    def collapsed(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(values < self.limit)
 
 
 @dataclass(frozen=True)
 class PlanePrediction:
-    """A plane and its prediction: name of the ``outline``, ``mask`` of the plane, ``depth_mm`` float64, ``prediction``
-    float32, and the rendered ``frame`` uint8, each (H, W)."""
+    """A plane and its prediction: name of the ``outline``, and maps (H, W) with the plane's ``mask`` and true depth."""
 
     outline: str
     distance_m: float
@@ -75,11 +66,6 @@ class PlanePrediction:
     frame: NDArray[np.uint8]
     prediction: NDArray[np.float32]
 
-    @property
-    def kind(self) -> str:
-        """`FRAME`, `RECTANGLE` or `SILHOUETTE`."""
-        return _kind(self.outline)
-
     def statistics(self, scale: Scale) -> dict[str, Any]:
         """Mean, standard deviation, least and largest prediction over ``mask``, in its own units and in mm, its error,
         and the share that collapsed to background; in float64."""
@@ -87,7 +73,7 @@ class PlanePrediction:
         millimetres = scale.mm(values)
         error = millimetres - self.depth_mm[self.mask]
         own = {"answer_mean": values.mean(), "answer_std": values.std(), "answer_min": values.min(),
-               "answer_max": values.max(), "collapsed_share": scale.collapsed(values).mean(),
+               "answer_max": values.max(), "collapsed_share": (values < scale.limit).mean(),
                "mean_mm": millimetres.mean(), "std_mm": millimetres.std(), "bias_mm": error.mean(),
                "mae_mm": np.abs(error).mean(), "true_std_mm": self.depth_mm[self.mask].std()}  # fmt: skip
         about = {"outline": self.outline, "distance_m": self.distance_m, "tilt_deg": list(self.tilt_deg)}
@@ -102,9 +88,8 @@ class FlatPlane(Probe):
     question = "Is a plane without features predicted at its distance, or as background?"
 
     def applies_to(self, subject: Subject) -> str | None:
-        if subject.uses_ground_truth_mask:
-            return f"{subject.name} uses the object's mask, and a plane that fills the frame has none."
-        return None
+        reason = f"{subject.name} uses the object's mask, and a plane that fills the frame has none."
+        return reason if subject.uses_ground_truth_mask else None
 
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
@@ -118,23 +103,18 @@ class FlatPlane(Probe):
         outlines = outlines_of(dataset, settings)
         total = len(DISTANCES_M) * len(TILTS_DEG) * (2 + len(outlines)) + len(outlines)
         planes: list[PlanePrediction] = []
-        for predicted in predict_planes(subject, renderer, outlines, settings.quick):
-            planes.append(predicted)
-            progress(len(planes), total, f"{predicted.outline}, {predicted.distance_m:g} m")
+        for one in predict_planes(subject, renderer, outlines, settings.quick):
+            planes.append(one)
+            progress(len(planes), total, f"{one.outline}, {one.distance_m:g} m")
         control = control_of(subject, dataset, renderer, list(outlines), scale)
-        rows = [predicted.statistics(scale) for predicted in planes]
-        return self.finding(
-            summary(rows, control, normalised),
-            {
-                "planes": rows, "objects": control, "range_mm": [low, high] if normalised else None,
-                "collapse_below": scale.limit,
-            },
-            tables(rows, control, normalised),
-            draw(planes, normalised, folder),
-        )  # fmt: skip
+        rows, range_mm = [one.statistics(scale) for one in planes], [low, high] if normalised else None
+        values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
+        figure = draw(planes, normalised, folder)
+        return self.finding(summary(rows, control, normalised), values, tables(rows, control, normalised), figure)
 
 
-def _kind(outline: str) -> str:
+def kind_of(outline: str) -> str:
+    """`FRAME`, `RECTANGLE` or `SILHOUETTE`."""
     return outline if outline in (FRAME, RECTANGLE) else SILHOUETTE
 
 
@@ -179,25 +159,23 @@ def control_of(
     subject: Subject, dataset: DatasetFolder, renderer: SceneRenderer, samples: list[str], scale: Scale
 ) -> dict[str, float]:
     """Share of the test objects' pixels that the subject predicts as background, and that are as near in truth."""
-    predicted_shares, true_shares = [], []
+    shares = []
     for sample in samples:
         unchanged = original(dataset, renderer, sample)
         frames = renderer.frames(unchanged.scene, subject.frames_used, subject.uses_ground_truth_mask)
         predicted = prediction_of(subject, frames)[unchanged.target].astype(np.float64)
-        predicted_shares.append(scale.collapsed(predicted).mean())
-        depth_mm = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
-        span = float(np.ptp(depth_mm)) or MM_PER_M
-        true_shares.append(scale.collapsed((depth_mm - depth_mm.min()) / span if scale.normalised else depth_mm).mean())
-    return {"collapsed_share": float(np.mean(predicted_shares)), "collapsed_share_true": float(np.mean(true_shares))}
-
-
-# ---- the report
+        true = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
+        if scale.normalised:
+            true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
+        shares.append([(values < scale.limit).mean() for values in (predicted, true)])
+    means = (float(np.mean(column)) for column in zip(*shares, strict=True))
+    return dict(zip(("collapsed_share", "collapsed_share_true"), means, strict=True))
 
 
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
     """The share that collapsed in each outline, the mean prediction at the paper's distance, and for mm the means at
     all distances."""
-    shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if _kind(row["outline"]) == kind]))
+    shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
               for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
     paper = next(row for row in facing if row["distance_m"] == PAPER_DISTANCE_M)
@@ -221,11 +199,9 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
 def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> list[Table]:
     """A row per plane; silhouettes as means over objects."""
     unit = "of range" if normalised else "mm"
-    poses: dict[tuple[Any, ...], list[Row]] = {}
-    for kind in (FRAME, RECTANGLE, SILHOUETTE):
-        for row in rows:
-            if _kind(row["outline"]) == kind:
-                poses.setdefault((kind, row["distance_m"], *row["tilt_deg"]), []).append(row)
+    poses = defaultdict(list)
+    for row in rows:  # frame, rectangle, then silhouettes
+        poses[kind_of(row["outline"]), row["distance_m"], *row["tilt_deg"]].append(row)
     lines = []
     for (kind, distance_m, across, down), same_pose in poses.items():
         name = f"{kind}, {len(same_pose)} objects" if kind == SILHOUETTE else kind
@@ -255,7 +231,7 @@ def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> F
     """The paper's figure, input and prediction, for each outline at 1.8 m, and the distribution of the predictions."""
     facing = [shown for shown in planes if shown.distance_m == PAPER_DISTANCE_M and shown.tilt_deg == (0.0, 0.0)]
     examples = [next(shown for shown in facing if shown.outline == kind) for kind in (FRAME, RECTANGLE)]
-    examples += [shown for shown in facing if shown.kind == SILHOUETTE][:1]
+    examples += [shown for shown in facing if kind_of(shown.outline) == SILHOUETTE][:1]
     sheet = Sheet(2, len(examples) + 1, 11, 5.2, width_ratios=[1] * len(examples) + [1.5])
     low, high = (-0.2, 1.2) if normalised else (0.0, 2400.0)
     unit, digits = ("share of range", 2) if normalised else ("mm", 0)
@@ -280,11 +256,10 @@ def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> F
 def _against_distance(sheet: Sheet, planes: Sequence[PlanePrediction], normalised: bool) -> None:
     axis, scale = sheet.axes[0, -1], 1.0 if normalised else 1000.0
     for kind, mark in ((FRAME, "o"), (RECTANGLE, "s"), (SILHOUETTE, "^")):
-        points: dict[float, list[float]] = {}
+        points = defaultdict(list)
         for shown in planes:
-            if shown.kind == kind and shown.tilt_deg == (0.0, 0.0):
-                mean = float(shown.prediction[shown.mask].mean(dtype=np.float64))
-                points.setdefault(shown.distance_m, []).append(mean)
+            if kind_of(shown.outline) == kind and shown.tilt_deg == (0.0, 0.0):
+                points[shown.distance_m].append(float(shown.prediction[shown.mask].mean(dtype=np.float64)))
         means = [np.mean(values) / scale for values in points.values()]
         axis.plot(list(points), means, mark + "-", markersize=5, label=kind)
     if not normalised:

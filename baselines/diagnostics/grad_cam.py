@@ -1,16 +1,14 @@
 """Grad-CAM for regression (paper Section 7.2): which pixels of a layer's activations change the mean prediction.
 
 The heatmap of a layer is the ReLU of its channels' sum, each weighted by the mean gradient of the mean predicted value
-with respect to that channel (Selvaraju et al. 2017; `captum.attr.LayerGradCam`), resized to the image. It is correlated
-(Pearson, over all pixels) with the edges of the true depth and with the local standard deviation of the fringe. As a
-sanity check (Adebayo et al. 2018) the heatmaps of random weights are measured too: if they are the same, the heatmap
-does not depend on what was learned.
+with respect to that channel (Selvaraju et al. 2017), resized to the image. It is correlated (Pearson, over all pixels)
+with the edges of the true depth and with the local standard deviation of the fringe. As a sanity check (Adebayo et al.
+2018) the heatmaps of random weights are measured too: if they are the same, they do not depend on what was learned.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,6 +18,7 @@ from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.fits import edge_map
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.probe import with_interval as text_of
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
@@ -111,28 +110,21 @@ def maps(
 
 def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[str, Image]:
     """Reference maps for the heatmaps of ``sample``: edges, and the fringe's local standard deviation."""
-    (index,) = subject.frames_used
-    depth_mm = dataset.depth_mm(sample)
-    frame = subject.as_input(dataset.frame(sample, index), depth_mm)
+    frame = subject.captured(dataset, sample)[subject.frames_used[0]]
     # Image px per fringe period at the standoff; of horizontal fringes where the frame has no direction.
     period_px = dataset.rig.image_px_per_period("vertical" if subject.direction == "vertical" else "horizontal")
-    return {EDGES: edge_map(depth_mm), FRINGES: fringe_variation(frame, period_px)}
+    return {EDGES: edge_map(dataset.depth_mm(sample)), FRINGES: fringe_variation(np.asarray(frame), period_px)}
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
     """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32.
 
-    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the image is mirrored at its
-    border.
+    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored.
     """
     side = max(3, 2 * int(np.ceil((period_px - 1) / 2)) + 1)
     image = np.asarray(grey, dtype=np.float64)
-    mean = cv2.blur(image, (side, side), borderType=cv2.BORDER_REFLECT_101)
-    square = cv2.blur(image * image, (side, side), borderType=cv2.BORDER_REFLECT_101)
+    mean, square = (cv2.blur(of, (side, side), borderType=cv2.BORDER_REFLECT_101) for of in (image, image * image))
     return np.sqrt(np.maximum(square - mean * mean, 0)).astype(np.float32)
-
-
-# ---- correlations
 
 
 def correlation(first: NDArray, second: NDArray) -> float | None:
@@ -144,26 +136,22 @@ def correlation(first: NDArray, second: NDArray) -> float | None:
     return None if sizes <= _LEAST_SPREAD * min(1.0, scale) else float(np.clip(a @ b / sizes, -1, 1))
 
 
-@dataclass(frozen=True)
-class Mean:
-    """Mean of ``count`` correlations and its 95% interval, resampled over objects; None without a correlation."""
+class Mean(NamedTuple):
+    """Mean ``r`` of some ``samples``' correlations and its 95% interval, resampled over objects; None without one."""
 
     r: float | None
     interval: Interval | None
-    count: int
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"r": self.r, "interval": self.interval, "samples": self.count}
+    samples: int
 
 
-@dataclass
 class Correlations:
-    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference map; one value per sample."""
+    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference map; one value per sample, whose
+    objects are ``objects``."""
 
-    layers: tuple[str, ...]
-    objects: list[str]
-    values: dict[tuple[str, str, str], list[float | None]] = field(default_factory=dict)
-    edges_with_fringes: list[float | None] = field(default_factory=list)
+    def __init__(self, layers: Sequence[str], objects: list[str]) -> None:
+        self.layers, self.objects = tuple(layers), objects
+        self.values: dict[tuple[str, str, str], list[float | None]] = {}
+        self.edges_with_fringes: list[float | None] = []
 
     def add(self, weights: str, layer: str, reference: str, r: float | None) -> None:
         """Append the next sample's ``r`` of a layer with a reference; `OWN` is the trained network's heatmap."""
@@ -196,20 +184,20 @@ class Correlations:
 
     def to_dict(self) -> dict[str, Any]:
         """For ``diagnose.json``."""
-
-        def of(layer: str) -> dict[str, Any]:
-            trained = {target: self.mean(layer, target).to_dict() for target in (EDGES, FRINGES)}
-            random = {target: self.mean(layer, target, trained=False).to_dict() for target in (EDGES, FRINGES, OWN)}
-            return {**trained, "ratio": ratio(self.mean(layer, EDGES).r, self.mean(layer, FRINGES).r), "random": random}
-
-        edges, fringes = self.average(EDGES), self.average(FRINGES)
-        random = {target: self.average(target, trained=False).to_dict() for target in (EDGES, FRINGES, OWN)}
+        layers, average = {}, {target: self.average(target) for target in (EDGES, FRINGES)}
+        for layer in self.layers:
+            trained = {target: self.mean(layer, target) for target in (EDGES, FRINGES)}
+            random = {target: self.mean(layer, target, trained=False)._asdict() for target in (EDGES, FRINGES, OWN)}
+            layers[layer] = {**_with_ratio(trained), "random": random}
+        random = {target: self.average(target, trained=False)._asdict() for target in (EDGES, FRINGES, OWN)}
         return {
-            "layers": {layer: of(layer) for layer in self.layers},
-            "average": {EDGES: edges.to_dict(), FRINGES: fringes.to_dict(), "ratio": ratio(edges.r, fringes.r)},
-            "random_average": random,
-            "edges_with_fringes": self.references.to_dict(),
-        }
+            "layers": layers, "average": _with_ratio(average), "random_average": random,
+            "edges_with_fringes": self.references._asdict(),
+        }  # fmt: skip
+
+
+def _with_ratio(means: dict[str, Mean]) -> dict[str, Any]:
+    return {**{key: mean._asdict() for key, mean in means.items()}, "ratio": ratio(means[EDGES].r, means[FRINGES].r)}
 
 
 def ratio(edges: float | None, fringes: float | None) -> float | None:
@@ -228,12 +216,11 @@ def measure(
 ) -> Correlations:  # fmt: skip
     """Correlations of every heatmap with both references, and of random weights' heatmaps with the trained ones."""
     network, untrained = subject.networks()
-    correlations = Correlations(tuple(layers), [split_sample_name(name)[0] for name in samples])
+    correlations = Correlations(layers, [split_sample_name(name)[0] for name in samples])
     total, done = len(samples) * (1 + seeds), 0
     random_networks = [untrained(seed) for seed in range(seeds)]
-    size = subject.batch_size
-    for start in range(0, len(samples), size):
-        batch_samples = samples[start : start + size]
+    for start in range(0, len(samples), subject.batch_size):
+        batch_samples = samples[start : start + subject.batch_size]
         trained_maps = dict(maps(subject, network, dataset, batch_samples, layers))
         reference_maps = {sample: references(subject, dataset, sample) for sample in batch_samples}
         for sample in batch_samples:
@@ -253,23 +240,18 @@ def measure(
     return correlations
 
 
-# ---- the report
-
-
 def summary(correlations: Correlations) -> str:
     """The result in a few sentences."""
     edges, fringes = correlations.average(EDGES), correlations.average(FRINGES)
-    random = correlations.average(EDGES, trained=False), correlations.average(FRINGES, trained=False)
+    random = [text_of(correlations.average(target, trained=False).r, None) for target in (EDGES, FRINGES)]
     own = correlations.average(OWN, trained=False).r
     text = (
-        f"Over the layers, heatmaps correlate with edges by {_r(edges.r)} and with fringe variation by "
-        f"{_r(fringes.r)}, {ratio_text(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random weights: "
-        f"{_r(random[0].r)} and {_r(random[1].r)}; edges and fringe variation themselves correlate by "
-        f"{_r(correlations.references.r)}, because both are strong where the object is."
+        f"Over the layers, heatmaps correlate with edges by {text_of(edges.r, None)} and with fringe variation by "
+        f"{text_of(fringes.r, None)}, {ratio_text(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random "
+        f"weights: {random[0]} and {random[1]}; edges and fringe variation themselves correlate by "
+        f"{text_of(correlations.references.r, None)}, because both are strong where the object is."
     )
-    if own is not None:
-        text += f" Random weights' heatmaps agree with the trained ones by {own:.2f}."
-    return text
+    return text if own is None else f"{text} Random weights' heatmaps agree with the trained ones by {own:.2f}."
 
 
 def ratio_text(edges: Mean, fringes: Mean) -> str:
@@ -277,9 +259,8 @@ def ratio_text(edges: Mean, fringes: Mean) -> str:
     quotient, span = ratio(edges.r, fringes.r), fringes.interval
     if quotient is None:
         return "no ratio"
-    if span is not None and span[0] <= 0 <= span[1]:
-        return f"ratio {quotient:.2f}, which says nothing: its divisor can't be told from 0"
-    return f"ratio {quotient:.2f}"
+    note = ", which says nothing: its divisor can't be told from 0"
+    return f"ratio {quotient:.2f}{note if span is not None and span[0] <= 0 <= span[1] else ''}"
 
 
 def tables(correlations: Correlations) -> list[Table]:
@@ -289,25 +270,23 @@ def tables(correlations: Correlations) -> list[Table]:
     for layer in correlations.layers:
         renamed = has_paper_layers and PAPER_LAYERS[layer] != layer
         name = f"{layer} (paper's {PAPER_LAYERS[layer]})" if renamed else layer
-        pairs[name] = correlations.mean(layer, EDGES), correlations.mean(layer, FRINGES)
+        pairs[name] = [correlations.mean(layer, target) for target in (EDGES, FRINGES)]
     for name, trained in (("Average", True), ("Average, random weights", False)):
-        pairs[name] = correlations.average(EDGES, trained), correlations.average(FRINGES, trained)
-    rows = [(name, _cell(edges), _cell(fringes), ratio(edges.r, fringes.r)) for name, (edges, fringes) in pairs.items()]
-    check = [
-        (layer, *(_cell(correlations.mean(layer, target, trained=False)) for target in (EDGES, FRINGES, OWN)))
-        for layer in correlations.layers
-    ]
+        pairs[name] = [correlations.average(target, trained) for target in (EDGES, FRINGES)]
+    rows = [(name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()]
+    random = {layer: [correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN)]
+              for layer in correlations.layers}  # fmt: skip
     return [
         Table(
             f"Correlation of Grad-CAM with edges and fringes, {len(correlations.objects)} test samples (the paper's "
             "table)",
             ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "Ratio"),
-            [*rows, ("Edges with fringes", _cell(correlations.references), None, None)],
+            [*rows, ("Edges with fringes", text_of(*correlations.references[:2]), None, None)],
         ),
         Table(
             "Sanity check: the same with random weights",
             ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "r(CAM, trained CAM)"),
-            check,
+            [(layer, *(text_of(*mean[:2]) for mean in means)) for layer, means in random.items()],
         ),
     ]
 
@@ -320,8 +299,7 @@ def _draw_bars(correlations: Correlations, folder: Path) -> Figure:
         (EDGES, False, "random", "edges, random weights"), (FRINGES, False, "raw", "fringes, random weights"),
     )  # fmt: skip
     for number, (target, trained, colour, label) in enumerate(series):
-        means = [correlations.mean(layer, target, trained) for layer in layers]
-        bars = [(mean.r, mean.interval) for mean in means]
+        bars = [correlations.mean(layer, target, trained)[:2] for layer in layers]
         sheet.bars(axis, positions + (number - 1.5) * _BAR, bars, width=_BAR, color=sheet.COLOURS[colour], label=label)
     axis.axhline(0, color=sheet.INK, linewidth=0.8)
     axis.set_xticks(positions, layers, rotation=30 if len(layers) > 8 else 0)
@@ -337,28 +315,15 @@ def _draw_heatmaps(
     picks = sorted({round(share * (len(samples) - 1)) for share in np.linspace(0, 1, _EXAMPLES)})
     examples = [samples[pick] for pick in picks]
     sheet = Sheet(len(examples), 3 + len(layers), 1.25 * (3 + len(layers)), 1.4 * len(examples))
-    (index,), titles = subject.frames_used, ["input", "edges", "fringes", *layers]
     sample_maps = maps(subject, subject.networks()[0], dataset, examples, layers)
+    titles = ["input", "edges", "fringes", *layers]
     for row, (sample, heat) in zip(sheet.axes, sample_maps, strict=True):
-        frame = subject.as_input(dataset.frame(sample, index), dataset.depth_mm(sample))
-        edges, fringes = references(subject, dataset, sample).values()
-        sheet.picture(row[0], frame, titles[0], "gray", 0, 255)
-        sheet.picture(row[1], edges, titles[1], "gray", 0, edges.max())
-        sheet.picture(row[2], fringes, titles[2], "gray", 0, fringes.max())
+        frame = np.asarray(subject.captured(dataset, sample)[subject.frames_used[0]])
+        images = [frame, *references(subject, dataset, sample).values(), *(heat[layer] for layer in layers)]
+        for number, (axis, image, title) in enumerate(zip(row, images, titles, strict=True)):
+            top = 255 if not number else float(image.max()) or (1.0 if number > 2 else 0.0)
+            sheet.picture(axis, image, title, "gray" if number < 3 else "inferno", 0, top)
         row[0].set_ylabel(sample, fontsize=7)
-        for axis, layer, title in zip(row[3:], layers, titles[3:], strict=True):
-            sheet.picture(axis, heat[layer], title, "inferno", 0, float(heat[layer].max()) or 1.0)
         titles = [""] * len(titles)  # only above the first row
     title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
     return sheet.save(folder, "grad_cam_heatmaps.png", title, alt)
-
-
-def _r(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _cell(mean: Mean) -> str:
-    if mean.r is None:
-        return "-"
-    span = "" if mean.interval is None else f" ({mean.interval[0]:.3f} to {mean.interval[1]:.3f})"
-    return f"{mean.r:.3f}{span}"

@@ -5,7 +5,6 @@ network with random weights, and to controls: the raw input and the pixel's posi
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +41,8 @@ SPATIAL = ("edges", "depth")
 
 Errors = dict[tuple[str, str], list[float]]
 """Squared error of each sample, by layer and target."""
+Drawn = dict[bool, tuple[Tensor, Tensor]]
+"""Pixels of a sample (P,) and their target values (P, T), over the image (False) and within the object (True)."""
 
 
 class LinearProbing(Probe):
@@ -75,13 +76,7 @@ class LinearProbing(Probe):
         }  # fmt: skip
         return self.finding(
             linear_report.summary(linear, spatial),
-            {
-                "protocol": protocol,
-                "four_convolutions": linear_report.to_dict(spatial),
-                "ratio": linear_report.mean_ratio(spatial[TRAINED]),
-                "ratio_of_means": linear_report.ratio_of_means(spatial[CONTROLS][fits.INPUT]),
-                "linear": linear_report.to_dict(linear),
-            },
+            {"protocol": protocol, **linear_report.values(linear, spatial)},
             linear_report.tables(linear, spatial),
             linear_report.draw_four_convolutions(spatial, folder),
             linear_report.draw_one_by_one(linear, folder),
@@ -89,26 +84,16 @@ class LinearProbing(Probe):
 
 
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
-    """The samples of ``split`` that show an object. Raises `DiagnosisError` where there is none."""
     names = [name for name in dataset.samples(split) if object_mask(dataset.depth_mm(name)).any()]
     if not names:
         raise DiagnosisError(f"{dataset.path}: split {split} holds no object; probes need training and validation data")
     return names
 
 
-@dataclass
-class _Drawn:
-    """Pixels of a sample (P,) and their target values (P, T), over the image (False) and within the object (True)."""
-
-    pixels: dict[bool, Tensor]
-    targets: dict[bool, Tensor]
-
-
 class Pixels:
     """Pixels drawn from each sample, the same for every network, and cached.
 
-    ``columns``: for each target its set (over the image or within the object) and its columns in that set's
-    ``targets``.
+    ``columns``: for each target its set (over the image or within the object) and its columns in that set's targets.
     """
 
     def __init__(self, subject: Subject, dataset: DatasetFolder) -> None:
@@ -120,25 +105,24 @@ class Pixels:
                 fields = self.fields[target in INSIDE]
                 self.columns[target] = target in INSIDE, slice(len(fields), len(fields) + len(names))
                 fields += names
-        self._drawn: dict[str, _Drawn] = {}
+        self._drawn: dict[str, Drawn] = {}
 
-    def of(self, sample: str) -> _Drawn:
+    def of(self, sample: str) -> Drawn:
         if sample not in self._drawn:
-            self._drawn[sample] = self._draw(sample)
+            dataset, split = self.dataset, self.dataset.split_of_sample(sample)
+            rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
+            direction = "horizontal" if self.direction == "both" else self.direction
+            truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
+            inside, size = np.flatnonzero(truth.inside), truth.inside.size
+            pixels = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
+            self._drawn[sample] = {
+                key: (
+                    torch.from_numpy(pixels[key]),
+                    torch.from_numpy(np.stack([getattr(truth, name).ravel()[pixels[key]] for name in fields], axis=1)),
+                )
+                for key, fields in self.fields.items()
+            }
         return self._drawn[sample]
-
-    def _draw(self, sample: str) -> _Drawn:
-        dataset, split = self.dataset, self.dataset.split_of_sample(sample)
-        rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
-        direction = "horizontal" if self.direction == "both" else self.direction
-        ground_truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
-        inside, size = np.flatnonzero(ground_truth.inside), ground_truth.inside.size
-        drawn = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
-        targets = {
-            key: np.stack([getattr(ground_truth, name).ravel()[drawn[key]] for name in fields], axis=1)
-            for key, fields in self.fields.items()
-        }
-        return _Drawn(*({key: torch.from_numpy(part[key]) for key in part} for part in (drawn, targets)))
 
     def errors_of(self, layer: str, inside: bool, errors: Tensor) -> Iterator[tuple[tuple[str, str], float]]:
         """Layer, target, and mean square of one sample's ``errors`` (P, T), for every target of its set."""
@@ -147,22 +131,19 @@ class Pixels:
                 yield (layer, target), float(errors[:, columns].square().mean())
 
 
-@dataclass
 class Experiment:
     """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``.
 
     ``tick`` is called with the number of samples just processed and the activity.
     """
 
-    subject: Subject
-    dataset: DatasetFolder
-    train: Sequence[str]
-    validation: Sequence[str]
-    tick: Callable[[int, str], None]
-
-    def __post_init__(self) -> None:
-        self.pixels = Pixels(self.subject, self.dataset)
-        self.objects = [split_sample_name(name)[0] for name in self.validation]
+    def __init__(
+        self, subject: Subject, dataset: DatasetFolder, train: Sequence[str], validation: Sequence[str],
+        tick: Callable[[int, str], None],
+    ) -> None:  # fmt: skip
+        self.subject, self.dataset, self.train, self.validation, self.tick = subject, dataset, train, validation, tick
+        self.pixels = Pixels(subject, dataset)
+        self.objects = [split_sample_name(name)[0] for name in validation]
 
     def linear_scores(self, seeds: int) -> Scores:
         """Scores of the linear probes: of the network, of ``seeds`` untrained copies, and of the controls."""
@@ -179,10 +160,9 @@ class Experiment:
         return scores
 
     def linear_errors(self, network: nn.Module, controls: bool = False) -> tuple[Errors, dict[str, list[float]]]:
-        """Errors of the 1 x 1 probes of ``network``'s layers.
+        """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target.
 
-        The second value holds the errors of predicting the mean, by target. With ``controls`` the raw input and the
-        position are probed like layers.
+        With ``controls`` the raw input and the position are probed like layers.
         """
         equations: dict[tuple[str, bool], fits.NormalEquations] = {}
         for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
@@ -196,14 +176,11 @@ class Experiment:
                 difference = fits.apply(weights[layer, key], sample_features) - sample_targets.double()
                 for name, error in self.pixels.errors_of(layer, key, difference):
                     errors.setdefault(name, []).append(error)
-        means: dict[bool, Tensor] = {}
-        for (_, key), normal_equations in equations.items():
-            means.setdefault(key, normal_equations.target_mean)
+        means = {key: normal_equations.target_mean for (_, key), normal_equations in reversed(equations.items())}
         reference: dict[str, list[float]] = {}
         for sample in self.validation:
-            for key, mean in means.items():
-                difference = self.pixels.of(sample).targets[key].double() - mean
-                for (_, target), error in self.pixels.errors_of("", key, difference):
+            for key, (_, targets) in self.pixels.of(sample).items():
+                for (_, target), error in self.pixels.errors_of("", key, targets.double() - means[key]):
                     reference.setdefault(target, []).append(error)
         return errors, reference
 
@@ -212,23 +189,23 @@ class Experiment:
     ) -> Iterator[tuple[str, bool, Tensor, Tensor]]:
         """Layer, set, features (B, P, C) and targets (B, P, T)."""
         layers, size = self.subject.layers_of(network), self.subject.image_size
-        drawn: dict[bool, Tensor] = {}
+        for names, fringe in self.subject.batches(self.dataset, samples):
+            batch = [self.pixels.of(name) for name in names]
+            pixels, targets = (
+                {key: torch.stack([drawn[key][part] for drawn in batch]) for key in (False, True)} for part in (0, 1)
+            )
 
-        def take(features: Tensor) -> Tensor:
-            return torch.stack([fits.at_pixels(features, pixels, size) for pixels in drawn.values()])
+            def take(features: Tensor, pixels: dict[bool, Tensor] = pixels) -> Tensor:
+                return torch.stack([fits.at_pixels(features, chosen, size) for chosen in pixels.values()])
 
-        with fits.tapped(layers, take) as activations:
-            for names, fringe in self.subject.batches(self.dataset, samples):
-                batch = [self.pixels.of(name) for name in names]
-                drawn.update({key: torch.stack([sample.pixels[key] for sample in batch]) for key in (False, True)})
-                fits.run_network(network, fringe, activations, list(layers), self.subject.name)
-                if controls:
-                    activations[fits.INPUT] = take(fringe)
-                    activations[POSITION] = torch.stack([_position(pixels, size) for pixels in drawn.values()])
-                for layer, of_sets in activations.items():
-                    for key, features in zip(drawn, of_sets, strict=True):
-                        yield layer, key, features, torch.stack([sample.targets[key] for sample in batch])
-                self.tick(len(names), f"{activity} linear probes")
+            activations = fits.activations_of(network, layers, fringe, take, self.subject.name)
+            if controls:
+                activations[fits.INPUT] = take(fringe)
+                activations[POSITION] = torch.stack([_position(chosen, size) for chosen in pixels.values()])
+            for layer, of_sets in activations.items():
+                for key, features in zip(pixels, of_sets, strict=True):
+                    yield layer, key, features, targets[key]
+            self.tick(len(names), f"{activity} linear probes")
 
     def spatial_scores(self, seeds: int, epochs: int) -> Scores:
         """Scores of the four-convolution probes: of the network, of an untrained copy, and of the raw input."""
@@ -246,10 +223,10 @@ class Experiment:
     def spatial_errors(
         self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
     ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
-        """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed.
+        """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed; and
+        those of predicting the mean, by target.
 
-        The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input. The
-        second value holds the errors of predicting the mean.
+        The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input.
         """
         moments: dict[fits.Source, fits.Moments] = {}
         sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
@@ -280,22 +257,20 @@ class Experiment:
         self, networks: Mapping[str, nn.Module], samples: Sequence[str], activity: str
     ) -> Iterator[tuple[dict[fits.Source, Tensor], dict[str, Tensor]]]:
         """Activations (B, C, h, w) of every layer and targets (B, 1, h, w), on one grid."""
-        height, width = self.subject.image_size
-        step = fits.grid_step((height, width))
+        (height, width), step = self.subject.image_size, fits.grid_step(self.subject.image_size)
         side = max(1, height // step), max(1, width // step)
         for names, fringe in self.subject.batches(self.dataset, samples, fits.BATCH):
             features = {(fits.INPUT, fits.INPUT): fits.at_size(fringe, side)}
             for source, network in networks.items():
                 layers = self.subject.layers_of(network)
-                with fits.tapped(layers, lambda maps: fits.at_size(maps, side)) as activations:
-                    fits.run_network(network, fringe, activations, list(layers), self.subject.name)
-                    features |= {(source, layer): activations[layer] for layer in layers}
+                activations = fits.activations_of(
+                    network, layers, fringe, lambda maps: fits.at_size(maps, side), self.subject.name
+                )
+                features |= {(source, layer): activations[layer] for layer in layers}
             depths = [self.dataset.depth_mm(name) for name in names]
-            targets = {
-                "edges": np.stack([fits.edge_map(depth_mm) for depth_mm in depths]),
-                "depth": np.stack([fits.normalised_depth(depth_mm) for depth_mm in depths]),
-            }
-            yield features, {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in targets.items()}
+            map_of = {"edges": fits.edge_map, "depth": fits.normalised_depth}
+            stacks = {key: np.stack([make(depth_mm) for depth_mm in depths]) for key, make in map_of.items()}
+            yield features, {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in stacks.items()}
             self.tick(len(names), activity)
 
 

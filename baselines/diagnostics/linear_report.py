@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench.baselines.diagnostics.fits import INPUT
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Sheet, Table, with_interval
 from fpp_ml_bench.evaluation.score import Interval, object_interval
 
 PAPER_RATIO = 2.82
@@ -63,12 +63,16 @@ def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects
     return Score(mse, interval, r2, r2_interval, tuple((1 - table.mean(axis=1) / mean_error).tolist()), mean_error)
 
 
-def to_dict(scores: Scores) -> dict[str, Any]:
+def values(linear: Scores, spatial: Scores) -> dict[str, Any]:
     """For ``diagnose.json``."""
+    four, one = (
+        {source: {layer: {name: asdict(one) for name, one in targets.items()} for layer, targets in layers.items()}
+         for source, layers in scores.items()} for scores in (spatial, linear)
+    )  # fmt: skip
     return {
-        source: {layer: {name: asdict(one) for name, one in targets.items()} for layer, targets in layers.items()}
-        for source, layers in scores.items()
-    }
+        "four_convolutions": four, "ratio": mean_ratio(spatial[TRAINED]),
+        "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]), "linear": one,
+    }  # fmt: skip
 
 
 def mean_mse(layers: Layers, target: str) -> float:
@@ -107,57 +111,45 @@ def summary(linear: Scores, spatial: Scores) -> str:
     return text
 
 
-# ---- tables
-
-
 def tables(linear: Scores, spatial: Scores) -> list[Table]:
     """The paper's table first, then the same probes as shares of variance, then the linear probes; with controls."""
     trained, untrained, raw = spatial[TRAINED], spatial[UNTRAINED], spatial[CONTROLS][INPUT]
     rows = {layer: {layer: targets} for layer, targets in trained.items()}
     rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
     errors = [
-        (name, mean_mse(layers, "edges"), mean_mse(layers, "depth"), mean_ratio(layers))
-        for name, layers in rows.items()
+        (name, mean_mse(rows[name], "edges"), mean_mse(rows[name], "depth"), mean_ratio(rows[name])) for name in rows
     ]
     of_mean = ("Predicting the mean", raw["edges"].mse_of_mean, raw["depth"].mse_of_mean, ratio_of_means(raw))
+
+    def r2(one: Score) -> str:
+        return with_interval(one.r2, one.r2_interval)
+
     shares = [
-        (layer, *(_r2(scores[layer][target]) for target in ("edges", "depth") for scores in (trained, untrained)))
+        (layer, *(r2(scores[layer][target]) for target in ("edges", "depth") for scores in (trained, untrained)))
         for layer in trained
     ]
     targets = list(next(iter(linear[TRAINED].values())))
     one_by_one: list[list[str | None]] = []
     for layer, scores in linear[TRAINED].items():
-        pairs = [(scores[target], linear[UNTRAINED][layer][target]) for target in targets]
+        pairs = ((scores[target], linear[UNTRAINED][layer][target]) for target in targets)
         one_by_one.append([layer, *(f"{one.r2:.3f}" for pair in pairs for one in pair)])
     for layer, scores in linear[CONTROLS].items():
-        cells = (cell for target in targets for cell in (f"{scores[target].r2:.3f}", None))
-        one_by_one.append([_CONTROLS[layer], *cells])
+        one_by_one.append([_CONTROLS[layer], *(cell for key in targets for cell in (f"{scores[key].r2:.3f}", None))])
     return [
         Table(
             "Four-convolution probes, validation MSE (the paper's table; lower is easier to read)",
-            ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"),
-            [*errors, of_mean],
+            ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"), [*errors, of_mean],
         ),
         Table(
             "The same probes, share of variance explained (R2)",
             ("Layer", "Edges R2", "random weights", "Depth R2", "random weights"),
-            [*shares, ("Raw input", _r2(raw["edges"]), None, _r2(raw["depth"]), None)],
+            [*shares, ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)],
         ),
         Table(
             "Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)",
-            ["Layer", *(title for target in targets for title in (TITLES[target], "random"))],
-            one_by_one,
+            ["Layer", *(title for target in targets for title in (TITLES[target], "random"))], one_by_one,
         ),
-    ]
-
-
-def _r2(one: Score) -> str:
-    """R2 with its interval, for a table cell."""
-    span = "" if one.r2_interval is None else f" ({one.r2_interval[0]:.3f} to {one.r2_interval[1]:.3f})"
-    return f"{one.r2:.3f}{span}"
-
-
-# ---- figures
+    ]  # fmt: skip
 
 
 def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
@@ -169,18 +161,17 @@ def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
         (sheet.axes[0, 1], "r2", "The same probes: share of variance explained"),
     ):
         for shift, target in ((-1, "edges"), (1, "depth")):
+            positions, colour = np.arange(len(layers)) + shift * _BAR / 2, sheet.COLOURS[target]
             scores = [spatial[TRAINED][layer][target] for layer in layers]
-            positions = np.arange(len(layers)) + shift * _BAR / 2
             bars = [(getattr(one, key), getattr(one, f"{key}_interval")) for one in scores]
-            sheet.bars(axis, positions, bars, width=_BAR, color=sheet.COLOURS[target], label=target)
+            sheet.bars(axis, positions, bars, width=_BAR, color=colour, label=target)
             random = [getattr(spatial[UNTRAINED][layer][target], key) for layer in layers]
-            axis.plot(
-                positions, random, linestyle="none", marker="_", markersize=9, markeredgewidth=2, color="black",
-                label="random weights" if shift > 0 else None,
-            )  # fmt: skip
-            style = {"color": sheet.COLOURS[target], "linewidth": 1, "linestyle": ":"}
+            label = "random weights" if shift > 0 else None
+            mark = {"marker": "_", "markersize": 9, "markeredgewidth": 2, "color": "black", "label": label}
+            axis.plot(positions, random, linestyle="none", **mark)
+            style = {"color": colour, "linewidth": 1, "linestyle": ":"}
             axis.axhline(getattr(raw[target], key), label=f"raw input, {target}", **style)
-        _layers(axis, layers)
+        _name_layers(axis, layers)
         sheet.tidy(axis, title, y="MSE" if key == "mse" else "R2")
     handles, labels = sheet.axes[0, 0].get_legend_handles_labels()
     sheet.figure.legend(handles, labels, fontsize=8, frameon=False, ncols=5, loc="outside lower center")
@@ -196,21 +187,22 @@ def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
     rows = -(-len(targets) // columns)
     sheet = Sheet(rows, columns, 10, 2.7 * rows)
     for axis, target in zip(sheet.axes.flat, targets, strict=False):
+        colour, grey = sheet.COLOURS[target], sheet.COLOURS["random"]
         trained, random = ([linear[source][layer][target] for layer in layers] for source in (TRAINED, UNTRAINED))
-        low, high = [min(one.seeds) for one in random], [max(one.seeds) for one in random]
-        axis.fill_between(positions, low, high, color=sheet.COLOURS["random"], alpha=0.4, linewidth=0)
-        axis.plot(positions, [one.r2 for one in random], color=sheet.COLOURS["random"], label="random weights")
-        style = {"color": sheet.COLOURS[target], "marker": "o", "markersize": 4, "label": "trained"}
+        low, high = ([end(one.seeds) for one in random] for end in (min, max))
+        axis.fill_between(positions, low, high, color=grey, alpha=0.4, linewidth=0)
+        axis.plot(positions, [one.r2 for one in random], color=grey, label="random weights")
+        style = {"color": colour, "marker": "o", "markersize": 4, "label": "trained"}
         axis.plot(positions, [one.r2 for one in trained], **style)
         for x, one in zip(positions, trained, strict=True):
             if one.r2_interval is not None:
-                axis.plot([x, x], one.r2_interval, color=sheet.COLOURS[target], linewidth=1)
+                axis.plot([x, x], one.r2_interval, color=colour, linewidth=1)
         for control, label, line in ((INPUT, "raw input", ":"), ("position", "pixel's position", "--")):
             r2 = linear[CONTROLS][control][target].r2
             axis.axhline(r2, color="black", linewidth=1, linestyle=line, label=label)
         axis.axhline(0, color=sheet.GRID, linewidth=1)
         axis.set_ylim(min(-0.1, max(-0.5, min(one.r2 for one in trained) - 0.05)), 1.02)
-        _layers(axis, layers)
+        _name_layers(axis, layers)
         sheet.tidy(axis, TITLES[target], y="R2")
     for axis in sheet.axes.flat[len(targets) :]:
         axis.axis("off")
@@ -223,5 +215,5 @@ def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
     return sheet.save(folder, "linear_one_by_one.png", "Linear (1 x 1) probes by layer and target", alt)
 
 
-def _layers(axis: Any, layers: Sequence[str]) -> None:
+def _name_layers(axis: Any, layers: Sequence[str]) -> None:
     axis.set_xticks(np.arange(len(layers)), layers, rotation=40, ha="right", rotation_mode="anchor")

@@ -1,41 +1,14 @@
 """The phase-reliance score (own definition): how far a prediction follows the fringe's phase and nothing else, 0 to 1.
 
-For a sample, take its target pixels and all moves of the phase within the object. Brightness is kept, so only the phase
-changes. Let t be the change of depth that a move implies and d the change of the prediction. With sums over pixels and
-moves,
-
-    gain = <d, t> / <t, t>,  purity = <d, t> / sqrt(<d, d> <t, t>),
-    follows = purity min(gain, 1 / gain), 0 where <d, t> is not positive.
-
-It is 1 for a prediction that changes by exactly t, and 0 for a prediction that does not change or whose change is
-uncorrelated with t. Under other outlines, over the pixels whose phase stays the same,
-
-    change = rms(d) / rms(t),  ignores outline = 1 - change, 0 where the change is above 1,
-
-so it is 0 for a method that changes as much with the outline as it should with the phase. The sample's score is the
-product of the two. The method's score is the mean over samples, with a bootstrap over objects.
-
-The score uses the units of the prediction. For mm, t is in mm. A prediction normalised to the sample's depth range is
-compared with the truth normalised as in training, each scene by its own range, which a perfect network would predict.
-Where another outline changes that range, both a constant prediction and one that follows the range count as ignoring
-the outline.
-
-A pixel without a prediction (0 where the unit is mm) does not follow. A pixel that loses its prediction under another
-outline counts as a change by rms(t).
-
-*Order-free* values allow errors of whole periods: with p the phase of a prediction in mm, Dp its change and Dt the
-expected change,
-
-    follows = 1 - (1 - <cos(Dp - Dt)>) / (1 - <cos Dt>), at least 0,
-    change = rms(2 sin(Dp / 2)) / rms(2 sin(Dt / 2)),
-
-where <> is the mean. A single fringe does not determine its order, so a method that reads the phase may still be wrong
-by a period. A random prediction gets no credit: its <cos(Dp - Dt)> is 0, below that of a constant prediction.
+A sample's score is the product of `follows`, over moves of the phase within the object, and of 1 - `relative_change`
+under other outlines over the same phase, at least 0. The method's score is the mean over samples, with a bootstrap over
+objects. docs/reliance.md defines and explains it: units, missing predictions, and *order-free* values, which allow
+errors of whole periods.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,24 +40,20 @@ class Change:
 
     @classmethod
     def of(cls, before: Map, after: Map, expected: Map, where: NDArray[np.bool_], zero_is_none: bool) -> "Change":
-        """From two predictions and the expected change, maps (H, W), at the pixels ``where`` (H, W).
-
-        With ``zero_is_none`` a 0 means that there is no prediction, and the actual change there is 0.
-        """
+        """From two predictions and the expected change, maps (H, W), at the pixels ``where`` (H, W). With
+        ``zero_is_none`` a 0 means that there is no prediction, and the actual change there is 0."""
         first, second = before[where].astype(np.float64), after[where].astype(np.float64)
         answered = (first != 0) & (second != 0) if zero_is_none else np.ones(first.shape, dtype=bool)
         return cls(np.asarray(expected[where], dtype=np.float64), np.where(answered, second - first, 0.0), answered)
 
-    def at(self, chosen: NDArray[np.bool_]) -> "Change":
-        """The part at ``chosen`` (n,)."""
-        return Change(self.expected[chosen], self.actual[chosen], self.answered[chosen])
-
 
 def follows(changes: Sequence[Change]) -> float | None:
-    """Purity times min(gain, 1 / gain) of the ``changes``; None where no change is expected."""
-    product = sum(float(change.actual @ change.expected) for change in changes)
-    actual = sum(float(change.actual @ change.actual) for change in changes)
-    expected = sum(float(change.expected @ change.expected) for change in changes)
+    """Purity <d, t> / sqrt(<d, d> <t, t>) times min(gain, 1 / gain), gain = <d, t> / <t, t>, over all pixels of
+    ``changes``, with d the actual and t the expected change; 0 where <d, t> is not positive, None where t is 0."""
+    product, actual, expected = (
+        sum(float(getattr(change, a) @ getattr(change, b)) for change in changes)
+        for a, b in (("actual", "expected"), ("actual", "actual"), ("expected", "expected"))
+    )
     if expected <= 0:
         return None
     if product <= 0:
@@ -100,10 +69,8 @@ def rms_expected(changes: Sequence[Change]) -> float:
 
 
 def relative_change(changes: Sequence[Change], unit: float) -> float | None:
-    """Root mean square of actual minus expected change, or of the actual change if that is less, divided by ``unit``.
-
-    A pixel that lost its prediction counts as ``unit``. None without pixels or with ``unit`` 0.
-    """
+    """Root mean square of actual minus expected change, or of the actual change if that is less, divided by ``unit``,
+    as which a pixel that lost its prediction counts. None without pixels or with ``unit`` 0."""
     size, total = sum(change.actual.size for change in changes), 0.0
     if unit <= 0 or not size:
         return None
@@ -114,7 +81,8 @@ def relative_change(changes: Sequence[Change], unit: float) -> float | None:
 
 
 def order_free_follows(changes: Sequence[Change]) -> float | None:
-    """`follows` for changes of phase in rad, modulo whole periods; without a prediction the change is 0."""
+    """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 - <cos t>), at least 0.
+    A random prediction gets no credit: its <cos(d - t)> is 0, below that of a constant prediction."""
     actual, expected = (np.concatenate([getattr(change, key) for change in changes]) for key in ("actual", "expected"))
     standing_still = 1 - float(np.mean(np.cos(expected))) if expected.size else 0.0
     if standing_still <= 0:
@@ -124,19 +92,12 @@ def order_free_follows(changes: Sequence[Change]) -> float | None:
 
 def order_free(changes: Sequence[Change]) -> list[Change]:
     """Changes of phase in rad as chords, for `relative_change`: a whole period is no change."""
-    return [
-        Change(2 * np.sin(change.expected / 2), 2 * np.sin(change.actual / 2), change.answered) for change in changes
-    ]
+    return [Change(2 * np.sin(one.expected / 2), 2 * np.sin(one.actual / 2), one.answered) for one in changes]
 
 
 def sample_score(follow: float | None, change: float | None) -> float | None:
     """The score of a sample; an outline that could not be changed counts as ignored."""
-    if follow is None:
-        return None
-    return follow * (1.0 if change is None else max(0.0, 1.0 - change))
-
-
-# ---- measuring
+    return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
 
 
 class DepthMethod(Protocol):
@@ -148,7 +109,6 @@ class DepthMethod(Protocol):
     def units(self) -> str: ...
     @property
     def uses_ground_truth_mask(self) -> bool: ...
-
     def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]: ...
 
 
@@ -167,23 +127,17 @@ class ScenePredictor:
     """Runs ``method`` on scenes and gives the true depth in the units of its predictions."""
 
     def __init__(self, method: DepthMethod, renderer: SceneRenderer) -> None:
-        self.method, self.renderer = method, renderer
-        units = method.units
-        if units not in ("mm", "normalised"):
-            raise DiagnosisError(f"units {units!r}: reliance is measured for predictions in mm, or normalised")
-        self.units: Literal["mm", "normalised"] = "mm" if units == "mm" else "normalised"
-        self._masked = method.uses_ground_truth_mask
-
-    @property
-    def in_mm(self) -> bool:
-        return self.units == "mm"
+        self.method, self.renderer, self.in_mm = method, renderer, method.units == "mm"
+        if method.units not in ("mm", "normalised"):
+            raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
 
     def predict(self, scene: Scene) -> NDArray[np.float32]:
-        """Predicted depth (H, W) in ``units``."""
-        return self.method.predict(self.renderer.frames(scene, self.method.frames_used, self._masked))
+        """Predicted depth (H, W) in the units of the method."""
+        frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
+        return self.method.predict(frames)
 
     def true_depth(self, depth_mm: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """``depth_mm`` (H, W) in ``units``: mm, or normalised to its range over ``mask``."""
+        """``depth_mm`` (H, W) in the units of the method: mm, or normalised to its range over ``mask``."""
         if self.in_mm:
             return depth_mm
         inside = depth_mm[mask]
@@ -201,12 +155,8 @@ def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> Sample
         expected = predictor.true_depth(depth_mm, mask) - truth
         return Change.of(before, after, expected, where, predictor.in_mm)
 
-    def turn(after: Map, depth_mm: NDArray[np.float64], where: NDArray[np.bool_]) -> Change:
-        return _phase_change(scenes, before, after, depth_mm, where)
-
     def followed(moves: Iterable[Move], scene_of: Callable[[Move], Scene]) -> float | None:
-        answers = ((predictor.predict(scene_of(move)), move.depth_mm) for move in moves)
-        return follows([change(after, depth_mm, target, target) for after, depth_mm in answers])
+        return follows([change(predictor.predict(scene_of(move)), move.depth_mm, target, target) for move in moves])
 
     moved = [(predictor.predict(move.phase), move.depth_mm) for move in within]
     phase_changes = [change(after, depth_mm, target, target) for after, depth_mm in moved]
@@ -230,13 +180,14 @@ def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> Sample
     for name, scene in scenes.reprojected.items():
         key = name.replace(" ", "_")
         other = Change.of(before, predictor.predict(scene), np.zeros(target.shape), target, predictor.in_mm)
-        parts[f"change_{key}"] = relative_change([other.at(other.answered)], unit)
+        kept = other.answered
+        parts[f"change_{key}"] = relative_change([Change(other.expected[kept], other.actual[kept], kept[kept])], unit)
         if name.startswith("no fringe"):
             parts[f"answered_{key}"] = float(other.answered.mean())
     order_free_score = None
     if predictor.in_mm:
-        moved_turns = [turn(after, depth_mm, target) for after, depth_mm in moved]
-        outline_turns = [turn(after, original.depth_mm, where) for after, _, where in outlined]
+        moved_turns = [_phase_change(scenes, before, after, depth_mm, target) for after, depth_mm in moved]
+        outline_turns = [_phase_change(scenes, before, after, original.depth_mm, where) for after, _, where in outlined]
         chords = rms_expected(order_free(moved_turns))
         parts["order_free_follows_phase"] = order_free_follows(moved_turns)
         parts["order_free_change_outline"] = relative_change(order_free(outline_turns), chords)
@@ -256,10 +207,8 @@ def _phase_change(scenes: Counterfactuals, before: Map, after: Map, depth_mm: Ma
 def measure(
     method: DepthMethod, scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
 ) -> tuple[Reliance, list[SampleReliance]]:
-    """The reliance block of a method, and the values of every sample.
-
-    Raises `DiagnosisError` as `ScenePredictor`, and where no sample has a score.
-    """
+    """The reliance block of a method, and the values of every sample. Raises `DiagnosisError` for a method of other
+    units, and where no sample has a score."""
     predictor = ScenePredictor(method, scene_set.renderer)
     direction = direction_read(method.frames_used, scene_set.dataset)
     samples: list[SampleReliance] = []
@@ -275,10 +224,10 @@ def measure(
         score=_mean(sample.score for sample in scored) or 0.0,
         interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
         order_free_score=_mean(sample.order_free_score for sample in scored),
-        parts=RelianceParts(
-            **{key: _mean(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
+        parts=RelianceParts.model_validate(
+            {key: _mean(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
         ),
-        units=predictor.units,
+        units="mm" if predictor.in_mm else "normalised",
         direction=direction,
         samples=len(scored),
         objects=len({sample.object for sample in scored}),

@@ -3,12 +3,14 @@
 Importing this module imports neither numpy nor matplotlib, so that the command line can name the probes.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fpp_ml_bench.errors import DiagnosisError
 
@@ -20,6 +22,12 @@ if TYPE_CHECKING:
     from fpp_ml_bench.loaders.storage import DatasetFolder
 
 Cell = str | int | float | None
+Progress = Callable[[int, int, str], None]
+"""Called by a running probe with the steps done, their total, and the activity."""
+
+
+def silent(*progress: object) -> None:
+    """A `Progress` that shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +35,7 @@ class ProbeSettings:
     """How much a probe measures; None means the probe's default.
 
     ``samples``: most samples of each split, taken evenly over it (`spread`). ``seeds``: repeats of what depends on
-    random numbers, 1 or more. ``quick``: a short run for a first look.
-
-    Raises `DiagnosisError` for a number below 1.
+    random numbers. ``quick``: a short run for a first look. Raises `DiagnosisError` for a number below 1.
     """
 
     samples: int | None = None
@@ -54,14 +60,10 @@ def spread(names: Sequence[str], limit: int | None) -> list[str]:
     return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
 
 
-class Progress(Protocol):
-    """Called by a running probe with its progress."""
-
-    def __call__(self, done: int, total: int, activity: str = "") -> None: ...
-
-
-def silent(done: int, total: int, activity: str = "") -> None:
-    """A `Progress` that shows nothing."""
+def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
+    """A mean with its interval as a table's cell; a dash for None."""
+    span = "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"
+    return "-" if value is None else f"{value:.3f}{span}"
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,8 @@ class Figure:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of a probe.
+    """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None instead of NaN.
 
-    ``summary``: the result in one or two sentences. ``values``: JSON for ``diagnose.json``, with None instead of NaN.
     ``skipped``: why the probe does not apply to this subject; then the other fields are empty.
     """
 
@@ -105,23 +106,23 @@ class Finding:
 
 
 class Probe:
-    """A test of a model. ``version`` goes up when its result for the same model changes."""
+    """A test of a model. ``version`` goes up when its result for the same model changes. ``without_network``: what a
+    method without a network lacks for this probe, or None."""
 
     name: str
     title: str
     question: str
     version = 1
     without_network: str | None = None
-    """What a method without a network lacks for this probe, or None."""
 
-    def applies_to(self, subject: "Subject") -> str | None:
+    def applies_to(self, subject: Subject) -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
         if self.without_network is None or subject.network is not None:
             return None
         return f"{subject.name} is a method without a network: {self.without_network}."
 
     def run(
-        self, subject: "Subject", dataset: "DatasetFolder", settings: ProbeSettings, folder: Path, progress: Progress
+        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         """Measure ``subject``; pictures are written into ``folder``, which exists."""
         raise NotImplementedError
@@ -138,15 +139,12 @@ PROBES = {
     "counterfactual": ("counterfactual", "Counterfactual"),
     "theory": ("theory", "Theory"),
 }
-"""The probes by name, in the order of the report: module below this package, which is imported on first use, and class
-in it, which is made without arguments."""
+"""The probes by name, in the order of the report: module of this package, imported on first use, and class in it."""
 
 
 class Sheet:
-    """A figure of ``rows x columns`` axes in the report's style, black on white; sizes in inches.
-
-    ``options`` as of ``subplots``. ``axes``: an array of that shape.
-    """
+    """A figure of ``rows x columns`` axes in the report's style, black on white; sizes in inches, ``options`` as of
+    ``subplots``. ``axes``: an array of that shape."""
 
     COLOURS: ClassVar = {
         "edges": "#2e8b57", "depth": "#c0392b", "distance": "#c0392b", "phase": "#1b5bb8", "order": "#8a4b00",
@@ -154,7 +152,6 @@ class Sheet:
     }  # fmt: skip
     """Colours of the targets, edges and depth as in the paper's figure; of the raw input, and of random weights."""
     INK, GRID = "#191c20", "#dfe1e5"
-    DPI = 130
 
     def __init__(self, rows: int, columns: int, width: float, height: float, **options: Any) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -164,7 +161,7 @@ class Sheet:
         FigureCanvasAgg(self.figure)
         self.axes: Any = self.figure.subplots(rows, columns, squeeze=False, **options)
 
-    def tidy(self, axes: "Axes", title: str = "", x: str = "", y: str = "") -> None:
+    def tidy(self, axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
         """Set titles and a light grid, and remove the box."""
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_xlabel(x, fontsize=9)
@@ -174,7 +171,7 @@ class Sheet:
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
 
-    def picture(self, axes: "Axes", image: "NDArray", title: str = "", colours: str = "gray", *limits: float) -> Any:
+    def picture(self, axes: Axes, image: NDArray, title: str = "", colours: str = "gray", *limits: float) -> Any:
         """An image (H, W) without ticks; ``limits``, low and high, default to its own range."""
         axes.set_title(title, fontsize=9)
         axes.set(xticks=[], yticks=[])
@@ -185,7 +182,7 @@ class Sheet:
         """The colour scale of a `picture` beside ``axes``."""
         self.figure.colorbar(image, ax=axes, **options).ax.tick_params(labelsize=size)
 
-    def bars(self, axes: "Axes", positions: Sequence[float], bars: Sequence[tuple[Any, Any]], **style: Any) -> None:
+    def bars(self, axes: Axes, positions: NDArray, bars: Sequence[tuple[Any, Any]], **style: Any) -> None:
         """Bars of (value, interval), each of which may be None; ``style`` as of ``bar``."""
         axes.bar(positions, [math.nan if value is None else value for value, _ in bars], **style)
         for x, (value, interval) in zip(positions, bars, strict=True):
@@ -197,8 +194,7 @@ class Sheet:
         from PIL import Image
 
         buffer = BytesIO()
-        self.figure.savefig(buffer, format="png", dpi=self.DPI, facecolor="white", metadata={"Software": None})
-        buffer.seek(0)
+        self.figure.savefig(buffer, format="png", dpi=130, facecolor="white", metadata={"Software": None})
         reduced = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
         reduced.save(folder / file, optimize=True)
         return Figure(title, file, alt)

@@ -25,6 +25,14 @@ Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
 
 
+_STEP = 1e-6
+"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
+_SAME_SURFACE_M = 1e-3
+"""A traced depth that differs from the stored depth by more belongs to another triangle."""
+_GRAZING = 0.02
+"""Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
+
+
 def constant(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """The `Field` that is 1 everywhere."""
     return np.ones_like(x)
@@ -33,14 +41,6 @@ def constant(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float
 def times(amplitude: float, field: Field) -> Field:
     """``amplitude`` times ``field``."""
     return lambda x, y: amplitude * field(x, y)
-
-
-_STEP = 1e-6
-"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
-_SAME_SURFACE_M = 1e-3
-"""A traced depth that differs from the stored depth by more belongs to another triangle."""
-_GRAZING = 0.02
-"""Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class Surface:
 
     def joined(self, other: "Surface") -> "Surface":
         """The pixels of both."""
-        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(self))
-        return Surface(*(np.concatenate(pair) for pair in pairs))
+        names = (part.name for part in fields(self))
+        return Surface(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
     def depth_mm(self, shape: tuple[int, int]) -> NDArray[np.float64]:
         """Depth map (H, W) in mm, 0 outside the surface."""
@@ -71,11 +71,8 @@ class Surface:
 
 
 def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
-    """The object of ``sample``: exact depth where the dataset has it, else the decoded depth.
-
-    Normals come from the mesh in a built dataset. Without a mesh (an imported dataset), and at pixels whose ray misses
-    it, they come from the depth map.
-    """
+    """The object of ``sample``: exact depth where the dataset has it, else the decoded depth. Normals come from a built
+    dataset's mesh, and without one (imported), or where the ray misses it, from the depth map."""
     depth_mm = dataset.depth_mm(sample, DEPTH_EXACT if dataset.has_exact else DEPTH).astype(np.float64)
     x, y = dataset.rig.camera.rays()
     pixels = np.flatnonzero(object_mask(depth_mm))
@@ -95,21 +92,18 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
 
 
 def normals_of_depth(depth_mm: NDArray[np.float64], x: NDArray, y: NDArray) -> NDArray[np.float64]:
-    """Unit normals (H W, 3) toward the camera of a depth map (H, W), 0 = background.
-
-    They come from differences between neighbouring object pixels; a pixel without neighbours gets (0, 0, -1).
-    """
+    """Unit normals (H W, 3) toward the camera of a depth map (H, W), 0 = background, from differences between
+    neighbouring object pixels; a pixel without neighbours gets (0, 0, -1)."""
     inside = object_mask(depth_mm)
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_mm[..., None]
     tangents = []
     for axis in (1, 0):
-        ahead, behind = np.roll(points, -1, axis), np.roll(points, 1, axis)
-        has_ahead, has_behind = np.roll(inside, -1, axis), np.roll(inside, 1, axis)
-        np.moveaxis(has_ahead, axis, 0)[-1] = False  # np.roll wraps around the image's edge
-        np.moveaxis(has_behind, axis, 0)[0] = False
-        ahead = np.where(has_ahead[..., None], ahead, points)
-        behind = np.where(has_behind[..., None], behind, points)
-        tangents.append(ahead - behind)
+        ends = []
+        for step, edge in ((-1, -1), (1, 0)):
+            has = np.roll(inside, step, axis)
+            np.moveaxis(has, axis, 0)[edge] = False  # np.roll wraps around the image's edge
+            ends.append(np.where(has[..., None], np.roll(points, step, axis), points))
+        tangents.append(ends[0] - ends[1])
     normals = np.cross(tangents[1], tangents[0]).reshape(-1, 3)
     lengths = np.linalg.norm(normals, axis=1)
     defined = inside.ravel() & (lengths > 0)
@@ -127,17 +121,20 @@ def plane(
     across, down = np.tan(np.deg2rad(tilt_deg))
     pixels = np.arange(x.size) if mask is None else np.flatnonzero(mask)
     x, y = x[pixels], y[pixels]
-    depth_m = distance_m / (1 - across * x - down * y)
-    normal = np.array([across, down, -1.0])
+    depth_m, normal = distance_m / (1 - across * x - down * y), np.array([across, down, -1.0])
     return Surface(pixels, x, y, depth_m, np.tile(normal / np.linalg.norm(normal), (pixels.size, 1)))
 
 
 def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) -> Surface:
-    """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``shift_rad``.
+    """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``shift_rad``, with its
+    new normals; the outline stays."""
 
-    Each pixel keeps its ray, so the outline stays. Normals are those of the moved surface.
-    """
-    new_m = _moved_m(surface.x, surface.y, surface.depth_m, rig, direction, shift_rad)
+    def moved_m(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        layer = CalibrationLayer.of(rig, direction, (x, y))
+        phase = layer.absolute_phase(depth_m * MM_PER_M) + shift_rad(x, y)
+        return layer.depth_of_residual_mm(phase - layer.infinity_rad - TAU * layer.infinity_order) / MM_PER_M
+
+    new_m = moved_m(surface.x, surface.y, surface.depth_m)
     rays = np.column_stack([surface.x, surface.y, np.ones_like(surface.x)])
     facing = np.einsum("ij,ij->i", surface.normals, rays)
     usable = np.abs(facing) > _GRAZING * np.linalg.norm(rays, axis=1)
@@ -147,23 +144,13 @@ def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) ->
         x, y = surface.x + _STEP * (axis == 0), surface.y + _STEP * (axis == 1)
         facing_beside = np.where(usable, facing + _STEP * surface.normals[:, axis], 1.0)
         beside_m = np.where(usable, surface.depth_m * facing / facing_beside, surface.depth_m)
-        gradient.append((_moved_m(x, y, beside_m, rig, direction, shift_rad) - new_m) / _STEP)
+        gradient.append((moved_m(x, y, beside_m) - new_m) / _STEP)
     across, down = gradient
     # Z(x, y) has the normal (Z_x, Z_y, -(Z + x Z_x + y Z_y)), up to its length.
     normals = np.column_stack([across, down, -(new_m + surface.x * across + surface.y * down)])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(usable[:, None] & np.isfinite(normals), normals, surface.normals)
     return Surface(surface.pixels, surface.x, surface.y, new_m, normals)
-
-
-def _moved_m(
-    x: NDArray, y: NDArray, depth_m: NDArray, rig: Rig, direction: Direction, shift_rad: Field
-) -> NDArray[np.float64]:
-    layer = CalibrationLayer.of(rig, direction, (x, y))
-    phase = layer.absolute_phase(depth_m * MM_PER_M) + shift_rad(x, y)
-    residual = phase - layer.infinity_rad - TAU * layer.infinity_order
-    depth: NDArray[np.float64] = layer.depth_of_residual_mm(residual) / MM_PER_M
-    return depth
 
 
 Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
@@ -177,8 +164,7 @@ class Scene:
     """Lit pixels in front of the empty scene, and the pattern that is projected on them.
 
     ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
-    it. ``stream``: key of the noise. ``projected``: the unchanged sequence, its mean light inside or outside the
-    object, the frames of the other direction, or fringes of another pitch.
+    it. ``stream``: key of the noise. With ``no fringe`` the mean light of the sequence is projected.
     """
 
     pixels: NDArray[np.uint32]
@@ -195,16 +181,14 @@ class SceneRenderer:
         self.rig, self.lighting = rig, render.Lighting()
         self.shape = (rig.camera.height, rig.camera.width)
         self.noise = render.Noise.of_sigma(noise_sigma_grey)
-        self._all_pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
         self._background_stream: tuple[object, ...] = ()
         self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
         """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
-        return cls(
-            dataset.rig, dataset.manifest.settings.get("noise_sigma_grey", render.BuildSettings.noise_sigma_grey)
-        )
+        settings = dataset.manifest.settings
+        return cls(dataset.rig, settings.get("noise_sigma_grey", render.BuildSettings.noise_sigma_grey))
 
     @cached_property
     def exposure(self) -> render.Exposure:
@@ -217,13 +201,10 @@ class SceneRenderer:
 
     @cached_property
     def _other_pitch(self) -> render.Exposure:
-        horizontal_px, vertical_px = (
-            PITCH_FACTOR * self.rig.pitch_horizontal_px,
-            PITCH_FACTOR * self.rig.pitch_vertical_px,
-        )
-        return render.Exposure.of(
-            replace(self.rig, pitch_horizontal_px=horizontal_px, pitch_vertical_px=vertical_px), self.noise
-        )
+        pitches = {
+            name: PITCH_FACTOR * getattr(self.rig, name) for name in ("pitch_horizontal_px", "pitch_vertical_px")
+        }
+        return render.Exposure.of(replace(self.rig, **pitches), self.noise)
 
     @cached_property
     def _empty(self) -> render.LitPixels:
@@ -236,11 +217,9 @@ class SceneRenderer:
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
         0 outside ``scene.mask``."""
-        inside, outside = {
-            "no fringe inside": (self._uniform, self.exposure),
-            "no fringe outside": (self.exposure, self._uniform),
-            "other pitch": (self._other_pitch, self._other_pitch),
-        }.get(scene.projected, (self.exposure, self.exposure))
+        usual = self._other_pitch if scene.projected == "other pitch" else self.exposure
+        inside = self._uniform if scene.projected == "no fringe inside" else usual
+        outside = self._uniform if scene.projected == "no fringe outside" else usual
         swapped = scene.projected == "other direction"
         projected_indices = [self._partner(index) if swapped else index for index in indices]
         object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
@@ -256,14 +235,13 @@ class SceneRenderer:
             self._background_stream, self._backgrounds = stream, {}
         key = id(exposure), index  # the three exposures live as long as the renderer
         if key not in self._backgrounds:
-            image = exposure.expose([index], self._empty, self._all_pixels, stream)[0]
-            self._backgrounds[key] = image.reshape(self.shape)
+            pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
+            self._backgrounds[key] = exposure.expose([index], self._empty, pixels, stream)[0].reshape(self.shape)
         return self._backgrounds[key]
 
     def _partner(self, index: int) -> int:
         """The frame of the other direction with the same step or bit; black and white frames map to themselves."""
-        sequence = self.rig.sequence
-        frame = sequence.frames[index]
+        sequence, frame = self.rig.sequence, self.rig.sequence.frames[index]
         if frame.direction is None:
             return index
         frames_of = sequence.sinusoids if frame.kind == "sinusoid" else sequence.gray

@@ -37,17 +37,15 @@ PIXELS_AT_ONCE = BATCH * 224 * 224
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A model under diagnosis.
+    """A model under diagnosis; ``sha256`` identifies it and its settings.
 
-    ``sha256`` identifies the model and its settings. ``units`` of `predict`: mm, or normalised to the sample's own
-    depth range. ``frames_used``: numbers of the frames that it needs; ``direction``: their fringe direction, or
-    ``both``. With ``uses_ground_truth_mask`` it expects frames that are 0 outside the object, as `captured` gives them.
+    ``units`` of `predict`: mm, or normalised to the sample's own depth range. ``direction``: that of the fringes in
+    ``frames_used``. With ``uses_ground_truth_mask`` it expects frames that are 0 outside the object (`captured`).
 
     ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and outputs depth in the
     representation ``normalisation``. Without a network, it and the following fields are None or empty. ``layer_names``:
     the layers to probe, in forward order. ``untrained(seed)``: the same architecture with random weights.
-    ``find_layers``: the layers of any network of that architecture by name. ``weights_sha256``: hash of the weights
-    file.
+    ``find_layers``: the layers of any network of that architecture by name.
     """
 
     name: str
@@ -80,13 +78,10 @@ class Subject:
     def captured(self, dataset: DatasetFolder, sample: str) -> list[NDArray[np.uint8] | None]:
         """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
         frames: list[NDArray[np.uint8] | None] = [None] * len(dataset.sequence)
+        mask = object_mask(dataset.depth_mm(sample)) if self.uses_ground_truth_mask else np.True_
         for index in self.frames_used:
-            frames[index] = self.as_input(dataset.frame(sample, index), dataset.depth_mm(sample))
+            frames[index] = dataset.frame(sample, index) * mask
         return frames
-
-    def as_input(self, frame: NDArray[np.uint8], depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """``frame`` (H, W) as the subject expects it: 0 outside the object if it uses the ground-truth mask."""
-        return frame * object_mask(depth_mm) if self.uses_ground_truth_mask else frame
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
@@ -100,11 +95,7 @@ class Subject:
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """The input of ``network`` for several samples: float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without
         its frame."""
-        (index,) = self.frames_used
-        images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
-        if len(images) != len(stacks):
-            raise DiagnosisError(f"{self.name} needs frame {index}, which is missing")
-        return fringe_batch(images, self.image_size, self.name)
+        return _input_batch(stacks, self.frames_used[0], self.image_size, self.name)
 
     @property
     def batch_size(self) -> int:
@@ -121,26 +112,28 @@ class Subject:
             yield names, self.input_batch([self.captured(dataset, name) for name in names])
 
     def represent(self, frames: Frames) -> NDArray[np.float32]:
-        """The network's output float32 (H, W) in its ``normalisation``.
-
-        Raises `DiagnosisError` without a network or its frame, and for an output of another shape or not finite.
-        """
+        """The network's output float32 (H, W) in its ``normalisation``. Raises `DiagnosisError` without a network, and
+        for an output of another shape or not finite."""
         network, _ = self.networks()
         batch = self.input_batch([frames])
         with torch.inference_mode():
             return checked_output(network(batch), batch, self.name)[0, 0].numpy()
 
 
+def _input_batch(stacks: Sequence[Frames], index: int, size: tuple[int, int], name: str) -> Tensor:
+    images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
+    if len(images) != len(stacks):
+        raise DiagnosisError(f"{name} needs frame {index}, which is missing")
+    return fringe_batch(images, size, name)
+
+
 def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:
     """``output`` if it is finite and shaped as ``batch`` (B, 1, H, W); else `DiagnosisError`."""
-    shape = tuple(getattr(output, "shape", ()))
-    if shape != tuple(batch.shape):
-        raise DiagnosisError(
-            f"{name}: expected an output of shape {tuple(batch.shape)}, one depth per pixel, got "
-            f"{shape or type(output).__name__}"
-        )
-    not_finite = int((~output.isfinite()).sum())
-    if not_finite:
+    shape, expected = tuple(getattr(output, "shape", ())), tuple(batch.shape)
+    if shape != expected:
+        got = shape or type(output).__name__
+        raise DiagnosisError(f"{name}: expected an output of shape {expected}, one depth per pixel, got {got}")
+    if not_finite := int((~output.isfinite()).sum()):
         raise DiagnosisError(f"{name}: {not_finite} of {output.numel()} values of its output are NaN or infinite")
     return output.float()
 
@@ -165,9 +158,8 @@ def subject(
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
     if name not in METHODS:
         return _subject_of_weights(name, dataset, layers, frame, threads)
-    for option, value in (("layers", layers), ("frame", frame)):
-        if value is not None:
-            raise DiagnosisError(f"{name} is a method without a network, so it has no {option}; leave it out")
+    if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
+        raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
     return subject_of_method(load_method(name, dataset.rig), dataset)
 
 
@@ -195,10 +187,9 @@ def _subject_of_weights(
     try:
         path = weights_path(name)
     except WeightsError:
-        names = ", ".join((*METHODS, *shipped_names()))
         raise DiagnosisError(
-            f"unknown model {name!r}; there are {names}, every .safetensors file of trained weights, and your own "
-            "module as file.py:factory"
+            f"unknown model {name!r}; there are {', '.join((*METHODS, *shipped_names()))}, every .safetensors file of "
+            "trained weights, and your own module as file.py:factory"
         ) from None
     torch.set_num_threads(threads)
     model = load(path, "cpu")
@@ -230,31 +221,24 @@ def _subject_of_weights(
 
 def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
     """The ``requested`` layers, or all ``available``, in forward order. Raises `DiagnosisError` for unknown ones."""
-    unknown = [layer for layer in requested or () if layer not in available]
-    if unknown:
-        suggestions = get_close_matches(unknown[0], available, n=3) or list(available)[:12]
-        raise DiagnosisError(f"{name} has no layer {unknown[0]!r}; there are {', '.join(suggestions)}")
+    for layer in requested or ():
+        if layer not in available:
+            suggestions = get_close_matches(layer, available, n=3) or list(available)[:12]
+            raise DiagnosisError(f"{name} has no layer {layer!r}; there are {', '.join(suggestions)}")
     return tuple(layer for layer in available if not requested or layer in requested)
 
 
 def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | Literal["both"]:
     """Fringe direction of ``frames``; ``both`` where they differ or have no direction."""
-    directions = {dataset.sequence.frames[index].direction for index in frames} - {None}
-    direction = next(iter(directions)) if len(directions) == 1 else None
-    return "both" if direction is None else direction
-
-
-# ---- a user's torch module: path/to/file.py:factory
+    first, *others = {dataset.sequence.frames[index].direction for index in frames} - {None} or {None}
+    return "both" if first is None or others else first
 
 
 def _subject_of_factory(
     name: str, dataset: DatasetFolder, layers: Sequence[str] | None, units: OutputUnits, frame: int, threads: int
 ) -> Subject:
-    """The module that ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits show early.
-
-    The file is the user's own code and is executed. Raises `DiagnosisError` for a file, factory, layer, frame or output
-    that can't be used; its message quotes errors of the user's code.
-    """
+    """The module that ``file.py:factory`` makes, as a subject. The file is the user's own code and is executed, and the
+    module is run on a sample, so that misfits show early."""
     if units not in NORMALISATION_OF:
         raise DiagnosisError(f"unknown units {units!r}; there are {', '.join(NORMALISATION_OF)}")
     if not 0 <= frame < len(dataset.sequence):
@@ -265,18 +249,15 @@ def _subject_of_factory(
     normalisation = NORMALISATION_OF[units]
 
     def predict(frames: Frames) -> NDArray[np.float32]:
-        image = frames[frame]
-        if image is None:
-            raise DiagnosisError(f"{name} needs frame {frame}, which is missing")
-        batch = fringe_batch([image], dataset.size, name)
+        batch = _input_batch([frames], frame, dataset.size, name)
         try:
             with torch.inference_mode():
                 values = checked_output(network(batch), batch, name)[0, 0].numpy()
         except FppBenchError:
             raise
         except Exception as error:
-            reason = f"on fringes of shape {tuple(batch.shape)} it failed: {_error_text(error)}"
-            raise DiagnosisError(f"{name}: {reason}") from error
+            shape, reason = tuple(batch.shape), _error_text(error)
+            raise DiagnosisError(f"{name}: on fringes of shape {shape} it failed: {reason}") from error
         return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
 
     user_subject = Subject(
@@ -302,11 +283,8 @@ def _subject_of_factory(
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:
-    """``network`` with random weights, changed in place.
-
-    Layers with ``reset_parameters`` are initialised again, with the buffers of normalisation layers. The parameters of
-    the others are shuffled, which keeps their scale.
-    """
+    """``network`` with random weights, changed in place: layers with ``reset_parameters`` are initialised again, the
+    parameters of the others are shuffled, which keeps their scale."""
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         for module in network.modules():
@@ -368,12 +346,12 @@ def _build_network(name: str, factory: Any) -> nn.Module:
 
 
 def _digest(path: Path, network: nn.Module, settings: str) -> str:
-    digest = hashlib.sha256(settings.encode())
-    digest.update(path.read_bytes())
+    digest = hashlib.sha256(settings.encode() + path.read_bytes())
     for key, value in network.state_dict().items():
         if isinstance(value, Tensor):
-            content = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
-            digest.update(key.encode() + content)
+            digest.update(
+                key.encode() + value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
+            )
     return digest.hexdigest()
 
 

@@ -1,14 +1,8 @@
-"""The paper's two theorems (Section 4.2), checked numerically; the subject is not used.
+"""The paper's two theorems (Section 4.2), checked numerically (docs/reliance.md); the subject is not used.
 
-*A single fringe does not determine depth.* Two surfaces are rendered, a whole period apart on every ray. Their frames
-of that direction are the same bytes, noise included. Brightness would distinguish them, so at each pixel the brighter
-surface gets a lower albedo, by the factor that inverse square law and tilt require. The ambient light is a constant of
-this benchmark and does not depend on the surface. The frames of the other direction differ.
-
-*An error of one period costs Z^2.* The depth error of an order error of one period, at distances from 0.3 to 10 m along
-the camera's axis, through the calibration layer. In closed form, with kappa = P / (f_p b) for the paper's rig, it is
-Z^2 kappa / (1 -+ Z kappa), one sign for each side. The exponent of Z is 2 +- Z kappa / (1 -+ Z kappa), and 2 only where
-Z kappa, the error relative to the disparity, is small.
+*A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
+direction, noise included, if at each pixel the brighter one gets a lower albedo. *An error of one period costs Z^2*,
+and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, Surface, constant, moved, times
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved, times
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
@@ -40,45 +34,40 @@ STARTS_PERIODS = (0.0, -1.0, -0.5)
 SET_BACK_M = 0.1
 """Distance of the projector behind the camera in the rig that shows the limit of the thin baseline."""
 _SHOWN_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
-Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
 class Twins:
-    """Two scenes that a frame can't distinguish. Depths float64 (H, W) in mm, 0 outside the object; frames uint8."""
+    """Two scenes that a frame can't distinguish. Depths float64 (H, W) in mm, 0 outside the object; frames uint8, one
+    of each scene."""
 
     sample: str
     direction: Direction
     frame: int
     other_frame: int
-    depths_mm: tuple[NDArray[np.float64], NDArray[np.float64]]
-    frames: Pair
-    noiseless: Pair
-    other_frames: Pair
+    depths_mm: list[NDArray[np.float64]]
+    frames: list[NDArray[np.uint8]]
+    noiseless: list[NDArray[np.uint8]]
+    other_frames: list[NDArray[np.uint8]]
     paint: NDArray[np.float64]
 
     def to_dict(self) -> dict[str, Any]:
         inside = self.depths_mm[0] > 0
         distance_mm = np.abs(self.depths_mm[1] - self.depths_mm[0])[inside]
+        pairs = {"": self.frames, "_noiseless": self.noiseless, "_other_direction": self.other_frames}
         return {
-            "sample": self.sample,
-            "direction": self.direction,
-            "frame": self.frame,
-            "object_pixels": int(inside.sum()),
-            "differing_pixels": int(np.not_equal(*self.frames).sum()),
-            "differing_pixels_noiseless": int(np.not_equal(*self.noiseless).sum()),
-            "differing_pixels_other_direction": int(np.not_equal(*self.other_frames).sum()),
-            "depth_apart_mean_mm": float(distance_mm.mean()),
-            "depth_apart_least_mm": float(distance_mm.min()),
-            "paint_least": float(self.paint.min()),
-            "paint_most": float(self.paint.max()),
-        }
+            "sample": self.sample, "direction": self.direction, "frame": self.frame, "object_pixels": int(inside.sum()),
+            **{f"differing_pixels{which}": int(np.not_equal(*pair).sum()) for which, pair in pairs.items()},
+            "depth_apart_mean_mm": float(distance_mm.mean()), "depth_apart_least_mm": float(distance_mm.min()),
+            "paint_least": float(self.paint.min()), "paint_most": float(self.paint.max()),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ErrorCurve:
     """Depth error (n,) in mm of a phase error of ``periods`` at ``distances_m`` (n,), inf where there is no depth; the
-    exponent of distance, ``local`` (n,) and ``exponent`` fitted over ``fitted_m``."""
+    exponent of distance, ``local`` (n,) and ``exponent`` fitted over ``fitted_m``; ``quadratic_m``: range of distances
+    whose local exponent is within `WITHIN` of 2, None where there are none."""
 
     name: str
     periods: float
@@ -86,16 +75,8 @@ class ErrorCurve:
     error_mm: NDArray[np.float64]
     local: NDArray[np.float64]
     exponent: float
-    fitted_m: tuple[float, float]
-
-    def quadratic_m(self) -> tuple[float, float] | None:
-        """Range of distances whose local exponent is within `WITHIN` of 2; None where there are none."""
-        quadratic = self.distances_m[np.abs(self.local - 2) <= 2 * WITHIN]
-        return (float(quadratic.min()), float(quadratic.max())) if quadratic.size else None
-
-    def to_dict(self) -> dict[str, Any]:
-        about = {"name": self.name, "periods": self.periods, "exponent": self.exponent}
-        return {**about, "fitted_m": list(self.fitted_m), "quadratic_m": self.quadratic_m()}
+    fitted_m: list[float] | None
+    quadratic_m: list[float] | None
 
 
 class Theory(Probe):
@@ -112,10 +93,11 @@ class Theory(Probe):
         twins = twins_of(dataset, SceneRenderer.of(dataset))
         progress(1, 2, "one period, many distances")
         curves = error_curves(dataset.rig, twins.direction)
+        keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
         values = {
             "twins": twins.to_dict(),
             "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": [curve.to_dict() for curve in curves],
+            "curves": [{key: getattr(curve, key) for key in keys} for curve in curves],
         }
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
@@ -123,17 +105,12 @@ class Theory(Probe):
 
 def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
     """The first test object that fits into the working range twice, a whole period apart: at its own position and a
-    period away, or half a period to either side.
-
-    Raises `DiagnosisError` where there is none.
-    """
+    period away, or half a period to either side. Raises `DiagnosisError` where there is none."""
     near_m, far_m = (end / MM_PER_M for end in renderer.rig.working_range_mm)
     for sample in dataset.samples("test"):
         first = original(dataset, renderer, sample)
-        if not first.target.any():
-            continue
-        for start in STARTS_PERIODS:
-            shifts = [times(TAU * turns, constant) for turns in (start, start + 1)]
+        for start in STARTS_PERIODS if first.target.any() else ():
+            shifts = (times(TAU * turns, constant) for turns in (start, start + 1))
             pair = [moved(first.surface, renderer.rig, direction, shift) for shift in shifts]
             if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
                 return _photographed(renderer, first, pair, direction)
@@ -150,20 +127,15 @@ def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surfa
     least, most = np.minimum(*gains), np.maximum(*gains)
     paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
     scenes = [replace(first.scene, lit=replace(light, gain=least.astype(np.float32))) for light in lights]
-    sequence = renderer.rig.sequence
-    frame = sequence.sinusoids(direction)[0]
-    across = sequence.sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
-    silent = SceneRenderer(renderer.rig, noise_sigma_grey=0.0)
-    return Twins(
-        first.sample, direction, frame, across,
-        (pair[0].depth_mm(renderer.shape), pair[1].depth_mm(renderer.shape)),
-        _pair(renderer, scenes, frame), _pair(silent, scenes, frame), _pair(renderer, scenes, across), paint,
-    )  # fmt: skip
 
+    def frames(index: int, camera: SceneRenderer = renderer) -> list[NDArray[np.uint8]]:
+        return [np.asarray(camera.frames(scene, [index])[index]) for scene in scenes]
 
-def _pair(renderer: SceneRenderer, scenes: Sequence[Scene], index: int) -> Pair:
-    first, second = (np.asarray(renderer.frames(scene, [index])[index]) for scene in scenes)
-    return first, second
+    sinusoids = renderer.rig.sequence.sinusoids
+    frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
+    noiseless = frames(frame, SceneRenderer(renderer.rig, noise_sigma_grey=0.0))
+    depths_mm = [surface.depth_mm(renderer.shape) for surface in pair]
+    return Twins(first.sample, direction, frame, across, depths_mm, frames(frame), noiseless, frames(across), paint)
 
 
 def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
@@ -216,44 +188,39 @@ def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: 
     quadratic = finite & (np.abs(np.where(finite, local, 0.0) - 2) <= 2 * WITHIN)
     fitted = quadratic if quadratic.sum() > 2 else finite
     exponent = float(np.polyfit(np.log(distances[fitted]), np.log(error_mm[fitted]), 1)[0])
-    ends = float(distances[fitted].min()), float(distances[fitted].max())
-    return ErrorCurve(name, periods, distances, error_mm, np.where(finite, local, np.nan), exponent, ends)
-
-
-# ---- the report
+    fitted_m, quadratic_m = (
+        [float(end(distances[chosen])) for end in (np.min, np.max)] if chosen.any() else None
+        for chosen in (fitted, quadratic)
+    )
+    local = np.where(finite, local, np.nan)
+    return ErrorCurve(name, periods, distances, error_mm, local, exponent, fitted_m, quadratic_m)
 
 
 def summary(values: Mapping[str, Any]) -> str:
     """Both theorems with their numbers."""
     twins, curves = values["twins"], {curve["name"]: curve for curve in values["curves"]}
     small = next(iter(curves.values()))
-    away, both = curves["one period, away"], curves["one period, mean of both"]
+    away, both = (
+        f"from {_span(curve['quadratic_m'])}" if curve["quadratic_m"] else "at no distance from 0.3 m"
+        for curve in (curves["one period, away"], curves["one period, mean of both"])
+    )
     return (
         f"{twins['sample']} and a surface {twins['depth_apart_mean_mm']:.0f} mm from it on average give the same "
         f"{twins['direction']} fringe: {twins['differing_pixels']} of the image's pixels differ (the frame of the "
         f"other direction: {twins['differing_pixels_other_direction']}). The depth error of a small phase error grows "
         f"with exponent {small['exponent']:.3f} over {_span(small['fitted_m'])}. For a whole period the exponent is 2 "
-        f"within 1% {_where(away['quadratic_m'])} for an error away from the camera, and {_where(both['quadratic_m'])} "
-        f"for the mean of both sides."
+        f"within 1% {away} for an error away from the camera, and {both} for the mean of both sides."
     )
 
 
-def _span(ends: Sequence[float]) -> str:
-    return f"{ends[0]:.2g} to {ends[1]:.2g} m"
-
-
-def _where(ends: Sequence[float] | None) -> str:
-    return "at no distance from 0.3 m" if ends is None else f"from {_span(ends)}"
+def _span(ends: Sequence[float] | None) -> str:
+    return "-" if ends is None else f"{ends[0]:.2g} to {ends[1]:.2g} m"
 
 
 def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Table]:
     """Exponents, and errors at some distances."""
-    exponents, errors = [], []
+    errors = []
     for curve in curves:
-        quadratic = curve.quadratic_m()
-        exponents.append(
-            (curve.name, curve.exponent, _span(curve.fitted_m), "-" if quadratic is None else _span(quadratic))
-        )
         shown = np.interp(np.log(_SHOWN_M), np.log(curve.distances_m), curve.error_mm)
         errors.append((curve.name, *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
     same = {
@@ -264,6 +231,7 @@ def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Tabl
         "pixels that differ in the other direction's frame": "differing_pixels_other_direction",
         "least albedo factor on the brighter surface": "paint_least",
     }
+    exponents = [(curve.name, curve.exponent, _span(curve.fitted_m), _span(curve.quadratic_m)) for curve in curves]
     header = ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2")
     return [
         Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
@@ -275,15 +243,14 @@ def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Tabl
 def _draw_twins(twins: Twins, folder: Path) -> Figure:
     sheet = Sheet(2, 4, 10, 5.0)
     inside = twins.depths_mm[0] > 0
-    depths = [depth[inside] for depth in twins.depths_mm]
-    low, high = min(depth.min() for depth in depths), max(depth.max() for depth in depths)
-    pairs = (twins.frames, twins.direction), (twins.other_frames, "other direction")
+    depths = np.stack(twins.depths_mm)[:, inside]
     for row, (name, axis, depth) in enumerate(zip("AB", sheet.axes, twins.depths_mm, strict=True)):
         depth_mm = np.where(inside, depth, np.nan)
-        shown = sheet.picture(axis[0], depth_mm, f"scene {name}: depth, mm", "viridis", low, high)
+        shown = sheet.picture(axis[0], depth_mm, f"scene {name}: depth, mm", "viridis", depths.min(), depths.max())
         sheet.picture(axis[1], twins.frames[row], f"its {twins.direction} fringe", "gray", 0, 255)
         sheet.picture(axis[2], twins.other_frames[row], "its other direction", "gray", 0, 255)
         sheet.scale(shown, axis[0], fraction=0.05, pad=0.03)
+    pairs = (twins.frames, twins.direction), (twins.other_frames, "other direction")
     for axis, ((first, second), direction) in zip(sheet.axes[:, 3], pairs, strict=True):
         difference = second.astype(np.int64) - first
         title = f"B - A, {direction}:\n{np.count_nonzero(difference)} pixels differ"

@@ -2,8 +2,6 @@
 
 import argparse
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from rich import progress as bar
@@ -42,15 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--probe", action="append", default=[], metavar="NAME",
         help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
     )  # fmt: skip
-    parser.add_argument(
-        "--samples", type=_count, metavar="N", help="most samples of a split, taken evenly (default: the probe's)"
-    )
-    parser.add_argument(
-        "--seeds", type=_count, metavar="N", help="repeats of what depends on random numbers (default: 2)"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="a short run for a first look; its numbers are not reliable"
-    )
+    text = "most samples of a split, taken evenly (default: the probe's)"
+    parser.add_argument("--samples", type=_count, metavar="N", help=text)
+    text = "repeats of what depends on random numbers (default: 2)"
+    parser.add_argument("--seeds", type=_count, metavar="N", help=text)
+    text = "a short run for a first look; its numbers are not reliable"
+    parser.add_argument("--quick", action="store_true", help=text)
     parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
     parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
     parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
@@ -74,32 +69,22 @@ def run(args: argparse.Namespace) -> int:
     dataset = storage.DatasetFolder(args.dataset)
     model = diagnostics.subject(args.model, dataset, args.layers, args.units, args.frame, threads)
     settings = diagnostics.ProbeSettings(args.samples, args.seeds, args.quick)
-    with _bars() as progress:
-        diagnosis = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
-    show(_table(model.title, diagnosis))
-    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
-    return 0
-
-
-@contextmanager
-def _bars() -> "Iterator[Callable[[diagnostics.Probe], diagnostics.Progress]]":
-    """A bar for each probe, on standard error."""
     columns = (
         bar.TextColumn("{task.description}"), bar.BarColumn(), bar.TaskProgressColumn(), bar.TimeElapsedColumn(),
         bar.TimeRemainingColumn(),
     )  # fmt: skip
     with bar.Progress(*columns, console=Console(stderr=True)) as bars:
 
-        def started(probe: "diagnostics.Probe") -> "diagnostics.Progress":
+        def progress(probe: "diagnostics.Probe") -> "diagnostics.Progress":
             task = bars.add_task(probe.title, total=None)
+            return lambda done, total, activity: bars.update(
+                task, completed=done, total=total, description=f"{probe.title}: {activity}"
+            )
 
-            def show_progress(done: int, total: int, activity: str = "") -> None:
-                description = f"{probe.title}: {activity}" if activity else probe.title
-                bars.update(task, completed=done, total=total, description=description)
-
-            return show_progress
-
-        yield started
+        diagnosis = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+    show(_table(model.title, diagnosis))
+    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
+    return 0
 
 
 def _table(title: str, diagnosis: "diagnostics.Diagnosis") -> Table:

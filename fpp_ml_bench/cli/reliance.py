@@ -25,16 +25,12 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
-    parser.add_argument(
-        "dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects"
-    )
-    parser.add_argument(
-        "--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)"
-    )
-    parser.add_argument(
-        "--into", type=Path, metavar="FILE",
-        help="write the score into this result or leaderboard row of the same method (.json)",
-    )  # fmt: skip
+    text = "dataset folder; scenes are made from its test objects"
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help=text)
+    text = "samples of each test object, 1 to 6 (default: 2)"
+    parser.add_argument("--views", type=int, default=2, metavar="N", help=text)
+    text = "write the score into this result or leaderboard row of the same method (.json)"
+    parser.add_argument("--into", type=Path, metavar="FILE", help=text)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
     add_method_options(parser)
 
@@ -53,16 +49,11 @@ def run(args: argparse.Namespace) -> int:
     if entry is not None:
         check_same_method(entry, method)
     scene_set = diagnostics.SceneSet(dataset, args.views)
-    advanced = 0
+    sha256 = method.settings.get("weights_sha256")
+    sha256 = sha256 if isinstance(sha256, str) else None
     with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
-
-        def progress(done: int, total: int, activity: str = "") -> None:
-            nonlocal advanced
-            advance(done - advanced)
-            advanced = done
-
-        sha256 = method.settings.get("weights_sha256")
-        reliance, _ = diagnostics.measure(method, scene_set, sha256 if isinstance(sha256, str) else None, progress)
+        # Called before each sample, so the first call is for none.
+        reliance, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
     if args.json is not None:
         result.write_json(reliance.model_dump(mode="json"), args.json)
     if entry is not None:

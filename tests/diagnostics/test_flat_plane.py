@@ -60,8 +60,8 @@ def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
 def test_collapse_is_nearer_to_background_than_to_any_object():
     mm, normalised = Scale(False, (1700.0, 1900.0), 1500.0), Scale(True, (1700.0, 1900.0), 1500.0)
     values = np.array([-1.0, 0.0, 749.0, 751.0])
-    assert mm.collapsed(values).tolist() == [True, True, True, False] and mm.mm(values) is values
-    assert normalised.collapsed(np.array([-1.2, 0.09, 0.11])).tolist() == [True, True, False]
+    assert (values < mm.limit).tolist() == [True, True, True, False] and mm.mm(values) is values
+    assert (np.array([-1.2, 0.09, 0.11]) < normalised.limit).tolist() == [True, True, False]
     assert normalised.mm(np.array([0.5])).tolist() == [1800.0]
 
 

@@ -91,7 +91,7 @@ def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_
     for seed, r in ((0, 0.2), (1, 0.4)):
         for _ in range(3):
             correlations.add(f"untrained {seed}", "a", OWN, r)
-    assert correlations.mean("a", EDGES).r == pytest.approx(0.3) and correlations.mean("a", EDGES).count == 2
+    assert correlations.mean("a", EDGES).r == pytest.approx(0.3) and correlations.mean("a", EDGES).samples == 2
     assert correlations.mean("a", OWN, trained=False).r == pytest.approx(0.3)
     assert correlations.average(EDGES).r == pytest.approx(0.2)
     assert ratio(correlations.average(EDGES).r, correlations.average(FRINGES).r) == pytest.approx(2)
