@@ -5,13 +5,12 @@ self-reported, or a row file: a result and a ``provenance``, which the maintaine
 is shown on the submission's page.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content
+from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content, write_json
 from fpp_ml_bench.evaluation.schema import StrictModel, validate
 from fpp_ml_bench.files import printable, write_atomically
 
@@ -111,16 +110,15 @@ def read_entry(path: Path) -> Entry:
 
 
 def write_row(entry: Entry, provenance: str, path: Path) -> None:
-    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or a path
-    that can't be written."""
+    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or an unwritable path."""
     if provenance not in PROVENANCES:
         raise SubmissionError(f"expected a provenance out of {', '.join(PROVENANCES)}, got {printable(provenance)!r}")
-    content = {
-        "row_schema_version": ROW_SCHEMA_VERSION,
-        "provenance": provenance,
-        "result": result_content(entry.result),
-    }
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    head = {"row_schema_version": ROW_SCHEMA_VERSION, "provenance": provenance}
+    write_json({**head, "result": result_content(entry.result)}, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 ``text``, complete or not at all. SubmissionError where it can't be written."""
     try:
         write_atomically(path, text.encode("utf-8"))
     except OSError as error:

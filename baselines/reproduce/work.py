@@ -13,12 +13,14 @@ from hashlib import sha256
 from pathlib import Path
 from textwrap import shorten
 from time import perf_counter
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any
 
 import torch
 
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads
+from fpp_ml_bench.baselines.reproduce import scoring
 from fpp_ml_bench.baselines.reproduce.plan import (
     PREDICTED,
     Folders,
@@ -29,15 +31,8 @@ from fpp_ml_bench.baselines.reproduce.plan import (
     planned,
     variants,
 )
-from fpp_ml_bench.baselines.reproduce.scoring import (
-    all_frames_that_hold,
-    score_all_frames,
-    score_method,
-    write_all_frames,
-)
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
-from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -45,32 +40,16 @@ PAPER_PRESET = "paper"
 REASON_LENGTH = 400
 
 
-class Leaderboard(Protocol):
-    """Keeps the rows, and shows them beside the paper's."""
-
-    def row_that_holds(self, path: Path, opened: DatasetFolder, weights_sha256: str) -> object:
-        """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
-
-    def check_row_is_of(self, path: Path, opened: DatasetFolder) -> None:
-        """Raises SubmissionError where ``path`` is a row on other data."""
-
-    def write_measured(self, result: Result, path: Path) -> None:
-        """Write a row that was measured here. Raises SubmissionError."""
-
-    def table_page(self, table: str, settings: "ReproduceSettings", outcome: "Outcome") -> str:
-        """A table as Markdown."""
-
-
 @dataclass(frozen=True)
 class ReproduceSettings:
-    """Settings of a run. ``minutes`` limits the whole run; ``command`` continues it; ``anyway`` trains the paper's
-    preset without a GPU; ``only_missing`` keeps rows that are up to date; ``show``: the engine's progress on stderr;
-    ``report`` takes a line of progress."""
+    """Settings of a run. ``leaderboard`` (`fpp_ml_bench.leaderboard.reproduced`) keeps the rows; ``minutes`` limits the
+    whole run; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
+    that are up to date; ``show``: the engine's progress on stderr; ``report`` takes a line of progress."""
 
     tables: Sequence[str]
     folders: Folders
     command: str
-    leaderboard: Leaderboard
+    leaderboard: ModuleType
     data: Path | None = None
     only_missing: bool = False
     minutes: float | None = None
@@ -110,7 +89,7 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
             _work(settings, outcome)
         finally:
             for table in settings.tables:
-                outcome.tables.append(_write_table(table, settings, outcome))
+                outcome.tables.append(settings.leaderboard.write_table(table, settings, outcome))
     return outcome
 
 
@@ -120,32 +99,31 @@ def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
     started = perf_counter()
     training_seconds: list[float] = []
     for number, job in enumerate(jobs, 1):
+        name, out = job.recipe.name, folders.training(job.recipe)
         minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
-        trained = is_trained(folders.training(job.recipe))
         if minutes_left is not None and minutes_left <= 0:
-            outcome.stopped = job.recipe.name
+            outcome.stopped = name
             return
+        trained = is_trained(out)
         left = _time_left(training_seconds, jobs[number - 1 :], folders)
-        settings.report(f"[{number}/{len(jobs)}] {job.recipe.name} ({', '.join(job.rows)}){left}")
+        settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)}){left}")
         began = perf_counter()
         try:
-            run = train(
-                job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=minutes_left, show=settings.show
-            )
+            run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left, show=settings.show)
             if not run.finished:
-                outcome.stopped = job.recipe.name
+                outcome.stopped = name
                 return
             _score(job, run, settings, outcome.opened)
         except (TrainingError, PredictionError, WeightsError) as error:
             # The other trainings, which take hours, may still succeed.
-            outcome.failed[job.recipe.name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
+            outcome.failed[name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
             settings.report(f"  failed, its rows stay as they are: {error}")
         if not trained:
             training_seconds.append(perf_counter() - began)
 
 
 def _time_left(training_seconds: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
-    """Words on the time that is left, estimated from the mean of the trainings of this call."""
+    """Estimated from the mean of the trainings of this call."""
     untrained = sum(not is_trained(folders.training(job.recipe)) for job in jobs)
     if not training_seconds or not untrained:
         return ""
@@ -160,10 +138,8 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
     model = load(finished_weights(recipe, run, opened, folders, settings.only_missing))
     if job.all_frames:
         _score_all_frames(recipe, model, settings, opened)
-    seconds = round(run.seconds, 1)
-    about: dict[str, Setting] = {
-        "recipe_digest": recipe.digest, "epochs_trained": run.epochs, "training_seconds": seconds,
-    }  # fmt: skip
+    about: dict[str, Setting] = {"recipe_digest": recipe.digest, "epochs_trained": run.epochs}
+    about["training_seconds"] = round(run.seconds, 1)
     for variant in variants(recipe):
         path = folders.row(recipe, variant)
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
@@ -172,7 +148,7 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         with _restored_threads():
             method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
-            result = score_method(opened, method, path, folders)
+            result = scoring.score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
         settings.report(f"  {path.stem}: object MAE {_mm(result.metrics.object_mae_mm)}, {result.track} track")
 
@@ -180,16 +156,13 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
 def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
     """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
     path = settings.folders.all_frames(recipe)
-    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+    if settings.only_missing and scoring.all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    scores = score_all_frames(
-        opened,
-        lambda frame: model.predict_representation([frame])[0],
-        opened.sequence.config(recipe.data_config),
-        SCORING[recipe.normalisation],
-        {"recipe": recipe.name, "weights_sha256": model.sha256},
+    frames, about = opened.sequence.config(recipe.data_config), {"recipe": recipe.name, "weights_sha256": model.sha256}
+    scores = scoring.score_all_frames(
+        opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
     )
-    write_all_frames(scores, path)
+    scoring.write_all_frames(scores, path)
     settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
 
 
@@ -199,22 +172,12 @@ def _mm(value: float | None) -> str:
 
 @contextmanager
 def _restored_threads() -> Iterator[None]:
-    """A network's method sets torch's threads for the whole process; restore them for the next training."""
+    """A network's method sets torch's threads for the whole process; the next training needs its own."""
     threads = torch.get_num_threads()
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
-    path = settings.folders.table(table)
-    text = settings.leaderboard.table_page(table, settings, outcome)
-    try:
-        write_atomically(path, text.encode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
-    return path
 
 
 def is_trained(out: Path) -> bool:

@@ -21,7 +21,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
     Scored,
     orderings,
     orderings_sentence,
-    scored_result,
+    scored,
     table_lines,
     table_markdown,
 )
@@ -108,11 +108,12 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
     jobs, run_folders = planned(["normalization"], "cpu"), folders(tmp_path)
     first = open_dataset(dataset.path, jobs, run_folders, print)
     assert open_dataset(dataset.path, jobs, run_folders, print).fingerprint == first.fingerprint
-    recorded = json.loads(run_folders.dataset_record.read_text())
-    run_folders.dataset_record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
+    record = run_folders.runs / "dataset.json"
+    recorded = json.loads(record.read_text())
+    record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
     with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
         open_dataset(dataset.path, jobs, run_folders, print)
-    run_folders.dataset_record.write_text("{")
+    record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
         open_dataset(dataset.path, jobs, run_folders, print)
 
@@ -122,8 +123,8 @@ def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: E
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
     mean = float(np.mean(list(errors.values())))
     samples = {sample: (sample.rpartition("_")[0], error) for sample, error in errors.items()}
-    scored = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
-    return Line(label, label, load_recipe("loss/rmse"), scored, entry, paper)
+    of_samples = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
+    return Line(label, label, load_recipe("loss/rmse"), of_samples, entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -172,7 +173,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     ]
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_result(entry.result))
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored(entry.result))
         for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
