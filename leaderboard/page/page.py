@@ -19,9 +19,8 @@ from fpp_ml_bench.evaluation.result import PART_TITLES, result_json
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import tables
 from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
-from fpp_ml_bench.leaderboard.paper import PaperTable
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, picture_of, read_entry
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, PaperTable, picture_of, read_entry
 from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"

@@ -14,7 +14,6 @@ from fpp_ml_bench.cli import reproduce as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
@@ -25,7 +24,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
     table_lines,
     table_markdown,
 )
-from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.leaderboard.rows import Entry, paper_tables
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +37,12 @@ def folders(tmp_path, preset="cpu"):
 
 
 def test_the_command_knows_the_recipes_tables_and_presets():
-    assert PAPER_TABLES == command.TABLES == TABLES and command.PRESETS == PRESETS
+    assert command.TABLES == TABLES and command.PRESETS == PRESETS
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_rows_of_one_recipe_are_one_training(preset):
-    jobs = planned(PAPER_TABLES, preset)
+    jobs = planned(TABLES, preset)
     rows = [row for job in jobs for row in job.rows]
     assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 5 and len(jobs) == 23
     shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
@@ -58,8 +57,8 @@ def test_rows_of_one_recipe_are_one_training(preset):
 
 
 def test_lines_hold_the_papers_numbers(tmp_path, dataset):
-    jobs = planned(PAPER_TABLES, "cpu")
-    for table in PAPER_TABLES:
+    jobs = planned(TABLES, "cpu")
+    for table in TABLES:
         by_row = {line.row: line for line in table_lines(table, jobs, folders(tmp_path), dataset)}
         for row in paper_tables()[table].rows:
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
