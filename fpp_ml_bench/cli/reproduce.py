@@ -77,12 +77,9 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.leaderboard import reproduced
 
     command = _command(args)
-    outcome = reproduce.reproduce(
-        reproduce.ReproduceSettings(
-            tables, folders, command, reproduced, args.data, args.only_missing, args.minutes, args.anyway,
-            report=_report,
-        )
-    )  # fmt: skip
+    options = (args.data, args.only_missing, args.minutes, args.anyway)
+    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report=_report)
+    outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
         orderings = reproduced.orderings_sentence(reproduced.orderings(lines))
@@ -108,13 +105,12 @@ def _command(args: argparse.Namespace) -> str:
     for option, value in (("--data", args.data), ("--rows", args.rows)):
         words += [] if value is None else [option, str(value)]
     words += [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
-    words += ["--only-missing"]
-    words += [] if args.minutes is None else ["--minutes", f"{args.minutes:g}"]
+    words += ["--only-missing", *([] if args.minutes is None else ["--minutes", f"{args.minutes:g}"])]
     words += ["--anyway"] if args.anyway else []
     return shlex.join(words)
 
 
-def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> None:
+def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
     from rich.table import Table
 
     from fpp_ml_bench.cli.console import show
