@@ -42,7 +42,7 @@ class Mark:
     """A mark of ``radius`` points at a cost ``x`` and an error ``y``, both above 0, with the intervals of both.
 
     ``colour``: of `COLOURS` or of matplotlib. ``number``: unique in a drawing, ``name`` explains it in the key. For a
-    page: ``title`` under the mouse, ``css`` classes, ``row``: id of the row that the mark belongs to, ``url``: its page.
+    page: ``title`` under the mouse, ``css`` classes, ``row``: id of the row that it belongs to, ``url``: its page.
     """
 
     x: float
@@ -131,7 +131,7 @@ class Scatter:
         return numbered
 
     def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
-        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks that it shows by number.
+        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks shown by number.
 
         It is styled by attributes and by the page, which forbids style of its own. ``css``, its classes, and ``about``,
         its description, tell it from other pictures of the page.
