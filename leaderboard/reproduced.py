@@ -45,12 +45,8 @@ def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> En
     if entry is None:
         return None
     result = entry.result
-    same = (
-        result.dataset.fingerprint == opened.fingerprint
-        and result.submission.settings.get("weights_sha256") == weights_sha256
-        and result.protocol_version == PROTOCOL_VERSION
-    )
-    return entry if same else None
+    found = (result.dataset.fingerprint, result.submission.settings.get("weights_sha256"), result.protocol_version)
+    return entry if found == (opened.fingerprint, weights_sha256, PROTOCOL_VERSION) else None
 
 
 def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
@@ -248,13 +244,11 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
 def table_rich(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The table for a terminal, with the columns that fit."""
     shown = [(number, short) for number, (_, short) in enumerate(_titles(preset)) if short is not None]
-    rich_table = Table(
-        title=Text(
-            f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset; "
-            f"paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
-        ),
-        title_justify="left",
+    title = (
+        f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset; "
+        f"paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
     )
+    rich_table = Table(title=Text(title), title_justify="left")
     for number, short in shown:
         rich_table.add_column(Text(short), justify="right" if number > 1 else "left", overflow="fold")
     for cells in map(_cells, lines):
@@ -295,11 +289,8 @@ def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> lis
     empty = [line for line in lines if line.scored is None]
     if not empty:
         return []
-    reasons = [
-        f"- {markdown_text(line.label)}: {markdown_text(failed[line.recipe.name])}"
-        for line in empty
-        if line.recipe.name in failed
-    ]
+    why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe.name in failed]
+    reasons = [f"- {markdown_text(label)}: {markdown_text(reason)}" for label, reason in why]
     names = ", ".join(dict.fromkeys(line.row for line in empty))
     return [f"Not measured here: {markdown_text(names)}. To fill: `{command}`", *reasons, ""]
 

@@ -218,9 +218,9 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
     lines += [f"### {PAPER_HEADING}", ""] if papers else []
     right = [number >= PAPER_TEXT_COLUMNS for number in range(len(PAPER_TITLES))]
     for paper in papers:
-        rows = [[markdown_text(cell) for cell in paper_cells(row)] for row in paper.rows]
-        lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), ""]
-        lines += [*markdown_rows(PAPER_TITLES, right, rows), "", paper_note(paper), ""]
+        rows = [list(map(markdown_text, paper_cells(row))) for row in paper.rows]
+        lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), "", *markdown_rows(PAPER_TITLES, right, rows), ""]
+        lines += [paper_note(paper), ""]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 

@@ -5,9 +5,7 @@ No training is ever deleted: a finished training is used, a stopped one continue
 
 import json
 import shlex
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -19,18 +17,9 @@ from typing import Any
 import torch
 
 from fpp_ml_bench.baselines.method import Setting
-from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads
-from fpp_ml_bench.baselines.reproduce import scoring
-from fpp_ml_bench.baselines.reproduce.plan import (
-    PREDICTED,
-    Folders,
-    Job,
-    Report,
-    differing,
-    open_dataset,
-    planned,
-    variants,
-)
+from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads, torch_threads
+from fpp_ml_bench.baselines.reproduce import plan, scoring
+from fpp_ml_bench.baselines.reproduce.plan import PREDICTED, Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.files import exclusive, write_atomically
@@ -44,7 +33,7 @@ REASON_LENGTH = 400
 class ReproduceSettings:
     """Settings of a run. ``leaderboard`` (`fpp_ml_bench.leaderboard.reproduced`) keeps the rows; ``minutes`` limits the
     whole run; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
-    that are up to date; ``show``: the engine's progress on stderr; ``report`` takes a line of progress."""
+    that are up to date; ``report`` takes a line of progress."""
 
     tables: Sequence[str]
     folders: Folders
@@ -54,7 +43,6 @@ class ReproduceSettings:
     only_missing: bool = False
     minutes: float | None = None
     anyway: bool = False
-    show: bool = True
     report: Report = print
 
 
@@ -79,11 +67,11 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     predicting and scoring raise.
     """
     folders = settings.folders
-    jobs = planned(settings.tables, folders.preset)
+    jobs = plan.planned(settings.tables, folders.preset)
     check_run_folders(jobs, folders)
     check_machine(jobs, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
-        opened = open_dataset(settings.data, jobs, folders, settings.report)
+        opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
         outcome = Outcome(opened, jobs)
         try:
             _work(settings, outcome)
@@ -109,7 +97,7 @@ def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
         settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)}){left}")
         began = perf_counter()
         try:
-            run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left, show=settings.show)
+            run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left)
             if not run.finished:
                 outcome.stopped = name
                 return
@@ -145,7 +133,8 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
-        with _restored_threads():
+        # A network's method sets torch's threads for the whole process; the next training needs its own.
+        with torch_threads(torch.get_num_threads()):
             method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
             result = scoring.score_method(opened, method, path, folders)
@@ -170,16 +159,6 @@ def _mm(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} mm"
 
 
-@contextmanager
-def _restored_threads() -> Iterator[None]:
-    """A network's method sets torch's threads for the whole process; the next training needs its own."""
-    threads = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def is_trained(out: Path) -> bool:
     """Whether a training folder holds a finished training."""
     return (out / DONE).is_file()
@@ -191,16 +170,14 @@ def state_of(out: Path) -> str:
 
 
 def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
-    """Refuse, before hours of work, a training folder that was made by another recipe. Nothing is ever deleted.
-
-    Raises TrainingError, which names the folder, the settings that differ and the cure.
-    """
+    """Refuse, before hours of work, a training folder of another recipe: TrainingError names the folder, the settings
+    that differ and the cure."""
     for job in jobs:
         path = folders.training(job.recipe) / RECIPE
         if not path.is_file():
             continue
         try:
-            differs = differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
+            differs = plan.differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
@@ -226,10 +203,8 @@ def check_machine(jobs: Sequence[Job], folders: Folders, anyway: bool, command: 
 
 
 def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, folders: Folders, keep: bool) -> Path:
-    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them.
-
-    ``keep``: a file that was made from the same weights is used as it is.
-    """
+    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them. ``keep``: one
+    that was made from the same weights is used as it is."""
     target, source = folders.weights(recipe), file_sha256(run.weights)
     if keep and _made_from(target, source):
         return target
@@ -237,11 +212,9 @@ def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, fo
     if PREDICTED in variants(recipe):
         save_with_heads(run.weights, opened.path, target)
     else:
-        partial = target.with_suffix(".partial")
-        shutil.copyfile(run.weights, partial)
-        partial.replace(target)
-    content = {"made_from_sha256": source, "sha256": file_sha256(target)}
-    write_atomically(target.with_suffix(".json"), (json.dumps(content) + "\n").encode("utf-8"))
+        write_atomically(target, run.weights.read_bytes())
+    content = json.dumps({"made_from_sha256": source, "sha256": file_sha256(target)})
+    write_atomically(target.with_suffix(".json"), f"{content}\n".encode())
     return target
 
 
