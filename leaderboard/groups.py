@@ -1,10 +1,9 @@
 """Groups of the leaderboard: what results must share to be ranked together, what its methods assumed or were told, and
-how a group, its data and its rows are called.
-
-Short names are for tables and pictures; a row's own page has the long name and every setting. Rows of this package's
-methods get a name from their method and settings. Every other submission keeps its own name, cut at a word.
+how a group, its data and its rows are called. Rows of this package's methods get a short name from their settings;
+every other submission keeps its own name, cut at a word.
 """
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -49,8 +48,7 @@ _RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None:
 
 @dataclass(frozen=True, order=True)
 class GroupKey:
-    """What two results must share to be compared. The dataset is identified by its
-    ``fingerprint``, not by its folder's name."""
+    """What two results must share to be compared. ``fingerprint`` identifies the dataset, not its folder's name."""
 
     track: str
     mode: str
@@ -193,8 +191,8 @@ def _phase(submission: Submission) -> str:
         name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
     else:
         name = f"Phase, {_whole(settings['frames'])} {direction}"
-    shading, standoff = bool(settings["shading"]), settings.get("prior") == "standoff"
-    if not shading:
+    standoff = settings.get("prior") == "standoff"
+    if not settings["shading"]:
         return f"{name}, standoff alone" if standoff else f"{name}, no shading"
     return f"{name}, standoff" if standoff else name
 
@@ -231,9 +229,7 @@ def _loss(label: str) -> str:
 
 
 def _whole(value: object) -> int:
-    if not isinstance(value, int):
-        raise TypeError("expected a whole number")
-    return value
+    return operator.index(value)  # type: ignore[arg-type]  # TypeError for all but a whole number
 
 
 _METHODS = {

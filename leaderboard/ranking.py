@@ -92,12 +92,12 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
                 f"{printable(entry.name)!r} on the same data; leave one out, or give one another name"
             )
         named[entry.name] = entry
-    values = {id(entry): _badness(entry.value(sort), sort) for entry in entries}
-    ordered = sorted(entries, key=lambda entry: (values[id(entry)] is None, values[id(entry)] or 0.0, entry.name))
-    ranges = rank_ranges(
-        [values[id(entry)] for entry in ordered],
-        [None if sort in HIGHER_IS_BETTER or sort in SIGNED else entry.interval(sort) for entry in ordered],
-    )
+    valued = [(_badness(entry.value(sort), sort), entry) for entry in entries]
+    valued.sort(key=lambda pair: (pair[0] is None, pair[0] or 0.0, pair[1].name))
+    ordered = [entry for _, entry in valued]
+    without_interval = sort in HIGHER_IS_BETTER or sort in SIGNED
+    intervals = [None if without_interval else entry.interval(sort) for entry in ordered]
+    ranges = rank_ranges([value for value, _ in valued], intervals)
     names = short_names([entry.result.submission for entry in ordered])
     ranked = tuple(Ranked(*ends, entry, name) for ends, entry, name in zip(ranges, ordered, names, strict=True))
     return Group(key, min(entry.result.dataset.name for entry in entries), ranked)

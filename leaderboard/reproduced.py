@@ -1,5 +1,5 @@
-"""The paper's tables as reproduced: rows that were measured here, written and read as rows of the leaderboard and shown
-beside the numbers reported by the paper, and which of its orderings hold.
+"""The paper's tables as reproduced: rows that were measured here, kept as rows of the leaderboard and shown beside the
+numbers reported by the paper, and which of its orderings hold.
 
 An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
 where it has the opposite sign and leaves 0 out, and is *within noise* otherwise. The interval is that of
@@ -8,11 +8,14 @@ where it has the opposite sign and leaves 0 out, and is *within noise* otherwise
 
 import statistics
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
+
+from rich.table import Table
+from rich.text import Text
 
 from fpp_ml_bench.baselines import reproduce
 from fpp_ml_bench.baselines.reproduce import MAIN_KEY, MEAN, PREDICTED, Folders, Job, Variant
@@ -22,15 +25,11 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.report import percent
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.leaderboard.paper import paper_tables
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, PROVENANCES, Entry, read_entry, write_row
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, Entry, paper_tables, read_entry, write_row, write_text
 from fpp_ml_bench.leaderboard.tables import device, markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-MEASURED_HERE = PROVENANCES[0]
+MEASURED_HERE = "measured here"
 _NOT_IN_THE_PAPER = {"hformer": "Hformer"}
 _TRACKS_DIFFER = "*"
 
@@ -46,12 +45,8 @@ def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> En
     if entry is None:
         return None
     result = entry.result
-    same = (
-        result.dataset.fingerprint == opened.fingerprint
-        and result.submission.settings.get("weights_sha256") == weights_sha256
-        and result.protocol_version == PROTOCOL_VERSION
-    )
-    return entry if same else None
+    found = (result.dataset.fingerprint, result.submission.settings.get("weights_sha256"), result.protocol_version)
+    return entry if found == (opened.fingerprint, weights_sha256, PROTOCOL_VERSION) else None
 
 
 def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
@@ -73,12 +68,18 @@ def _sound_row(path: Path) -> Entry | None:
 
 @dataclass(frozen=True)
 class Scored:
-    """The six errors in mm by the keys of `HEADLINE`, the 95% interval of the object MAE, and each sample's own:
-    sample to (object, object MAE in mm)."""
+    """Errors in mm by the keys of `HEADLINE`, the 95% interval of the object MAE, and each sample's own: sample to
+    (object, object MAE in mm)."""
 
     errors_mm: dict[str, float | None]
     interval_mm: tuple[float, float] | None
     samples: dict[str, tuple[str, float | None]]
+
+
+def scored(scores: Result | reproduce.AllFrames) -> Scored:
+    """The scores of a row's result, or those over all frames."""
+    samples = {row.sample: (row.object, getattr(getattr(row, "metrics", row), MAIN_KEY)) for row in scores.per_sample}
+    return Scored({key: getattr(scores.metrics, key) for key in HEADLINE}, scores.intervals.of(MAIN_KEY), samples)
 
 
 @dataclass(frozen=True)
@@ -105,58 +106,32 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
     recipes = {name: job.recipe for job in jobs for name in job.rows}
     lines = []
     for row in table_rows(table):
-        recipe = recipes[f"{table}/{row}"]
-        label, paper_mm = (
-            (reported[row].label, reported[row].errors_mm)
-            if row in reported
-            else (_NOT_IN_THE_PAPER.get(row, row), None)
-        )
+        recipe, paper = recipes[f"{table}/{row}"], reported.get(row)
+        label, paper_mm = (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
         weights = reproduce.current_weights(recipe, folders)
         if weights is None:
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
         sha256 = reproduce.file_sha256(weights)
-        main, *twin_variants = reproduce.variants(recipe)
-        entry = row_that_holds(folders.row(recipe, main), opened, sha256)
-        twins = {
-            twin.suffix: found
-            for twin in twin_variants
-            if (found := row_that_holds(folders.row(recipe, twin), opened, sha256)) is not None
-        }
-        first = None if entry is None else scored_result(entry.result)
+        suffixes = [variant.suffix for variant in reproduce.variants(recipe)]
+        paths = [folders.row(recipe, variant) for variant in reproduce.variants(recipe)]
+        entry, *others = (row_that_holds(path, opened, sha256) for path in paths)
+        twins = {suffix: twin for suffix, twin in zip(suffixes[1:], others, strict=True) if twin is not None}
+        first = None if entry is None else scored(entry.result)
         if table != "multi_frame" or len(opened.sequence.config(recipe.data_config)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
-        all_frames = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
-        every = None if all_frames is None else scored_frames(all_frames)
-        lines.append(Line(row, label, recipe, every, entry, paper_mm))
+        every = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+        lines.append(Line(row, label, recipe, every and scored(every), entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
 
 
-def scored_result(result: Result) -> Scored:
-    """Scores of a row's result."""
-    samples = {row.sample: (row.object, row.object_mae_mm) for row in result.per_sample}
-    return Scored(_headline(result.metrics), result.intervals.of(MAIN_KEY), samples)
-
-
-def scored_frames(scores: reproduce.AllFrames) -> Scored:
-    """Scores over all frames."""
-    samples = {row.sample: (row.object, row.metrics.object_mae_mm) for row in scores.per_sample}
-    return Scored(_headline(scores.metrics), scores.intervals.of(MAIN_KEY), samples)
-
-
-def _headline(metrics: object) -> dict[str, float | None]:
-    return {key: getattr(metrics, key) for key in HEADLINE}
-
-
 @dataclass(frozen=True)
 class Ordering:
-    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``.
-
-    ``gap_mm`` is worse minus better here, the mean over samples, ``interval_mm`` its 95% interval (None with fewer than
-    two objects). ``same_track`` is False where the two rows were told different things about the test samples.
-    """
+    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; here the mean over
+    samples of worse minus better is ``gap_mm``, its 95% interval ``interval_mm`` (None with fewer than two objects).
+    ``same_track`` is False where the two rows were told different things about the test samples."""
 
     better: str
     worse: str
@@ -192,81 +167,92 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
     return judged
 
 
-@dataclass(frozen=True)
-class Column:
-    """``text`` makes the cell of a line; ``short`` is the title in a terminal, None where the column is left out."""
-
-    title: str
-    short: str | None
-    text: Callable[[Line], str]
-    right: bool = True
-
-
-def columns(preset: str) -> tuple[Column, ...]:
-    """The table's columns."""
+def _titles(preset: str) -> list[tuple[str, str | None]]:
+    """Title of each column of `_cells` in a file and in a terminal, which leaves those without out; the first two hold
+    text."""
     measured, paper = f"{MEASURED_HERE}, {preset} preset", BY_THE_PAPER
     twin = f"object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
-    return (
-        Column("Row", "Row", lambda line: line.label, right=False),
-        Column("Track", None, lambda line: "-" if line.entry is None else line.entry.result.track, right=False),
-        Column(f"Object MAE / RMSE, {measured}", "Object, here", lambda line: _here(line, "object")),
-        Column(f"95% interval of the object MAE, {MEASURED_HERE}", "95% of MAE", _interval),
-        Column(f"Object MAE / RMSE, {paper}", "Object, paper", lambda line: _pair(line.paper_mm, "object")),
-        Column(f"Overall MAE / RMSE, {measured}", "Overall, here", lambda line: _here(line, "overall")),
-        Column(f"Overall MAE / RMSE, {paper}", "Overall, paper", lambda line: _pair(line.paper_mm, "overall")),
-        Column(f"Background MAE / RMSE, {measured}", None, lambda line: _here(line, "background")),
-        Column(f"Background MAE / RMSE, {paper}", None, lambda line: _pair(line.paper_mm, "background")),
-        Column(f"Range predicted: {twin}", "Range predicted", lambda line: _twin(line, PREDICTED)),
-        Column(f"Range of the training mean: {twin}", None, lambda line: _twin(line, MEAN)),
-        Column("Parameters", None, _parameters),
-        Column("Epochs", "Epochs", lambda line: _setting(line, "epochs_trained")),
-        Column("Training, s", "s", lambda line: _setting(line, "training_seconds")),
-        Column("Latency, ms", "ms", _latency),
-    )
+    return [
+        ("Row", "Row"), ("Track", None), (f"Object MAE / RMSE, {measured}", "Object, here"),
+        (f"95% interval of the object MAE, {MEASURED_HERE}", "95% of MAE"),
+        (f"Object MAE / RMSE, {paper}", "Object, paper"), (f"Overall MAE / RMSE, {measured}", "Overall, here"),
+        (f"Overall MAE / RMSE, {paper}", "Overall, paper"), (f"Background MAE / RMSE, {measured}", None),
+        (f"Background MAE / RMSE, {paper}", None), (f"Range predicted: {twin}", "Range predicted"),
+        (f"Range of the training mean: {twin}", None), ("Parameters", None), ("Epochs", "Epochs"),
+        ("Training, s", "s"), ("Latency, ms", "ms"),
+    ]  # fmt: skip
 
 
-def table_page(table: str, settings: reproduce.ReproduceSettings, outcome: reproduce.Outcome) -> str:
-    """The page of a table as Markdown, from the rows that there are."""
-    lines = table_lines(table, outcome.jobs, settings.folders, outcome.opened)
-    return table_markdown(table, lines, settings.folders.preset, settings.command, outcome.failed)
+def _cells(line: Line) -> list[str]:
+    """A dash where nothing is known; errors with the paper's two decimals."""
+    entry, paper = line.entry, line.paper_mm
+    here, interval = (line.scored.errors_mm, line.scored.interval_mm) if line.scored else (None, None)
+    settings = entry.result.submission.settings if entry else {}
+    counts = [settings.get("epochs_trained"), settings.get("training_seconds")]
+    timing, latency = (entry.result.timing, entry.latency_ms) if entry else (None, None)
+    return [
+        line.label, entry.result.track if entry else "-", _pair(here, "object"),
+        " - ".join(map(_mm, interval)) if interval else "-",
+        _pair(paper, "object"), _pair(here, "overall"), _pair(paper, "overall"), _pair(here, "background"),
+        _pair(paper, "background"), _twin(line, PREDICTED), _twin(line, MEAN),
+        f"{timing.parameters:,}" if timing else "-",
+        *(f"{count:,.0f}" if isinstance(count, int | float) else "-" for count in counts),
+        "-" if latency is None else f"{latency:.3g}",
+    ]  # fmt: skip
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _pair(errors_mm: Mapping[str, float | None] | None, pixels: str) -> str:
+    """MAE and RMSE."""
+    return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
+
+
+def _twin(line: Line, variant: Variant) -> str:
+    """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
+    entry = line.twins.get(variant.suffix)
+    if entry is None:
+        return "-"
+    errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
+    return " / ".join([*errors, percent(entry.value("object_missing_share"))])
+
+
+def write_table(table: str, settings: reproduce.ReproduceSettings, outcome: reproduce.Outcome) -> Path:
+    """Write the page of a table from the rows that there are; its path. SubmissionError where it can't be written."""
+    folders = settings.folders
+    lines = table_lines(table, outcome.jobs, folders, outcome.opened)
+    text = table_markdown(table, lines, folders.preset, settings.command, outcome.failed)
+    write_text(folders.table(table), text)
+    return folders.table(table)
 
 
 def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
     """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name to its error."""
-    shown = columns(preset)
-    rows = [[markdown_text(column.text(line)) for column in shown] for line in lines]
+    titles = [title for title, _ in _titles(preset)]
+    rows = [list(map(markdown_text, _cells(line))) for line in lines]
     parts = [
-        f"# {markdown_text(paper_tables()[table].title)}",
-        "",
-        f"Made by `{command}`. Errors in mm, mean over samples.",
-        *_about(lines),
-        "",
-        *markdown_rows([column.title for column in shown], [column.right for column in shown], rows),
-        "",
-        *_missing(lines, command, failed),
-        *_twins_explained(lines),
-        *_orderings(orderings(lines)),
-    ]
+        f"# {markdown_text(paper_tables()[table].title)}", "",
+        f"Made by `{command}`. Errors in mm, mean over samples.", *_about(lines), "",
+        *markdown_rows(titles, [number > 1 for number in range(len(titles))], rows), "",
+        *_missing(lines, command, failed), *_twins_explained(lines), *_orderings(orderings(lines)),
+    ]  # fmt: skip
     return "\n".join(parts).rstrip("\n") + "\n"
 
 
-def table_rich(table: str, lines: Sequence[Line], preset: str) -> "Table":
+def table_rich(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The table for a terminal, with the columns that fit."""
-    from rich.table import Table
-    from rich.text import Text
-
-    terminal_columns = [column for column in columns(preset) if column.short is not None]
-    rich_table = Table(
-        title=Text(
-            f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset; "
-            f"paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
-        ),
-        title_justify="left",
+    shown = [(number, short) for number, (_, short) in enumerate(_titles(preset)) if short is not None]
+    title = (
+        f"{paper_tables()[table].title}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset; "
+        f"paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
     )
-    for column in terminal_columns:
-        rich_table.add_column(Text(column.short or ""), justify="right" if column.right else "left", overflow="fold")
-    for line in lines:
-        rich_table.add_row(*(Text(column.text(line)) for column in terminal_columns))
+    rich_table = Table(title=Text(title), title_justify="left")
+    for number, short in shown:
+        rich_table.add_column(Text(short), justify="right" if number > 1 else "left", overflow="fold")
+    for cells in map(_cells, lines):
+        rich_table.add_row(*(Text(cells[number]) for number, _ in shown))
     return rich_table
 
 
@@ -300,31 +286,25 @@ def _about(lines: Sequence[Line]) -> list[str]:
 
 
 def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
-    empty = list(dict.fromkeys(line.row for line in lines if line.scored is None))
+    empty = [line for line in lines if line.scored is None]
     if not empty:
         return []
-    reasons = [
-        f"- {markdown_text(line.label)}: {markdown_text(failed[line.recipe.name])}"
-        for line in lines
-        if line.scored is None and line.recipe.name in failed
-    ]
-    return [f"Not measured here: {markdown_text(', '.join(empty))}. To fill: `{command}`", *reasons, ""]
+    why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe.name in failed]
+    reasons = [f"- {markdown_text(label)}: {markdown_text(reason)}" for label, reason in why]
+    names = ", ".join(dict.fromkeys(line.row for line in empty))
+    return [f"Not measured here: {markdown_text(names)}. To fill: `{command}`", *reasons, ""]
 
 
 def _twins_explained(lines: Sequence[Line]) -> list[str]:
-    parts = []
-    if any(line.twins for line in lines):
-        parts += [
-            "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought "
-            "to mm with a range predicted by a small head from the image, or with the mean range of the training "
-            "samples. The difference between their object MAE and the row's own is what the oracle gave: the range, "
-            "and also the mask, because a twin must find the object itself, and an object pixel that it misses costs "
-            "its whole depth.",
-            "",
-        ]
-    if any(line.recipe.background_removed for line in lines):
-        parts += ["With the background removed the input shows the test sample's object mask; no twins there.", ""]
-    return parts
+    twins = (
+        "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought to "
+        "mm with a range predicted by a small head from the image, or with the mean range of the training samples. The "
+        "difference between their object MAE and the row's own is what the oracle gave: the range, and also the mask, "
+        "because a twin must find the object itself, and an object pixel that it misses costs its whole depth."
+    )
+    removed = "With the background removed the input shows the test sample's object mask; no twins there."
+    parts = [twins, ""] if any(line.twins for line in lines) else []
+    return parts + ([removed, ""] if any(line.recipe.background_removed for line in lines) else [])
 
 
 def _orderings(judged: Sequence[Ordering]) -> list[str]:
@@ -347,47 +327,3 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
         told = "one of the two was given the test sample's range, which is part of the difference."
         parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {told}"]
     return parts
-
-
-def _mm(value: float | None) -> str:
-    """Millimetres with the paper's two decimals."""
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _here(line: Line, pixels: str) -> str:
-    return _pair(None if line.scored is None else line.scored.errors_mm, pixels)
-
-
-def _pair(errors_mm: Mapping[str, float | None] | None, pixels: str) -> str:
-    """MAE and RMSE."""
-    return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
-
-
-def _interval(line: Line) -> str:
-    if line.scored is None or line.scored.interval_mm is None:
-        return "-"
-    return " - ".join(map(_mm, line.scored.interval_mm))
-
-
-def _twin(line: Line, variant: Variant) -> str:
-    """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
-    entry = line.twins.get(variant.suffix)
-    if entry is None:
-        return "-"
-    errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
-    return " / ".join([*errors, percent(entry.value("object_missing_share"))])
-
-
-def _setting(line: Line, key: str) -> str:
-    value = None if line.entry is None else line.entry.result.submission.settings.get(key)
-    return f"{value:,.0f}" if isinstance(value, int | float) else "-"
-
-
-def _parameters(line: Line) -> str:
-    timing = None if line.entry is None else line.entry.result.timing
-    return "-" if timing is None else f"{timing.parameters:,}"
-
-
-def _latency(line: Line) -> str:
-    latency = None if line.entry is None else line.entry.latency_ms
-    return "-" if latency is None else f"{latency:.3g}"

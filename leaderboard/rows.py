@@ -2,16 +2,19 @@
 
 A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which counts as
 self-reported, or a row file: a result and a ``provenance``, which the maintainers set. A PNG of the same name beside it
-is shown on the submission's page.
+is shown on the submission's page. The paper's own rows, as typed in from its tables, are in ``paper_rows.json``; this
+package did not measure them, and they are never ranked with measured rows.
 """
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
 
+from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content
+from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content, write_json
 from fpp_ml_bench.evaluation.schema import StrictModel, validate
 from fpp_ml_bench.files import printable, write_atomically
 
@@ -31,6 +34,9 @@ MEANING = {
     LOCAL: "A result on this machine that is in no leaderboard.",
     BY_THE_PAPER: "Typed in from the paper's tables, measured by its authors on other data with other code.",
 }
+
+PAPER_HEADING = "Reported by the paper on other data (not measured here)"
+SHOWN_BY_DEFAULT = ("architecture", "normalization")
 
 LARGEST_PICTURE_BYTES = 2_000_000
 LARGEST_PICTURE_PX = 4096
@@ -111,16 +117,15 @@ def read_entry(path: Path) -> Entry:
 
 
 def write_row(entry: Entry, provenance: str, path: Path) -> None:
-    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or a path
-    that can't be written."""
+    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or an unwritable path."""
     if provenance not in PROVENANCES:
         raise SubmissionError(f"expected a provenance out of {', '.join(PROVENANCES)}, got {printable(provenance)!r}")
-    content = {
-        "row_schema_version": ROW_SCHEMA_VERSION,
-        "provenance": provenance,
-        "result": result_content(entry.result),
-    }
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    head = {"row_schema_version": ROW_SCHEMA_VERSION, "provenance": provenance}
+    write_json({**head, "result": result_content(entry.result)}, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 ``text``, complete or not at all. SubmissionError where it can't be written."""
     try:
         write_atomically(path, text.encode("utf-8"))
     except OSError as error:
@@ -144,3 +149,41 @@ def picture_of(entry: Entry) -> bytes | None:
     if data[:8] != _PNG or data[12:16] != b"IHDR" or not all(0 < side <= LARGEST_PICTURE_PX for side in sides):
         raise SubmissionError(f"{shown}: expected a PNG of at most {LARGEST_PICTURE_PX} px a side")
     return data
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row of a table: errors in mm by the keys of `HEADLINE`, on ``test_samples`` (view, frame) pairs."""
+
+    row: str
+    label: str
+    track: str
+    test_samples: int
+    errors_mm: dict[str, float]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table of the paper, its rows in the paper's order."""
+
+    name: str
+    title: str
+    rows: tuple[PaperRow, ...]
+
+
+@cache
+def paper_tables() -> dict[str, PaperTable]:
+    """Every table of the paper by name, in the order of `TABLES`."""
+    content = json.loads(Path(__file__).with_name("paper_rows.json").read_text(encoding="utf-8"))
+    tables = {}
+    for table in content["tables"]:
+        errors_mm = [dict(zip(content["columns"], row.pop("errors_mm"), strict=True)) for row in table["rows"]]
+        rows = tuple(PaperRow(**row, errors_mm=errors) for row, errors in zip(table["rows"], errors_mm, strict=True))
+        tables[table["name"]] = PaperTable(table["name"], table["title"], rows)
+    return {name: tables[name] for name in TABLES}
+
+
+def chosen_tables(choice: str | None) -> list[PaperTable]:
+    """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
+    several = {None: SHOWN_BY_DEFAULT, "all": TABLES, "none": ()}
+    return [paper_tables()[name] for name in several.get(choice, (choice,))]

@@ -1,22 +1,23 @@
-"""The leaderboard as tables: in the terminal, as Markdown, and as JSON, from one description of the columns. The same
-rows give the same bytes."""
+"""The leaderboard as tables from one description of the columns: in the terminal, as Markdown, as JSON, and as the
+block of README.md between two markers, which is not edited by hand. The same rows give the same bytes."""
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 from rich.table import Table
 from rich.text import Text
 
+from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
-from fpp_ml_bench.leaderboard.paper import PAPER_HEADING, PaperRow, PaperTable
-from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.leaderboard.groups import ASSUMED, LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
+from fpp_ml_bench.leaderboard.rows import PAPER_HEADING, Entry, PaperRow, PaperTable, paper_tables
 
 SELF_REPORTED = "*"
 NOT_MEASURED = "not measured"
@@ -54,6 +55,15 @@ PAPER_TITLES = (
     "Backgr. RMSE",
 )  # fmt: skip
 PAPER_TEXT_COLUMNS = 2
+BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
+SHOWN = 5
+"""Rows of a group that README shows; the page shows them all."""
+_MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in `leaderboard/rows/`."
+_README_NOTE = (
+    f"{_MADE_BY} Errors in mm. {RANK_NOTE} Intervals: bootstrap over objects. Time: median latency of one image. "
+    f"\\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 does not "
+    "follow it (docs/reliance.md)."
+)
 _PLAIN = frozenset(" -,+()/%=.")
 
 
@@ -69,43 +79,40 @@ class Column:
 
 
 def columns(sort: str) -> list[Column]:
-    """Columns of a ranking by ``sort``; a key without a column gets its own."""
+    """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
+    named = {*_ERRORS, "seconds_per_sample", "frames_used"}
+    own = {} if sort in named else {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
+    errors = []
+    for key, (title, from_width) in {**own, **_ERRORS}.items():
+        errors.append(Column(title, partial(_error, key), from_width=0 if key == sort else from_width))
+        if key == sort in HEADLINE:
+            interval = partial(_interval, between="-", key=sort)
+            errors.append(Column("95% interval", interval, from_width=MIDDLE))
     return [
-        Column("Rank", lambda row: row.ranks),
-        Column("Method", lambda row: printable(row.short_name), right=False),
-        *_error_columns(sort),
-        Column("s/sample", _time),
-        Column("Frames", lambda row: str(row.entry.frames)),
-        Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE),
-        Column("Provenance", lambda row: row.entry.provenance, right=False, from_width=MIDDLE),
+        _RANK, _METHOD, *errors, Column("s/sample", _seconds), _FRAMES, replace(_RELIANCE, from_width=WIDE),
+        replace(_PROVENANCE, from_width=MIDDLE),
         Column("Assumes", lambda row: assumption(row.entry.result) or "-", right=False, from_width=WIDEST),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
         Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
-    ]
-
-
-def _error_columns(sort: str) -> Iterator[Column]:
-    """The errors; beside the one that the rows are ranked by, its interval."""
-    own = {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
-    own = {} if sort in (*_ERRORS, "seconds_per_sample", "frames_used") else own
-    for key, (title, from_width) in {**own, **_ERRORS}.items():
-        yield Column(title, partial(_error, key), from_width=0 if key == sort else from_width)
-        if key == sort in HEADLINE:
-            yield Column("95% interval", partial(_interval, sort), from_width=MIDDLE)
+    ]  # fmt: skip
 
 
 def _error(key: str, row: Ranked) -> str:
     return (percent if key.endswith("_share") else millimetres)(row.entry.value(key))
 
 
-def _interval(key: str, row: Ranked) -> str:
-    ends = row.entry.interval(key)
-    return "-" if ends is None else "-".join(map(millimetres, ends))
+def _interval(row: Ranked, between: str, key: str = "object_mae_mm") -> str:
+    return between.join(map(millimetres, row.entry.interval(key) or ())) or "-"
 
 
-def _time(row: Ranked) -> str:
+def _seconds(row: Ranked) -> str:
     value = row.entry.value("seconds_per_sample")
     return seconds(value) + (SELF_REPORTED if value is not None and not row.entry.time_measured else "")
+
+
+def _milliseconds(row: Ranked) -> str:
+    ms = row.entry.latency_ms
+    return "-" if ms is None else f"{ms:.3g}{'' if row.entry.time_measured else SELF_REPORTED}"
 
 
 def reliance(entry: Entry) -> str:
@@ -211,51 +218,99 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
     lines += [f"### {PAPER_HEADING}", ""] if papers else []
     right = [number >= PAPER_TEXT_COLUMNS for number in range(len(PAPER_TITLES))]
     for paper in papers:
-        rows = [[markdown_text(cell) for cell in paper_cells(row)] for row in paper.rows]
-        lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), ""]
-        lines += [*markdown_rows(PAPER_TITLES, right, rows), "", paper_note(paper), ""]
+        rows = [list(map(markdown_text, paper_cells(row))) for row in paper.rows]
+        lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), "", *markdown_rows(PAPER_TITLES, right, rows), ""]
+        lines += [paper_note(paper), ""]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
 def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
     """The whole leaderboard as JSON: groups of ranked rows, and the paper's tables apart."""
-    content = {
-        "sorted_by": sort,
-        "groups": [
-            {
-                **asdict(group.key),
-                "title": group.key.title,
-                "legacy": group.key.is_legacy,
-                "dataset": group.dataset_name,
-                "rows": [_json_row(row) for row in group.rows],
-            }
-            for group in groups
-        ],
-        "reported_by_the_paper": [asdict(paper) for paper in papers],
-    }
+    of_groups = [
+        {
+            **asdict(group.key), "title": group.key.title, "legacy": group.key.is_legacy,
+            "dataset": group.dataset_name, "rows": list(map(_json_row, group.rows)),
+        }
+        for group in groups
+    ]  # fmt: skip
+    content = {"sorted_by": sort, "groups": of_groups, "reported_by_the_paper": list(map(asdict, papers))}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def _json_row(row: Ranked) -> dict[str, Any]:
-    result = row.entry.result
+    entry, result = row.entry, row.entry.result
+    timing, reliance = (part and part.model_dump(mode="json") for part in (result.timing, result.reliance))
     return {
-        "best_rank": row.best_rank,
-        "worst_rank": row.worst_rank,
-        "name": row.entry.name,
-        "short_name": row.short_name,
-        "method": result.submission.method,
-        "provenance": row.entry.provenance,
-        "metrics": result.metrics.model_dump(mode="json"),
-        "intervals": result.intervals.model_dump(mode="json"),
+        "best_rank": row.best_rank, "worst_rank": row.worst_rank, "name": entry.name, "short_name": row.short_name,
+        "method": result.submission.method, "provenance": entry.provenance,
+        "metrics": result.metrics.model_dump(mode="json"), "intervals": result.intervals.model_dump(mode="json"),
         "per_object": [part.model_dump(mode="json") for part in result.per_object],
-        "seconds_per_sample": row.entry.value("seconds_per_sample"),
-        "time_measured_here": row.entry.time_measured,
-        "timing": None if result.timing is None else result.timing.model_dump(mode="json"),
-        "phase_reliance": None if result.reliance is None else result.reliance.model_dump(mode="json"),
-        "timed_on": device(row.entry),
-        "assumes": assumption_sentences(result),
-        "frames_used": row.entry.frames,
-        "samples": result.dataset.samples,
-        "created": result.created,
-        "source": row.entry.path.name,
-    }
+        "seconds_per_sample": entry.value("seconds_per_sample"), "time_measured_here": entry.time_measured,
+        "timing": timing, "phase_reliance": reliance, "timed_on": device(entry),
+        "assumes": assumption_sentences(result), "frames_used": entry.frames, "samples": result.dataset.samples,
+        "created": result.created, "source": entry.path.name,
+    }  # fmt: skip
+
+
+def readme_block(groups: Sequence[Group]) -> str:
+    """What is between README's markers: the best `SHOWN` rows of each group, and the paper's architectures."""
+    if not groups:
+        return f"No row yet. {_MADE_BY}\n"
+    lines: list[str] = []
+    for group in groups:
+        machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
+        timed = f"; measured on {', '.join(machines)}" if machines else ""
+        lines += [f"**{markdown_text(group.key.title + timed)}**", ""]
+        lines += [*markdown_columns(_README_COLUMNS, group.rows[:SHOWN]), ""]
+        more = len(group.rows) - SHOWN
+        lines += [f"… and {more} more on the page", ""] if more > 0 else []
+    results = [row.entry.result for group in groups for row in group.rows]
+    assuming = sorted({result.submission.method for result in results if assumption(result)})
+    notes = [_README_NOTE] + ([f"{' and '.join(assuming)} assume {ASSUMED}."] if assuming else [])
+    notes += [LEGACY_NOTE] if any(group.key.is_legacy for group in groups) else []
+    keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _README_ERRORS]
+    paper = [
+        [row.label, *(f"{row.errors_mm[key]:.2f}" for key in keys), f"told {TOLD[row.track]}"]
+        for row in paper_tables()["architecture"].rows
+    ]
+    rows = [list(map(markdown_text, cells)) for cells in paper]
+    lines += ["**Reported by the paper on other data, not measured here and not ranked with the rows above**", ""]
+    lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]
+    return "\n".join([*lines, " ".join(notes)]) + "\n"
+
+
+_RANK = Column("Rank", lambda row: row.ranks)
+_METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
+_FRAMES = Column("Frames", lambda row: str(row.entry.frames))
+_RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
+_PROVENANCE = Column("Provenance", lambda row: row.entry.provenance, right=False)
+_README_ERRORS = (
+    Column("Object MAE, mm", partial(_error, "object_mae_mm")),
+    Column("Object RMSE", partial(_error, "object_rmse_mm")),
+    Column("Overall MAE", partial(_error, "overall_mae_mm")),
+)  # fmt: skip
+_README_COLUMNS = (
+    _RANK, _METHOD, _README_ERRORS[0], Column("95% interval", partial(_interval, between=" - ")), *_README_ERRORS[1:],
+    Column("Time, ms", _milliseconds), _FRAMES, _RELIANCE, _PROVENANCE,
+)  # fmt: skip
+
+
+def update_readme(path: Path, groups: Sequence[Group], check: bool) -> bool:
+    """Whether ``path`` holds the block of ``groups`` already; if not, write it, except with ``check``."""
+    try:
+        text = path.read_bytes().decode("utf-8")
+        begin, end = text.find(BEGIN), text.find(END)
+        if text.count(BEGIN) != 1 or text.count(END) != 1 or end < begin:
+            raise SubmissionError(
+                f"{printable(str(path), 500)}: expected {BEGIN} and below it {END}, each once; put them where the "
+                "ranking belongs"
+            )
+        updated = f"{text[: begin + len(BEGIN)]}\n\n{readme_block(groups)}\n{text[end:]}"
+        if updated == text:
+            return True
+        if not check:
+            write_atomically(path, updated.encode("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = "is no UTF-8 text" if isinstance(error, UnicodeDecodeError) else f"failed: {error.strerror}"
+        raise SubmissionError(f"{printable(str(path), 500)} {reason}") from None
+    return False

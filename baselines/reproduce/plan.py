@@ -1,12 +1,10 @@
 """The work for a table of the paper: which trainings fill which of its rows, the paths of their files, and the dataset,
-which is built where it is missing and is the same for every row of a run.
-
-Rows that resolve to one recipe (``normalization/individual``, ``loss/rmse`` and ``multi_frame/frame0``) are a single
-training and a single row of the leaderboard.
+which is built where it is missing and is the same for every row of a run. Rows that resolve to one recipe
+(``normalization/individual``, ``loss/rmse``, ``multi_frame/frame0``) are one training and one row of the leaderboard.
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -66,11 +64,6 @@ class Folders:
     runs: Path
     rows: Path
 
-    @property
-    def dataset_record(self) -> Path:
-        """File that records the dataset of all trainings and scores in this folder."""
-        return self.runs / "dataset.json"
-
     def training(self, recipe: Recipe) -> Path:
         return self.runs / recipe.name
 
@@ -119,28 +112,22 @@ def differing(first: dict, second: dict, words: str = "{} and {}") -> str:
     return ", ".join(f"{key} ({words.format(first.get(key), second.get(key))})" for key in keys)
 
 
-def common_size(jobs: Iterable[Job]) -> int:
-    """Image width and height in px that all ``jobs`` train on. RecipeError where they differ."""
-    sizes = {job.recipe.size: job.recipe.name for job in jobs}
-    if len(sizes) != 1:
-        raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
-    return next(iter(sizes))
-
-
 def default_folder(preset: str, size: int) -> Path:
     """``data/full`` for the benchmark's own size, else named after preset and size, like ``data/cpu224``."""
     return Path("data") / ("full" if size == FULL_SIZE else f"{preset}{size}")
 
 
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
-    """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none.
-
-    Every table uses all 50 objects and 52 frames, so that all share a dataset and its fingerprint.
+    """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none: all 50 objects
+    and 52 frames, which every table shares.
 
     Raises DatasetError for a dataset of another image size than the preset's, without a frame that a row needs, or
     another dataset than the trainings in the runs folder; BuildError where it can't be built.
     """
-    size = common_size(jobs)
+    sizes = {job.recipe.size: job.recipe.name for job in jobs}
+    if len(sizes) != 1:
+        raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
+    (size,) = sizes
     folder = default_folder(folders.preset, size) if folder is None else folder
     if not (folder / MANIFEST).is_file():
         report(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
@@ -165,7 +152,7 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
 
 def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
     """Record the dataset in the runs folder; refuse a dataset other than the recorded one."""
-    record = folders.dataset_record
+    record = folders.runs / "dataset.json"
     content = {"fingerprint": opened.fingerprint, "size": list(opened.size), "folder": str(opened.path)}
     try:
         if not record.is_file():

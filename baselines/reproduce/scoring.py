@@ -8,7 +8,7 @@ every sample has the same frames, and the interval can then be taken over object
 
 import shutil
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -38,9 +38,7 @@ Scores = dict[str, float | None]
 
 def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), draw the picture
-    beside the row.
-
-    Files of an earlier run under this name are replaced at the end; an interrupted run leaves nothing that is taken for
+    beside the row. Files of an earlier run are replaced at the end: an interrupted run leaves nothing that is taken for
     finished. Raises what predicting, timing and scoring raise.
     """
     name = row.stem
@@ -113,37 +111,26 @@ def score_all_frames(
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
             metrics = score_sample(*scored_pair(values, target_mm, *scoring, sample)).metrics()
             scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
-    rows = [_mean(scores[sample, frame] for frame in frames) for sample in samples]
+    rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
+    of_frames = [_mean([scores[sample, frame] for sample in samples]) for frame in frames]
     objects = [split_sample_name(sample)[0] for sample in samples]
-    ends: dict[str, list[float | None]] = {
-        key: [None, None] if interval is None else list(interval)
-        for key, interval in intervals_over_objects(rows, objects, HEADLINE).items()
-    }
+    ends = intervals_over_objects(rows, objects, HEADLINE)
     return AllFrames(
-        schema_version="1.0.0",
-        protocol_version=PROTOCOL_VERSION,
-        fingerprint=opened.fingerprint,
-        mode=scoring[1],
-        frames=list(frames),
-        pairs=len(scores),
-        metrics=Headline(**_mean(rows)),
-        intervals=Intervals(**ends),
-        per_frame=[
-            FrameMean(frame=frame, metrics=Headline(**_mean(scores[sample, frame] for sample in samples)))
-            for frame in frames
-        ],
+        schema_version="1.0.0", protocol_version=PROTOCOL_VERSION, fingerprint=opened.fingerprint, mode=scoring[1],
+        frames=list(frames), pairs=len(scores), metrics=Headline(**_mean(rows)),
+        intervals=Intervals(**{key: list(interval or (None, None)) for key, interval in ends.items()}),
+        per_frame=[FrameMean(frame=f, metrics=Headline(**row)) for f, row in zip(frames, of_frames, strict=True)],
         per_sample=[
             SampleMean(sample=sample, object=name, metrics=Headline(**row))
             for sample, name, row in zip(samples, objects, rows, strict=True)
         ],
         **about,
-    )
+    )  # fmt: skip
 
 
-def _mean(rows: Iterable[Scores]) -> Scores:
+def _mean(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each headline score over the rows that have it."""
-    kept = list(rows)
-    values_by_key = {key: [value for row in kept if (value := row[key]) is not None] for key in HEADLINE}
+    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
     return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
 
 
@@ -160,8 +147,6 @@ def read_all_frames(path: Path) -> AllFrames:
 
 def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> AllFrames | None:
     """The scores in ``path`` if valid and of this dataset, these weights and the current protocol; else None."""
-    if not path.is_file():
-        return None
     try:
         scores = read_all_frames(path)
     except SubmissionError:

@@ -5,39 +5,23 @@ No training is ever deleted: a finished training is used, a stopped one continue
 
 import json
 import shlex
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from textwrap import shorten
 from time import perf_counter
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any
 
 import torch
 
 from fpp_ml_bench.baselines.method import Setting
-from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads
-from fpp_ml_bench.baselines.reproduce.plan import (
-    PREDICTED,
-    Folders,
-    Job,
-    Report,
-    differing,
-    open_dataset,
-    planned,
-    variants,
-)
-from fpp_ml_bench.baselines.reproduce.scoring import (
-    all_frames_that_hold,
-    score_all_frames,
-    score_method,
-    write_all_frames,
-)
+from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads, torch_threads
+from fpp_ml_bench.baselines.reproduce import plan, scoring
+from fpp_ml_bench.baselines.reproduce.plan import PREDICTED, Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
-from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -45,37 +29,20 @@ PAPER_PRESET = "paper"
 REASON_LENGTH = 400
 
 
-class Leaderboard(Protocol):
-    """Keeps the rows, and shows them beside the paper's."""
-
-    def row_that_holds(self, path: Path, opened: DatasetFolder, weights_sha256: str) -> object:
-        """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
-
-    def check_row_is_of(self, path: Path, opened: DatasetFolder) -> None:
-        """Raises SubmissionError where ``path`` is a row on other data."""
-
-    def write_measured(self, result: Result, path: Path) -> None:
-        """Write a row that was measured here. Raises SubmissionError."""
-
-    def table_page(self, table: str, settings: "ReproduceSettings", outcome: "Outcome") -> str:
-        """A table as Markdown."""
-
-
 @dataclass(frozen=True)
 class ReproduceSettings:
-    """Settings of a run. ``minutes`` limits the whole run; ``command`` continues it; ``anyway`` trains the paper's
-    preset without a GPU; ``only_missing`` keeps rows that are up to date; ``show``: the engine's progress on stderr;
-    ``report`` takes a line of progress."""
+    """Settings of a run. ``leaderboard`` (`fpp_ml_bench.leaderboard.reproduced`) keeps the rows; ``minutes`` limits the
+    whole run; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
+    that are up to date; ``report`` takes a line of progress."""
 
     tables: Sequence[str]
     folders: Folders
     command: str
-    leaderboard: Leaderboard
+    leaderboard: ModuleType
     data: Path | None = None
     only_missing: bool = False
     minutes: float | None = None
     anyway: bool = False
-    show: bool = True
     report: Report = print
 
 
@@ -100,17 +67,17 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     predicting and scoring raise.
     """
     folders = settings.folders
-    jobs = planned(settings.tables, folders.preset)
+    jobs = plan.planned(settings.tables, folders.preset)
     check_run_folders(jobs, folders)
     check_machine(jobs, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
-        opened = open_dataset(settings.data, jobs, folders, settings.report)
+        opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
         outcome = Outcome(opened, jobs)
         try:
             _work(settings, outcome)
         finally:
             for table in settings.tables:
-                outcome.tables.append(_write_table(table, settings, outcome))
+                outcome.tables.append(settings.leaderboard.write_table(table, settings, outcome))
     return outcome
 
 
@@ -120,32 +87,31 @@ def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
     started = perf_counter()
     training_seconds: list[float] = []
     for number, job in enumerate(jobs, 1):
+        name, out = job.recipe.name, folders.training(job.recipe)
         minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
-        trained = is_trained(folders.training(job.recipe))
         if minutes_left is not None and minutes_left <= 0:
-            outcome.stopped = job.recipe.name
+            outcome.stopped = name
             return
+        trained = is_trained(out)
         left = _time_left(training_seconds, jobs[number - 1 :], folders)
-        settings.report(f"[{number}/{len(jobs)}] {job.recipe.name} ({', '.join(job.rows)}){left}")
+        settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)}){left}")
         began = perf_counter()
         try:
-            run = train(
-                job.recipe, outcome.opened.path, folders.training(job.recipe), minutes=minutes_left, show=settings.show
-            )
+            run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left)
             if not run.finished:
-                outcome.stopped = job.recipe.name
+                outcome.stopped = name
                 return
             _score(job, run, settings, outcome.opened)
         except (TrainingError, PredictionError, WeightsError) as error:
             # The other trainings, which take hours, may still succeed.
-            outcome.failed[job.recipe.name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
+            outcome.failed[name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
             settings.report(f"  failed, its rows stay as they are: {error}")
         if not trained:
             training_seconds.append(perf_counter() - began)
 
 
 def _time_left(training_seconds: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
-    """Words on the time that is left, estimated from the mean of the trainings of this call."""
+    """Estimated from the mean of the trainings of this call."""
     untrained = sum(not is_trained(folders.training(job.recipe)) for job in jobs)
     if not training_seconds or not untrained:
         return ""
@@ -160,19 +126,18 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
     model = load(finished_weights(recipe, run, opened, folders, settings.only_missing))
     if job.all_frames:
         _score_all_frames(recipe, model, settings, opened)
-    seconds = round(run.seconds, 1)
-    about: dict[str, Setting] = {
-        "recipe_digest": recipe.digest, "epochs_trained": run.epochs, "training_seconds": seconds,
-    }  # fmt: skip
+    about: dict[str, Setting] = {"recipe_digest": recipe.digest, "epochs_trained": run.epochs}
+    about["training_seconds"] = round(run.seconds, 1)
     for variant in variants(recipe):
         path = folders.row(recipe, variant)
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
-        with _restored_threads():
+        # A network's method sets torch's threads for the whole process; the next training needs its own.
+        with torch_threads(torch.get_num_threads()):
             method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
-            result = score_method(opened, method, path, folders)
+            result = scoring.score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
         settings.report(f"  {path.stem}: object MAE {_mm(result.metrics.object_mae_mm)}, {result.track} track")
 
@@ -180,41 +145,18 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
 def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
     """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
     path = settings.folders.all_frames(recipe)
-    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+    if settings.only_missing and scoring.all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    scores = score_all_frames(
-        opened,
-        lambda frame: model.predict_representation([frame])[0],
-        opened.sequence.config(recipe.data_config),
-        SCORING[recipe.normalisation],
-        {"recipe": recipe.name, "weights_sha256": model.sha256},
+    frames, about = opened.sequence.config(recipe.data_config), {"recipe": recipe.name, "weights_sha256": model.sha256}
+    scores = scoring.score_all_frames(
+        opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
     )
-    write_all_frames(scores, path)
+    scoring.write_all_frames(scores, path)
     settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
 
 
 def _mm(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} mm"
-
-
-@contextmanager
-def _restored_threads() -> Iterator[None]:
-    """A network's method sets torch's threads for the whole process; restore them for the next training."""
-    threads = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
-    path = settings.folders.table(table)
-    text = settings.leaderboard.table_page(table, settings, outcome)
-    try:
-        write_atomically(path, text.encode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
-    return path
 
 
 def is_trained(out: Path) -> bool:
@@ -228,16 +170,14 @@ def state_of(out: Path) -> str:
 
 
 def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
-    """Refuse, before hours of work, a training folder that was made by another recipe. Nothing is ever deleted.
-
-    Raises TrainingError, which names the folder, the settings that differ and the cure.
-    """
+    """Refuse, before hours of work, a training folder of another recipe: TrainingError names the folder, the settings
+    that differ and the cure."""
     for job in jobs:
         path = folders.training(job.recipe) / RECIPE
         if not path.is_file():
             continue
         try:
-            differs = differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
+            differs = plan.differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
@@ -263,10 +203,8 @@ def check_machine(jobs: Sequence[Job], folders: Folders, anyway: bool, command: 
 
 
 def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, folders: Folders, keep: bool) -> Path:
-    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them.
-
-    ``keep``: a file that was made from the same weights is used as it is.
-    """
+    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them. ``keep``: one
+    that was made from the same weights is used as it is."""
     target, source = folders.weights(recipe), file_sha256(run.weights)
     if keep and _made_from(target, source):
         return target
@@ -274,11 +212,9 @@ def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, fo
     if PREDICTED in variants(recipe):
         save_with_heads(run.weights, opened.path, target)
     else:
-        partial = target.with_suffix(".partial")
-        shutil.copyfile(run.weights, partial)
-        partial.replace(target)
-    content = {"made_from_sha256": source, "sha256": file_sha256(target)}
-    write_atomically(target.with_suffix(".json"), (json.dumps(content) + "\n").encode("utf-8"))
+        write_atomically(target, run.weights.read_bytes())
+    content = json.dumps({"made_from_sha256": source, "sha256": file_sha256(target)})
+    write_atomically(target.with_suffix(".json"), f"{content}\n".encode())
     return target
 
 

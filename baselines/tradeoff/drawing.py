@@ -41,9 +41,8 @@ Place = tuple[float, float]
 class Mark:
     """A mark of ``radius`` points at a cost ``x`` and an error ``y``, both above 0, with the intervals of both.
 
-    ``colour``: of `COLOURS` or of matplotlib. ``number`` is unique in a drawing, and ``name`` explains it in the key.
-    For a page: ``title`` is shown under the mouse, ``css`` are classes, ``row`` is the id of a row that the mark
-    belongs to, and ``url`` its page.
+    ``colour``: of `COLOURS` or of matplotlib. ``number``: unique in a drawing, ``name`` explains it in the key. For a
+    page: ``title`` under the mouse, ``css`` classes, ``row``: id of the row that it belongs to, ``url``: its page.
     """
 
     x: float
@@ -77,9 +76,7 @@ class Scatter:
 
     def draw(self, axes: Axes) -> list[Mark]:
         """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown by a number."""
-        axes.set_xlabel(self.across)
-        axes.set_ylabel(self.up)
-        axes.set(xscale="log", yscale="log")
+        axes.set(xlabel=self.across, ylabel=self.up, xscale="log", yscale="log")
         left, right = axes.set_xlim(_ends([end for m in self.marks for end in (m.x, *(m.x_span or ()))]))
         bottom, top = axes.set_ylim(_ends([end for m in self.marks for end in (m.y, *(m.y_span or ()))]))
         log_axes(axes)
@@ -134,10 +131,10 @@ class Scatter:
         return numbered
 
     def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
-        """An ``svg`` element of ``width`` by ``height`` px, and the marks that it shows by number.
+        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks shown by number.
 
-        It is styled by attributes and by the page, which forbids style of its own; its colours are the page's. ``css``:
-        its classes, ``about``: its description, which together tell it from other pictures of the page.
+        It is styled by attributes and by the page, which forbids style of its own. ``css``, its classes, and ``about``,
+        its description, tell it from other pictures of the page.
         """
         text = io.StringIO()
         with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
@@ -161,10 +158,8 @@ class Scatter:
         content = content[content.index("<g ") : content.rindex("</g>") + len("</g>")]
         content = re.sub(r"<[^>]*>", lambda found: _for_page(found[0], groups), content)
         content = re.sub(r"\s*\n\s*", " ", content)
-        return (
-            f'<svg class="{css}" viewBox="0 0 {width} {height}" role="img" aria-label="{escaped(about, 5000)}">'
-            f"{content}</svg>"
-        ), numbered
+        head = f'<svg class="{css}" viewBox="0 0 {width} {height}" role="img" aria-label="{escaped(about, 5000)}">'
+        return f"{head}{content}</svg>", numbered
 
 
 def log_axes(axes: Axes) -> None:
@@ -173,14 +168,13 @@ def log_axes(axes: Axes) -> None:
     axes.grid(True, color=COLOURS["line"], lw=0.8)
     axes.set_axisbelow(True)
     for axis in (axes.xaxis, axes.yaxis):
+        axis.label.set_color(COLOURS["soft"])
         low, high = axis.get_view_interval()
         factors = (1, 1.5, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if high < 300 * low else (1,)
         axis.set_major_locator(LogLocator(subs=factors))
         axis.set_major_formatter(FuncFormatter(lambda value, place: f"{value:g}" if value < 1e6 else f"{value:.0e}"))
         axis.set_minor_formatter(NullFormatter())
     axes.tick_params(which="both", length=0, labelcolor=COLOURS["soft"])
-    axes.xaxis.label.set_color(COLOURS["soft"])
-    axes.yaxis.label.set_color(COLOURS["soft"])
     for spine in axes.spines.values():
         spine.set_color(COLOURS["line"])
 

@@ -4,6 +4,7 @@ Rendering, decoding, the phase route, networks and scoring run in memory; buildi
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,6 @@ class Ladder:
 
     @property
     def key(self) -> str:
-        """Name of the ladder, unique in a run."""
         return f"{self.stage} over {self.over}"
 
 
@@ -85,18 +85,17 @@ def _pixel_rung(rig: Rig, make: Callable[[Rig], Work], size: int, folder: Path) 
 
 
 def _frame_rung(rig: Rig, make: Callable[[Rig], Work], steps: int, folder: Path) -> Rung:
-    bits = rig.sequence.bits_horizontal, rig.sequence.bits_vertical
-    changed = replace(rig.scaled(FRAMES_SIZE), sequence=Sequence(steps, *bits))
-    return Rung(len(changed.sequence), make(changed))
+    sequence = Sequence(steps, rig.sequence.bits_horizontal, rig.sequence.bits_vertical)
+    return Rung(len(sequence), make(replace(rig.scaled(FRAMES_SIZE), sequence=sequence)))
 
 
 def _captured(rig: Rig) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32]]:
     """Frames and depth of the ladder's view."""
-    row = Studio(BuildSettings(rig, (OBJECT,))).photograph(solid_mesh(OBJECT), VIEW)
+    row = _render(rig)()
     return [row.frames[index] for index in range(len(rig.sequence))], row.depth_mm
 
 
-def _render(rig: Rig) -> Work:
+def _render(rig: Rig) -> Callable[[], Row]:
     return partial(Studio(BuildSettings(rig, (OBJECT,))).photograph, solid_mesh(OBJECT), VIEW)
 
 
@@ -105,7 +104,7 @@ def _decode(rig: Rig) -> Work:
 
 
 def _phase(rig: Rig) -> Work:
-    """Phase and order of one direction, on the whole image at once."""
+    """On the whole image at once."""
     frames, _ = _captured(rig)
     plan = plan_direction(rig, "vertical", rig.sequence.steps, Limits())
     return partial(decode_direction, np.stack([frames[index].reshape(-1) for index in plan.frames]), plan, Limits())
@@ -119,8 +118,7 @@ def _triangulate(rig: Rig) -> Work:
 
 
 def _phase_route(rig: Rig) -> Work:
-    frames, _ = _captured(rig)
-    method = PhaseMethod(rig)
+    frames, method = _captured(rig)[0], PhaseMethod(rig)
     return lambda: method.measure(frames).seconds
 
 
@@ -129,15 +127,7 @@ def _score(rig: Rig) -> Work:
     return partial(score_sample, depth_mm + np.float32(1.5) * (depth_mm > 0), depth_mm)
 
 
-def _network(size: int, folder: Path) -> Rung:
-    return Rung(size * size, _inference(1, size))
-
-
-def _network_batch(batch: int, folder: Path) -> Rung:
-    return Rung(batch, _inference(batch, BATCH_SIZE))
-
-
-def _inference(batch: int, size: int) -> Work:
+def _network(size: int, folder: Path, batch: int = 1) -> Rung:
     import torch
 
     from fpp_ml_bench.baselines.networks import build as build_network
@@ -145,20 +135,24 @@ def _inference(batch: int, size: int) -> Work:
     torch.manual_seed(0)
     network = build_network("unet", width=8).eval().requires_grad_(False)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return torch.inference_mode()(partial(network, torch.rand(batch, 1, size, size)))
+    run = torch.inference_mode()(partial(network, torch.rand(batch, 1, size, size)))
+    return Rung(size * size, run)
+
+
+def _network_batch(batch: int, folder: Path) -> Rung:
+    return replace(_network(BATCH_SIZE, folder, batch), amount=batch)
 
 
 def _build(rig: Rig, objects: int, folder: Path) -> Rung:
     """The same mesh under many names: only the number of objects grows."""
     first = folder / "object_00.ply"
     write_ply(solid_mesh("cork"), first)
-    mesh_of_all = single_mesh(first)
-    meshes = tuple(replace(mesh_of_all, name=f"object_{number:02d}") for number in range(objects))
-    settings = BuildSettings(
-        rig.scaled(BUILT_SIZE), tuple(mesh.name for mesh in meshes), stored="single_shot", user_meshes=meshes
-    )
-    count = iter(range(1_000_000))
-    return Rung(objects, lambda: build(folder / f"dataset-{next(count)}", settings, workers=1))
+    mesh = single_mesh(first)
+    meshes = tuple(replace(mesh, name=f"object_{number:02d}") for number in range(objects))
+    names = tuple(named.name for named in meshes)
+    settings = BuildSettings(rig.scaled(BUILT_SIZE), names, stored="single_shot", user_meshes=meshes)
+    numbers = count()
+    return Rung(objects, lambda: build(folder / f"dataset-{next(numbers)}", settings, workers=1))
 
 
 def written_dataset(
@@ -198,17 +192,18 @@ def _read_rows(objects: int, folder: Path) -> Rung:
 
 
 def _read_frames(frames: int, folder: Path) -> Rung:
-    return Rung(frames, _reading(written_dataset(folder, 1, READ_SIZE, "all", views=1), frames))
+    return _reading(frames, folder, READ_SIZE, frames)
 
 
 def _read_pixels(size: int, folder: Path) -> Rung:
-    return Rung(size * size, _reading(written_dataset(folder, 1, size, "all", views=1), len(PAPER_SEQUENCE)))
+    return _reading(size * size, folder, size, len(PAPER_SEQUENCE))
 
 
-def _reading(opened: DatasetFolder, frames: int) -> Work:
-    """The first ``frames`` frames of the dataset's only row."""
+def _reading(amount: int, folder: Path, size: int, frames: int) -> Rung:
+    """The first ``frames`` frames of a dataset's only row."""
+    opened = written_dataset(folder, 1, size, "all", views=1)
     (sample,) = opened.samples("test")
-    return lambda: [frame.max() for frame in opened.frames(sample, range(frames))]
+    return Rung(amount, lambda: [frame.max() for frame in opened.frames(sample, range(frames))])
 
 
 def _evaluate(objects: int, folder: Path) -> Rung:

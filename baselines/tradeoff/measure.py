@@ -1,13 +1,11 @@
-"""Error against run time and against captured frames: every setting of every method on one machine, and what each stage
-costs as its input grows.
+"""Measuring every setting of every method on one machine, and what each stage costs as its input grows.
 
-A setting is measured once and stored; a stopped run continues where it stopped. A setting that can't be measured (a
-frame is not stored, a package is not installed) says why in its row, and the others are measured. Times are taken on
-frames in memory: warm-up, bounded runs, their spread, and the machine's pace beside each setting.
+A setting is measured once and stored; a stopped run continues where it stopped. A setting that can't be measured says
+why in its row, and the others are measured. Times are taken on frames in memory: warm-up, bounded runs, their spread,
+and the machine's pace beside each setting.
 """
 
 import os
-import statistics
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -18,20 +16,20 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
+from statistics import median
 from textwrap import shorten
 from time import perf_counter, process_time
 from typing import Any, Literal, Self, TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder
 from fpp_ml_bench.baselines.tradeoff.points import GROUPS, JOURNAL, Growth, Journal, Point, Tradeoff
 from fpp_ml_bench.baselines.tradeoff.settings import Plan, Setting, TradeoffSettings
+from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.result import HardwareInfo
 from fpp_ml_bench.evaluation.score import object_interval, score_sample, scored_pair
@@ -40,28 +38,24 @@ from fpp_ml_bench.machine import describe_hardware
 
 T = TypeVar("T")
 
-PACE_VALUES = 100_000
+PACE_VALUES, PACE_RUNS = 100_000, 5
 """Numbers that the pace is measured with: about 10 ms of sorting and arctangents, in and out of the cache."""
-PACE_RUNS = 5
 ROUNDS, LEAST_ROUNDS, LIMIT_S = 40, 2, 4.0
 """Rounds over all rungs of a ladder, fewer (but two) once the seconds are used up. The least time of each rung counts:
 other work on the machine can only add to it. Rounds spread a busy minute over all rungs."""
 LINEAR_LIMIT = 1.3
 """Every stage goes through its input once, so its power should be 1, or less with a fixed cost. Input that no longer
 fits the caches adds some tenths; a second loop over the input gives 2."""
-TAIL_POINTS = 3
-CONFIDENCE = 0.95
-
+TAIL_POINTS, CONFIDENCE = 3, 0.95
 _PACKAGE = Path(__file__).resolve().parents[2]
 """The package's folder, which is removed from messages that go into a result."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """``threads`` that a method may use; timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used
-    up; ``warm_up`` runs, which are not timed, come first.
+    """Timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used up, after ``warm_up`` runs.
 
-    ``clock``: wall-clock time, or the time that processors worked for this process. For a single thread that waits for
+    ``clock``: wall-clock time, or the time that processors worked for this process. For one thread that waits for
     nothing both agree on an idle machine; on a shared machine only processor time stays the same.
     """
 
@@ -77,16 +71,6 @@ class Rules:
         rules = cls(settings.clock, settings.threads)
         return replace(rules, runs=5, limit_s=1.0) if settings.quick else rules
 
-    def extended(self, seconds: list[float], call: Callable[[], object]) -> list[float]:
-        """``seconds`` and those of further runs of ``call``, as many as these rules ask for. A run longer than the
-        limit is not repeated."""
-        seconds = list(seconds)
-        while len(seconds) < self.runs and (len(seconds) < self.least or sum(seconds) < self.limit_s):
-            if seconds and min(seconds) > self.limit_s:
-                break
-            seconds.append(self.timed(call)[0])
-        return seconds
-
     def timed(self, call: Callable[[], T]) -> tuple[float, T]:
         """Seconds of a single run of ``call``, and what it returned."""
         clock = perf_counter if self.clock == "wall" else process_time
@@ -96,15 +80,10 @@ class Rules:
 
 
 def pace_ms(rules: Rules) -> float:
-    """Milliseconds that a fixed piece of work takes now, the median of a few runs.
-
-    Times of two settings are comparable where their paces agree: other load, clock frequency and temperature of the
-    machine change the pace.
-    """
+    """Median milliseconds that a fixed piece of work takes now. Other load, clock frequency and temperature change it:
+    times of two settings are comparable where their paces agree."""
     values = np.random.Generator(np.random.PCG64(7)).random(PACE_VALUES)
-    return 1000 * statistics.median(
-        rules.timed(lambda: np.arctan2(np.sort(values), values))[0] for _ in range(PACE_RUNS)
-    )
+    return 1000 * median(rules.timed(lambda: np.arctan2(np.sort(values), values))[0] for _ in range(PACE_RUNS))
 
 
 def measured(setting: Setting, rules: Rules) -> Point:
@@ -129,7 +108,7 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
     """Times and scores of ``setting``, as fields of a `Point`."""
     method, views = setting.make(), setting.views
     seconds: list[float] = []
-    scores: list[tuple[float | None, float | None, float]] = []
+    scores: list[tuple[float | None, ...]] = []
     for number, name in enumerate(views.names if setting.scored else views.names[:1]):
         predict = partial(method.predict, views.frames(method, name))
         for _ in range(rules.warm_up if number == 0 else 0):
@@ -138,11 +117,18 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         run_s, depth = rules.timed(predict)
         seconds.append(run_s)
         if setting.scored:
-            scores.append(_score(method, depth, views.target_mm(name), name))
-    seconds = rules.extended(seconds, predict)
+            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name)
+            of_sample = score_sample(*pair)
+            pixels = of_sample.object.pixels
+            missing_share = of_sample.missing / pixels if pixels else 0.0
+            scores.append((of_sample.object.mae_mm, of_sample.valid.mae_mm, missing_share))
+    # A run longer than the limit is not repeated.
+    while len(seconds) < rules.runs and (len(seconds) < rules.least or sum(seconds) < rules.limit_s):
+        if min(seconds) > rules.limit_s:
+            break
+        seconds.append(rules.timed(predict)[0])
     low, middle, high = (float(f"{float(np.percentile(seconds, q)):.4g}") for q in (5, 50, 95))
-    given = ["depth range"] * method.uses_ground_truth_range
-    given += ["object mask"] * method.uses_ground_truth_mask
+    given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
     figures: dict[str, Any] = {
         "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds),
         "seconds": middle, "seconds_p5": low, "seconds_p95": high,
@@ -150,23 +136,12 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
     }  # fmt: skip
     if scores:
         object_mae, valid_mae, missing = zip(*scores, strict=True)
-        interval = object_interval(list(object_mae), views.objects)
+        interval = object_interval(list(object_mae), [split_sample_name(name)[0] for name in views.names])
         figures |= {
-            "object_mae_mm": _mean(object_mae),
-            "interval_mm": None if interval is None else list(interval),
-            "measured_mae_mm": _mean(valid_mae),
-            "missing_share": _mean(missing),
-        }
+            "object_mae_mm": _mean(object_mae), "interval_mm": None if interval is None else list(interval),
+            "measured_mae_mm": _mean(valid_mae), "missing_share": _mean(missing),
+        }  # fmt: skip
     return figures
-
-
-def _score(
-    method: Method, depth: NDArray[np.floating], target_mm: NDArray[np.float32], name: str
-) -> tuple[float | None, float | None, float]:
-    """Object MAE, the MAE over measured object pixels, and the share of object pixels without a depth."""
-    scores = score_sample(*scored_pair(depth, target_mm, method.units, method.mode, name))
-    pixels = scores.object.pixels
-    return scores.object.mae_mm, scores.valid.mae_mm, scores.missing / pixels if pixels else 0.0
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -174,13 +149,12 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(numbers, dtype=np.float64)) if numbers else None
 
 
-def time_ladder(ladder: Ladder, rules: Rules | None = None) -> list[Growth]:
+def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
     """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first.
 
     Runs time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage
     counts where every rung has it, with a time that a clock can tell from 0.
     """
-    rules = rules or Rules()
     least: list[dict[str, float]] = [{} for _ in ladder.steps]
     with tempfile.TemporaryDirectory(prefix="fpp-bench-costs-") as folder:
         rungs = []
@@ -202,11 +176,8 @@ def time_ladder(ladder: Ladder, rules: Rules | None = None) -> list[Growth]:
             if number + 1 >= LEAST_ROUNDS and total_s > LIMIT_S * rules.limit_s / Rules.limit_s:
                 break
     amounts = [rung.amount for rung in rungs]
-    growths = [
-        growth(stage, ladder.over, amounts, [best[stage] for best in least])
-        for stage in least[0]
-        if all(best.get(stage, 0.0) > 1e-6 for best in least)
-    ]
+    stages_of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
+    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in stages_of_all]
     return sorted(growths, key=lambda stage_growth: -stage_growth.seconds[-1])
 
 
@@ -262,22 +233,17 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
             if ladder.key not in journal.growth:
                 journal.growth[ladder.key] = time_ladder(ladder, rules)
                 journal.write(path)
-    per_object = max(Counter(plan.views.objects).values())
+    per_object = max(Counter(split_sample_name(name)[0] for name in views).values())
     return Tradeoff(
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        dataset=plan.opened.path.resolve().name,
-        fingerprint=plan.opened.fingerprint,
-        image_size=list(plan.opened.size),
-        target=plan.views.target,
-        views=views,
+        created=datetime.now(UTC).isoformat(timespec="seconds"), dataset=plan.opened.path.resolve().name,
+        fingerprint=plan.opened.fingerprint, image_size=list(plan.opened.size), target=plan.views.target, views=views,
         settings={**asdict(rules), "quick": settings.quick, "views_an_object": per_object},
         hardware=HardwareInfo.model_validate(hardware.to_dict()),
-        software={"fpp_ml_bench": __version__, "python": python_version(), **_versions()},
-        sittings=journal.sittings,
+        software={"fpp_ml_bench": __version__, "python": python_version(), **_versions()}, sittings=journal.sittings,
         # Everything in this folder, so that a group measured on its own adds to the earlier ones.
         points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
         growth=[growth for growths in journal.growth.values() for growth in growths],
-    )
+    )  # fmt: skip
 
 
 def _versions() -> dict[str, str]:

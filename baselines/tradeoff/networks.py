@@ -10,8 +10,10 @@ of ``pip install "fpp-ml-bench[onnx]"``.
 import importlib.util
 import logging
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +21,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.method import Frames, Method, load_method
-from fpp_ml_bench.baselines.networks import (
-    DepthRange,
-    FringeNetwork,
-    NetworkMethod,
-    build,
-    export_onnx,
-    fringe_batch,
-    load,
-    parameter_count,
-    represent,
-)  # fmt: skip
+from fpp_ml_bench.baselines.networks import DepthRange, FringeNetwork, NetworkMethod, fringe_batch
 from fpp_ml_bench.baselines.tradeoff.settings import Setting, StoredViews, TradeoffSettings
 from fpp_ml_bench.baselines.training import SHIPPED, SUFFIX, WeightsFile, open_weights
 from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError
@@ -57,7 +50,7 @@ def _cpu_flags() -> set[str]:
 
 
 def bf16_note() -> str | None:
-    """A note about bfloat16 on this processor; None where it has instructions for it or nothing is known."""
+    """Says that this processor emulates bfloat16; None where it has instructions for it or nothing is known."""
     flags = _cpu_flags()
     return "this CPU has no bf16 instructions: emulated" if flags and not flags & _BF16_FLAGS else None
 
@@ -82,37 +75,34 @@ def network_settings(views: StoredViews, run: TradeoffSettings) -> Iterator[Sett
     torch.set_num_threads(run.threads)
     height, width = views.opened.size
     precisions = PRECISIONS[:2] if run.quick else PRECISIONS
-    seen: dict[str, int] = {}
+    notes = {"bf16": bf16_note()}
+    seen: Counter[str] = Counter()
     for weights in trained_weights((height, width), run.runs):
         name = weights.config.name
-        seen[name] = seen.get(name, 0) + 1
+        seen[name] += 1
         repeat = f" #{seen[name]}" if seen[name] > 1 else ""
         individual = weights.config.normalisation == "individual"
         ranges: tuple[DepthRange | None, ...] = ("predicted", "oracle") if individual else (None,)
-        for depth_range in ranges:
-            for precision in precisions:
-                if precision.startswith("onnx") and depth_range == "predicted":
-                    continue  # the range heads read layers that an ONNX file does not expose
-                title = f"{name}{repeat}{f' ({depth_range} range)' if depth_range else ''}, {precision}"
-                make = partial(_trained, weights.path, depth_range, precision, views, run.threads)
-                key = f"network-{name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
-                note = bf16_note() if precision == "bf16" else None
-                yield Setting(key, "networks", title, make, views, note=note)
+        for depth_range, precision in product(ranges, precisions):
+            if precision.startswith("onnx") and depth_range == "predicted":
+                continue  # the range heads read layers that an ONNX file does not expose
+            title = f"{name}{repeat}{f' ({depth_range} range)' if depth_range else ''}, {precision}"
+            make = partial(_trained, weights.path, depth_range, precision, views, run.threads)
+            key = f"network-{name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
+            yield Setting(key, "networks", title, make, views, note=notes.get(precision))
     yield Setting("phase-net", "networks", "phase-net", partial(load_method, "phase-net", views.rig), views)
     default_widths = QUICK_WIDTHS if run.quick or height * width > LARGE_PX else WIDTHS
-    for unet_width in default_widths if run.widths is None else run.widths:
-        for precision in precisions:
-            emulated = bf16_note() if precision == "bf16" else None
-            if emulated and unet_width > EMULATED_WIDTH:
-                continue
-            make = partial(_untrained, unet_width, precision, views, run.threads)
+    for unet_width, precision in product(default_widths if run.widths is None else run.widths, precisions):
+        emulated = notes.get(precision)
+        if not emulated or unet_width <= EMULATED_WIDTH:
+            make = partial(Untrained, unet_width, precision, views, run.threads)
+            key, title = f"network-width-{unet_width:03d}-{precision}", f"UNet width {unet_width}, {precision}"
             note = f"{NOT_TRAINED}; {emulated}" if emulated else NOT_TRAINED
-            title = f"UNet width {unet_width}, {precision}"
-            yield Setting(f"network-width-{unet_width:03d}-{precision}", "networks", title, make, views, False, note)
+            yield Setting(key, "networks", title, make, views, False, note)
 
 
 def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: StoredViews, threads: int) -> Method:
-    model = load(path, "cpu")
+    model = networks.load(path, "cpu")
     if depth_range == "predicted" and model.heads is None:
         raise PredictionError(f"{path.name} holds no range heads, so it can't predict a depth range")
     trained = NetworkMethod(model, depth_range, threads=threads, sequence=views.opened.sequence)
@@ -120,30 +110,23 @@ def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: 
     return trained
 
 
-def _untrained(width: int, precision: str, views: StoredViews, threads: int) -> Method:
-    torch.manual_seed(0)
-    network = build("unet", width=width)
-    network.check_size(*views.opened.size)
-    parameters = parameter_count(network)
-    if parameters > 5e8:
-        raise NetworkError(f"a UNet of width {width} has {parameters:,} parameters; give a smaller one")
-    untrained = UntrainedMethod(network)
-    set_precision(network, precision, partial(calibration, views, 0, UNTRAINED_EXAMPLES), threads)
-    return untrained
-
-
-class UntrainedMethod(Method):
-    """A network with its initial weights, to measure time only: its output is never scored."""
+class Untrained(Method):
+    """A UNet with its initial weights, to measure time only: its output is never scored."""
 
     units = "normalised"
     frames_used = (0,)
 
-    def __init__(self, network: FringeNetwork) -> None:
-        self.network = network.eval().requires_grad_(False)
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.name = self.title = f"untrained {network.name}"
-        self.settings: dict[str, Any] = dict(network.options)
-        self.parameters = sum(parameter.numel() for parameter in network.parameters())
+    def __init__(self, width: int, precision: str, views: StoredViews, threads: int) -> None:
+        torch.manual_seed(0)
+        self.network = networks.build("unet", width=width)
+        self.network.check_size(*views.opened.size)
+        self.parameters = networks.parameter_count(self.network)
+        if self.parameters > 5e8:
+            raise NetworkError(f"a UNet of width {width} has {self.parameters:,} parameters; give a smaller one")
+        self.network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.name = self.title = f"untrained {self.network.name}"
+        self.settings: dict[str, Any] = dict(self.network.options)
+        set_precision(self.network, precision, partial(calibration, views, 0, UNTRAINED_EXAMPLES), threads)
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """The network's output float32 (H, W)."""
@@ -152,7 +135,7 @@ class UntrainedMethod(Method):
             raise PredictionError("frame 0 was not captured")
         batch = fringe_batch([image], (image.shape[0], image.shape[1]), self.name)
         with torch.inference_mode():
-            return represent(self.network, batch, self.name)[0, 0].float().numpy()
+            return networks.represent(self.network, batch, self.name)[0, 0].float().numpy()
 
 
 def calibration(views: StoredViews, frame: int, count: int = 8) -> NDArray[np.float32]:
@@ -191,7 +174,7 @@ def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3
     with tempfile.TemporaryDirectory(prefix="fpp-bench-onnx-") as folder:
-        path = export_onnx(network, Path(folder) / "network.onnx", examples.shape[2:])  # type: ignore[arg-type]
+        path = networks.export_onnx(network, Path(folder) / "network.onnx", examples.shape[2:])  # type: ignore[arg-type]
         if quantised:
             path = _quantised(path, examples)
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

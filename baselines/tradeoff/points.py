@@ -1,8 +1,8 @@
 """What `fpp-bench tradeoff` measures, as strict models: a point for each setting, a growth for each stage, fronts; and
 the journal from which a stopped run continues.
 
-There are two errors. ``object_mae_mm`` is the leaderboard's: an object pixel without a depth counts with its whole
-depth. ``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
+``object_mae_mm`` is the leaderboard's error: an object pixel without a depth counts with its whole depth.
+``measured_mae_mm`` is over the pixels that got a depth, and ``missing_share`` is the share that did not.
 """
 
 from collections.abc import Sequence
@@ -32,10 +32,9 @@ TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.json"
 class Point(StrictModel):
     """A setting: ``seconds`` per view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
 
-    ``interval_mm`` is the 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method
-    was told about the views that it is scored on. ``note``: further remarks. ``failed``: why there is no measurement;
-    there are no numbers then. ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's
-    one-minute load average at that time, None where the system does not provide it.
+    ``interval_mm``: 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method was
+    told about the views that it is scored on. ``failed``: why there is no measurement; there are no numbers then.
+    ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's one-minute load average then.
     """
 
     key: Text
@@ -61,8 +60,7 @@ class Point(StrictModel):
     @property
     def ms(self) -> tuple[float, float, float]:
         """Median, 5th and 95th percentile of the time per view in ms, 0 where it is not known."""
-        median, low, high = (1000 * (value or 0) for value in (self.seconds, self.seconds_p5, self.seconds_p95))
-        return median, low, high
+        return 1000 * (self.seconds or 0), 1000 * (self.seconds_p5 or 0), 1000 * (self.seconds_p95 or 0)
 
 
 class Growth(StrictModel):
@@ -81,10 +79,10 @@ class Growth(StrictModel):
 
 
 class Tradeoff(StrictModel):
-    """A whole run: the data, the rules, the machine, and the results.
+    """A whole run: the data, the rules and options (``settings``), the machine, and the results.
 
     ``sittings``: how often the run was started or continued; times of different sittings may differ by more than the
-    pace shows. ``settings``: the rules and options of the run.
+    pace shows.
     """
 
     tradeoff_schema_version: Literal["1.0.0"] = "1.0.0"
@@ -124,9 +122,8 @@ class Tradeoff(StrictModel):
     def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
         """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
 
-        The precisions are left out: they repeat the classical method's arithmetic in plain NumPy. For the error over
-        measured pixels, points that leave out more than `MOST_LEFT_OUT` of the object's pixels are left out too:
-        a method must not gain by leaving out difficult pixels.
+        The precisions repeat the classical method's arithmetic and are left out; for the error over measured pixels,
+        so are points that leave out more than `MOST_LEFT_OUT` of the object: that must not gain them anything.
         """
         points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
         if error == "measured_mae_mm":
@@ -140,10 +137,8 @@ class Tradeoff(StrictModel):
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the ``points`` (cost, error) that no other point beats: none is as good in both and better in one.
-
-    Smaller is better. Sorted by cost. Points that are equal in both are all on the front or all off it.
-    """
+    """Indices of the ``points`` (cost, error) that no other beats (as good in both, better in one), by cost. Smaller is
+    better. Points that are equal in both are all on the front or all off it."""
     front: list[int] = []
     for index in sorted(range(len(points)), key=points.__getitem__):
         if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
@@ -162,8 +157,8 @@ def shipped_tradeoff() -> Tradeoff:
 
 
 class Journal(StrictModel):
-    """What the run that ``about`` describes has measured so far, so that a stopped run goes on: points by key, growth
-    by ladder, and how often the run was started."""
+    """What the run that ``about`` describes has measured: points by key, growth by ladder, and how often it was
+    started."""
 
     about: dict[Text, Any]
     sittings: Count = 1
@@ -173,11 +168,8 @@ class Journal(StrictModel):
     @classmethod
     def of(cls, path: Path, about: dict[str, Any]) -> "Journal":
         """The journal in ``path`` for another sitting, or a new one. Points that failed are forgotten: a package may
-        have been installed since.
-
-        Raises SubmissionError for one of other rules or of another machine, because times are only compared within a
-        run; it names what differs.
-        """
+        have been installed since. SubmissionError for one of other rules or of another machine: times are only
+        compared within a run."""
         if not path.exists():
             return cls(about=about)
         try:
@@ -187,8 +179,7 @@ class Journal(StrictModel):
                 f"{error}; expected what a run of fpp-bench tradeoff left: give another --out"
             ) from None
         first = earlier.about
-        differs = sorted(key for key in {**first, **about} if first.get(key) != about.get(key))
-        if differs:
+        if differs := sorted(key for key in {**first, **about} if first.get(key) != about.get(key)):
             key = differs[0]
             raise SubmissionError(
                 f"{path}: holds a run with another {', '.join(differs)} ({key}: {first.get(key)!r} there, "
@@ -198,5 +189,4 @@ class Journal(StrictModel):
         return earlier.model_copy(update={"points": measured, "sittings": earlier.sittings + 1})
 
     def write(self, path: Path) -> None:
-        """Write it complete or not at all."""
         write_json(self.model_dump(mode="json", exclude_none=True), path)

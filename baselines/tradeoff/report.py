@@ -87,15 +87,15 @@ def _short(point: Point) -> str:
     return short.replace(", fp32", "").replace("predicted range", "predicted")
 
 
-def draw_tradeoff(tradeoff: Tradeoff, path: Path, error: ErrorKey = "object_mae_mm") -> bool:
-    """Two panels on log axes with the front of each; False where no point can be drawn."""
+def draw_tradeoff(tradeoff: Tradeoff, error: ErrorKey = "object_mae_mm") -> Figure | None:
+    """Two panels on log axes with the front of each; None where no point can be drawn."""
     figure = Figure(figsize=(13, 6.2), dpi=110)
     figure.subplots_adjust(0.05, 0.12, 0.99, 0.91, 0.06)
     panels = figure.subplots(1, 2)
     for cost, axes in zip(COST_KEYS, panels, strict=True):
         picture = scatter(tradeoff, cost, error, all_named=True)
         if picture is None:
-            return False
+            return None
         for family in FAMILIES:
             points = [point for point in tradeoff.points if point.group != "sizes" and _family(point) == family]
             places = [(point.ms[0] if cost == "seconds" else point.frames, getattr(point, error)) for point in points]
@@ -112,14 +112,14 @@ def draw_tradeoff(tradeoff: Tradeoff, path: Path, error: ErrorKey = "object_mae_
         f"{tradeoff.settings.get('threads')} thread(s) of {tradeoff.hardware.cpu}\n"
         "dashed: the front. Hollow: told the view's own depth range or mask, on no front"
     )
-    return _save(figure, path)
+    return figure
 
 
-def draw_sizes(tradeoff: Tradeoff, path: Path) -> bool:
-    """Error over image size, and against seconds; False without such points."""
+def draw_sizes(tradeoff: Tradeoff) -> Figure | None:
+    """Error over image size, and against seconds; None without such points."""
     points = [point for point in tradeoff.points if point.group == "sizes" and point.seconds and point.measured_mae_mm]
     if not points:
-        return False
+        return None
     figure = Figure(figsize=(11, 4.6), dpi=110, layout="constrained")
     by_size, by_time = figure.subplots(1, 2)
     for title in dict.fromkeys(point.title for point in points):
@@ -135,52 +135,44 @@ def draw_sizes(tradeoff: Tradeoff, path: Path) -> bool:
     log_axes(by_size)
     log_axes(by_time)
     sizes = sorted({point.image_px for point in points})
-    by_size.set_xticks(sizes, [str(size) for size in sizes])
+    by_size.set_xticks(sizes, list(map(str, sizes)))
     by_size.legend()
-    return _save(figure, path)
+    return figure
 
 
-def draw_growth(growths: Sequence[Growth], path: Path) -> bool:
-    """Seconds against pixels, frames, rows and objects, with the fitted powers; False where nothing was timed."""
+def draw_growth(growths: Sequence[Growth]) -> Figure | None:
+    """Seconds against pixels, frames, rows and objects, with the fitted powers; None where nothing was timed."""
     if not growths:
-        return False
-    choices: dict[str, Callable[[Growth], bool]] = {
-        "pixels: stages": lambda growth: growth.over == "pixels" and ":" not in growth.stage,
-        "pixels: parts of stages": lambda growth: growth.over == "pixels" and ":" in growth.stage,
-        "frames": lambda growth: growth.over == "frames",
-        "rows or objects": lambda growth: growth.over in ("rows", "objects"),
+        return None
+    stages = [growth for growth in growths if growth.over == "pixels" and ":" not in growth.stage]
+    panels = {
+        "pixels: stages": stages,
+        "pixels: parts of stages": [growth for growth in growths if growth.over == "pixels" and growth not in stages],
+        "frames": [growth for growth in growths if growth.over == "frames"],
+        "rows or objects": [growth for growth in growths if growth.over in ("rows", "objects")],
     }
     figure = Figure(figsize=(15, 8.5), dpi=110, layout="constrained")
-    for axes, (title, chosen) in zip(figure.subplots(2, 2).flat, choices.items(), strict=True):
-        for line in sorted(filter(chosen, growths), key=lambda line: -line.seconds[-1]):
+    for axes, (title, lines) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
+        for line in sorted(lines, key=lambda line: -line.seconds[-1]):
             over = f" over {line.over}" if title.startswith("rows") else ""
             label = f"{line.exponent:.2f}  {line.stage}{over}" + (" (!)" if line.flag else "")
-            axes.plot(
-                line.amounts, [1000 * s for s in line.seconds], "o-", ms=4, lw=2.4 if line.flag else 1.2, label=label
-            )
+            ms = [1000 * seconds for seconds in line.seconds]
+            axes.plot(line.amounts, ms, "o-", ms=4, lw=2.4 if line.flag else 1.2, label=label)
         axes.set(title=title, xlabel=title.split(":")[0], ylabel="milliseconds")
         log_axes(axes)
         if axes.lines:
             axes.legend(title="fitted power, stage", loc="upper left", bbox_to_anchor=(1, 1))
     figure.suptitle("Least time of each stage as its input grows; (!): steeper than it should be")
-    return _save(figure, path)
+    return figure
 
 
-def _save(figure: Figure, path: Path) -> bool:
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
-    return True
-
-
-PICTURES: dict[str, Callable[[Tradeoff, Path], bool]] = {
+PICTURES: dict[str, Callable[[Tradeoff], Figure | None]] = {
     "tradeoff.png": draw_tradeoff,
-    "tradeoff_measured.png": lambda tradeoff, path: draw_tradeoff(tradeoff, path, "measured_mae_mm"),
+    "tradeoff_measured.png": lambda tradeoff: draw_tradeoff(tradeoff, "measured_mae_mm"),
     "sizes.png": draw_sizes,
-    "costs.png": lambda tradeoff, path: draw_growth(tradeoff.growth, path),
+    "costs.png": lambda tradeoff: draw_growth(tradeoff.growth),
 }
-"""Name of each picture and the function that draws it; the function returns False where there is nothing to draw."""
+"""Name of each picture and the function that draws it, where there is something to draw."""
 
 
 def write_report(tradeoff: Tradeoff, out: Path) -> list[Path]:
@@ -189,15 +181,20 @@ def write_report(tradeoff: Tradeoff, out: Path) -> list[Path]:
     content["points"] = [point.model_dump(mode="json", exclude_none=True) for point in tradeoff.points]
     write_json(content, out / TRADEOFF_FILE)
     written = [out / TRADEOFF_FILE]
-    for name, text in (("tradeoff.csv", points_csv(tradeoff)), ("costs.csv", growth_csv(tradeoff.growth))):
-        if text.count("\n") > 1:
-            written.append(out / name)
-            try:
+    texts = {"tradeoff.csv": points_csv(tradeoff), "costs.csv": growth_csv(tradeoff.growth)}
+    try:
+        for name, text in texts.items():
+            if text.count("\n") > 1:
+                written.append(out / name)
                 write_atomically(out / name, text.encode("utf-8"))
-            except OSError as error:
-                raise SubmissionError(f"{out / name} can't be written: {error.strerror}") from None
-    with matplotlib.rc_context({"font.size": 8, "figure.titlesize": 9}):
-        return written + [out / name for name, draw in PICTURES.items() if draw(tradeoff, out / name)]
+        with matplotlib.rc_context({"font.size": 8, "figure.titlesize": 9}):
+            for name, draw in PICTURES.items():
+                if figure := draw(tradeoff):
+                    written.append(out / name)
+                    figure.savefig(out / name)
+    except OSError as error:
+        raise SubmissionError(f"{written[-1]} can't be written: {error.strerror}") from None
+    return written
 
 
 def points_csv(tradeoff: Tradeoff) -> str:
@@ -226,23 +223,25 @@ def _csv(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
-    for line in lines:
-        writer.writerow([_CSV_CELLS.get(type(value), str)(value) for value in line])
+    cells: dict[type, Callable[..., str | None]] = {
+        float: "{:.6g}".format, bool: lambda value: str(value).lower(), type(None): lambda value: None,
+    }  # fmt: skip
+    writer.writerows([cells.get(type(value), str)(value) for value in line] for line in lines)
     return text.getvalue()
 
 
-_CSV_CELLS: dict[type, Callable[..., str]] = {
-    float: "{:.6g}".format,
-    bool: lambda value: str(value).lower(),
-    type(None): lambda value: "",
-}
+def _table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in texts:
+        table.add_column(column, overflow="fold")
+    for column in numbers:
+        table.add_column(column, justify="right")
+    return table
 
 
 def plan_table(plan: Plan) -> Table:
     """What would be measured."""
-    table = Table(title=f"{plan.opened.path}: {len(plan.views.names)} views", title_justify="left")
-    for title in ("Group", "Setting", "Note"):
-        table.add_column(title, overflow="fold")
+    table = _table(f"{plan.opened.path}: {len(plan.views.names)} views", ("Group", "Setting", "Note"))
     for setting in plan.settings:
         table.add_row(setting.group, setting.title, setting.note or "")
     for ladder in plan.ladders:
@@ -252,11 +251,9 @@ def plan_table(plan: Plan) -> Table:
 
 def front_table(tradeoff: Tradeoff) -> Table:
     """Both fronts of object MAE, the cheapest first."""
-    table = Table(title="Fronts of object MAE: no other setting is both cheaper and more exact", title_justify="left")
-    table.add_column("Against")
-    table.add_column("Setting", overflow="fold")
-    for title in ("ms per view", "5th-95th", "Frames", "Object MAE mm", "Measured MAE mm", "Not measured"):
-        table.add_column(title, justify="right")
+    numbers = ("ms per view", "5th-95th", "Frames", "Object MAE mm", "Measured MAE mm", "Not measured")
+    title = "Fronts of object MAE: no other setting is both cheaper and more exact"
+    table = _table(title, ("Against", "Setting"), numbers)
     for cost in COST_KEYS:
         for point in tradeoff.front(cost):
             ms, low, high = point.ms
@@ -271,11 +268,8 @@ def front_table(tradeoff: Tradeoff) -> Table:
 
 def growth_table(growths: Sequence[Growth]) -> Table:
     """The fitted powers with their flags."""
-    table = Table(title="Costs that grow: seconds = c amount^power", title_justify="left")
-    table.add_column("Stage", overflow="fold")
-    table.add_column("Over")
-    for title in ("From", "To", "ms at most", "Power", "95% interval", "At the end"):
-        table.add_column(title, justify="right")
+    numbers = ("From", "To", "ms at most", "Power", "95% interval", "At the end")
+    table = _table("Costs that grow: seconds = c amount^power", ("Stage", "Over"), numbers)
     table.add_column("Flag", overflow="fold")
     for growth in growths:
         table.add_row(

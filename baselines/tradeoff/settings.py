@@ -1,6 +1,5 @@
-"""What a run measures: the settings that are compared (numbers of steps, filters of the phase route, float32 against
-float64, image sizes), the views that they are measured on, and the plan. `networks` has the networks, `ladders` the
-costs that grow."""
+"""What a run measures: the settings that are compared, the views that they are measured on, and the plan. `networks`
+has the networks, `ladders` the costs that grow."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
 from fpp_ml_bench.constants import MM_PER_M, TEST_OBJECTS, split_sample_name
-from fpp_ml_bench.decoding import MIN_MODULATION, DirectionPlan, Directions, Limits, plan_direction
+from fpp_ml_bench.decoding import MIN_MODULATION, Directions, Limits, plan_direction
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
@@ -31,8 +30,8 @@ FEW_FRAMES, QUICK_FRAMES = (2, 3, 4, 6, 9), (3,)
 WINDOWS = ((0.25, 0.2), (0.5, 0.4), (0.7, 0.55))
 """First and second window of the phase route in fringe periods, besides the default (0.35, 0.27)."""
 SIZES, QUICK_SIZES = (240, 480, 960, 1920), (240, 480)
-SIZE_OBJECTS = ("power_drill", "wooden_boards")
-"""Objects of the image sizes: a concave and a flat object."""
+SIZE_OBJECTS, SIZE_VIEW = ("power_drill", "wooden_boards"), "A60"
+"""Objects and view of the image sizes: a concave and a flat object."""
 
 
 @dataclass
@@ -45,10 +44,6 @@ class StoredViews:
     @property
     def rig(self) -> Rig:
         return self.opened.rig
-
-    @property
-    def objects(self) -> list[str]:
-        return [split_sample_name(name)[0] for name in self.names]
 
     @property
     def target(self) -> str:
@@ -64,10 +59,8 @@ class StoredViews:
 
 
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> StoredViews:
-    """``per_object`` views of each object of ``split``, spread over its views, in row order.
-
-    Raises `DatasetError` for a split without samples.
-    """
+    """``per_object`` views of each object of ``split``, spread over its views, in row order. `DatasetError` for a split
+    without samples."""
     samples_by_object: dict[str, list[str]] = {}
     for sample in opened.samples(split):
         samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
@@ -87,12 +80,11 @@ class PhotographedViews:
     """Objects of the benchmark in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
 
     rig: Rig
-    objects: list[str]
-    view: str = "A60"
+    objects: tuple[str, ...]
 
     @property
     def names(self) -> list[str]:
-        return [f"{name}_{self.view}" for name in self.objects]
+        return [f"{name}_{SIZE_VIEW}" for name in self.objects]
 
     def frames(self, method: Method, name: str) -> Frames:
         return [f if index in method.frames_used else None for index, f in enumerate(self._captures[name][0])]
@@ -105,8 +97,7 @@ class PhotographedViews:
         captures = {}
         for name, object_name in zip(self.names, self.objects, strict=True):
             # A studio of its own for each view: the frames are its memory, which the next view would overwrite.
-            studio = Studio(BuildSettings(self.rig, tuple(self.objects)))
-            row = studio.photograph(solid_mesh(object_name), self.view)
+            row = Studio(BuildSettings(self.rig, self.objects)).photograph(solid_mesh(object_name), SIZE_VIEW)
             exact = np.zeros_like(row.depth_mm) if row.depth_exact_mm is None else row.depth_exact_mm
             frames = [row.frames[index] for index in range(len(self.rig.sequence))]
             captures[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
@@ -127,131 +118,6 @@ class Setting:
     note: str | None = None
 
 
-def classical_settings(views: StoredViews, threads: int, quick: bool = False) -> Iterator[Setting]:
-    """N = 3 to all captured steps, of vertical, horizontal and both directions."""
-    most = views.rig.sequence.steps
-    for direction in CLASSICAL_DIRECTIONS:
-        for steps in sorted({3, min(6, most), most}) if quick else range(3, most + 1):
-            make = partial(ClassicalMethod, views.rig, direction, steps, threads)
-            title = f"classical N={steps}, {direction}"
-            yield Setting(f"classical-{direction}-{steps:02d}", "classical", title, make, views)
-
-
-def phase_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:
-    """The phase route: direction, cues for the fringe order, frames, windows of its filters."""
-    rig = views.rig
-
-    def setting(key: str, title: str, note: str | None = None, **options: object) -> Setting:
-        make = partial(load_method, "phase", rig, **options)
-        return Setting(f"phase-{key}", "phase", f"phase {title}", make, views, note=note)
-
-    for direction in DIRECTIONS:
-        yield setting(direction, direction, direction=direction)
-        yield setting(f"{direction}-no-shading", f"{direction}, no shading", direction=direction, shading=False)
-    for direction in DIRECTIONS:
-        for count in (number for number in (QUICK_FRAMES if quick else FEW_FRAMES) if number <= rig.sequence.steps):
-            yield setting(f"{direction}-{count}", f"{direction}, {count} frames", direction=direction, frames=count)
-    if not quick:
-        standoff_note = "assumes objects near the rig's standoff distance, which holds for fixed placement"
-        yield setting("standoff", "horizontal, standoff", standoff_note, prior="standoff")
-        mask_note = "pixels of confidence below 0.5 are masked"
-        yield setting("masked", "horizontal, confident only", mask_note, min_confidence=0.5)
-        for first, second in WINDOWS:
-            title = f"horizontal, windows {first:g}/{second:g}"
-            yield setting(f"window-{first:g}", title, first_window=first, second_window=second)
-
-
-def precision_settings(views: StoredViews, quick: bool = False) -> Iterator[Setting]:
-    """The decoder's arithmetic in float32 and in float64, for few and for all steps."""
-    most = views.rig.sequence.steps
-    for steps in (most,) if quick else (3, most):
-        for dtype in ("float32", "float64"):
-            make = partial(DecodeInType, views.rig, "vertical", steps, dtype=dtype)
-            yield Setting(f"precision-{steps:02d}-{dtype}", "precision", f"NumPy {dtype}, N={steps}", make, views)
-
-
-def size_settings(rig: Rig, threads: int, quick: bool = False) -> Iterator[Setting]:
-    """Small scenes photographed by ``rig`` at each image size, by all steps, by few, and from one fringe."""
-    for size in QUICK_SIZES if quick else SIZES:
-        scaled = rig.scaled(size)
-        try:
-            scaled.check_sampling()
-        except FppBenchError:
-            continue  # coarser than the fringes allow: no dataset of this rig has such a size
-        views = PhotographedViews(scaled, [name for name in SIZE_OBJECTS if name in TEST_OBJECTS])
-        choices: tuple[tuple[Directions, int], ...] = (("both", rig.sequence.steps), ("vertical", 3))
-        for direction, steps in choices:
-            make = partial(ClassicalMethod, scaled, direction, steps, threads)
-            title = f"classical N={steps}, {direction}"
-            yield Setting(f"size-{size:04d}-{direction}-{steps}", "sizes", title, make, views)
-        phase = partial(load_method, "phase", scaled, direction="horizontal")
-        yield Setting(f"size-{size:04d}-phase", "sizes", "phase horizontal", phase, views)
-
-
-class DecodeInType(ClassicalMethod):
-    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``.
-
-    The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from
-    one projector coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous
-    code, or lies outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is
-    iterated in float64.
-    """
-
-    def __init__(self, rig: Rig, direction: Direction, steps: int, dtype: str) -> None:
-        super().__init__(rig, direction, steps)
-        self.way, self.dtype = direction, dtype
-        if rig.projector.is_distorted:
-            raise DecodeError("float32 against float64 is compared for a projector without distortion; this rig's has")
-
-    @cached_property
-    def _plan(self) -> DirectionPlan:
-        return plan_direction(self.rig, self.way, self.steps, Limits())
-
-    @cached_property
-    def _axis(self) -> int:
-        """Of the projector's image: the one across the fringes."""
-        return 0 if self.direction == "vertical" else 1
-
-    @cached_property
-    def _rays(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Components of R (x, y, 1) across the fringes and forward, (H, W) in ``dtype``."""
-        x, y = (axis.astype(self.dtype) for axis in self.rig.camera.rays())
-        rotation = self.rig.R.astype(self.dtype)
-        across, forward = (rotation[row, 0] * x + rotation[row, 1] * y + rotation[row, 2] for row in (self._axis, 2))
-        return across, forward
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        plan, number = self._plan, np.dtype(self.dtype).type
-        grey = [frame for frame in (frames[index] for index in plan.frames) if frame is not None]
-        if len(grey) != len(plan.frames):
-            raise DecodeError(f"expected the {len(plan.frames)} frames {plan.frames}, {len(grey)} were captured")
-        sums = np.zeros((3, *grey[0].shape), self.dtype)
-        for image, weights in zip(grey, plan.weights.T.astype(self.dtype), strict=False):
-            levels = image.astype(self.dtype)
-            for total, weight in zip(sums, weights, strict=True):
-                total += weight * levels
-        mean, cosine, sine = sums
-        modulation = np.sqrt(cosine * cosine + sine * sine)
-        cells, trusted = decode_cells(np.stack(grey[len(plan.sinusoids) :]), mean, modulation)
-        turn = number(2 * np.pi)
-        phase = -np.arctan2(sine, cosine)
-        centre = plan.centres_rad.astype(self.dtype)[np.minimum(cells, len(plan.centres_rad) - 1)]
-        absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
-        return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
-
-    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        number = np.dtype(self.dtype).type
-        axis, device = self._axis, self.rig.projector
-        ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
-        across, forward = self._rays
-        with np.errstate(all="ignore"):
-            depth = (ideal * number(self.rig.t[2]) - number(self.rig.t[axis])) / (across - ideal * forward)
-            depth_mm = depth * number(MM_PER_M)
-            near, far = self.rig.working_range_mm
-            valid = valid & (depth_mm >= near) & (depth_mm <= far)
-        return np.where(valid, depth_mm, 0).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class TradeoffSettings:
     """Settings of a run: ``only`` these groups (of `GROUPS` and `COSTS`; empty: all), ``runs``: a folder with further
@@ -266,6 +132,125 @@ class TradeoffSettings:
     views: int | None = None
     runs: Path | None = None
     widths: Sequence[int] | None = None
+
+
+def _classical(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
+    """N = 3 to all captured steps, of vertical, horizontal and both directions."""
+    most = views.rig.sequence.steps
+    for direction in CLASSICAL_DIRECTIONS:
+        for steps in sorted({3, min(6, most), most}) if run.quick else range(3, most + 1):
+            make = partial(ClassicalMethod, views.rig, direction, steps, run.threads)
+            title = f"classical N={steps}, {direction}"
+            yield Setting(f"classical-{direction}-{steps:02d}", "classical", title, make, views)
+
+
+def _phase(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
+    """The phase route: direction, cues for the fringe order, frames, windows of its filters."""
+
+    def setting(key: str, title: str, note: str | None = None, **options: object) -> Setting:
+        make = partial(load_method, "phase", views.rig, **options)
+        return Setting(f"phase-{key}", "phase", f"phase {title}", make, views, note=note)
+
+    for direction in DIRECTIONS:
+        yield setting(direction, direction, direction=direction)
+        yield setting(f"{direction}-no-shading", f"{direction}, no shading", direction=direction, shading=False)
+    for direction in DIRECTIONS:
+        for count in QUICK_FRAMES if run.quick else FEW_FRAMES:
+            if count <= views.rig.sequence.steps:
+                yield setting(f"{direction}-{count}", f"{direction}, {count} frames", direction=direction, frames=count)
+    if run.quick:
+        return
+    note = "assumes objects near the rig's standoff distance, which holds for fixed placement"
+    yield setting("standoff", "horizontal, standoff", note, prior="standoff")
+    note = "pixels of confidence below 0.5 are masked"
+    yield setting("masked", "horizontal, confident only", note, min_confidence=0.5)
+    for first, second in WINDOWS:
+        title = f"horizontal, windows {first:g}/{second:g}"
+        yield setting(f"window-{first:g}", title, first_window=first, second_window=second)
+
+
+def _networks(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
+    from fpp_ml_bench.baselines.tradeoff.networks import network_settings  # torch takes a second
+
+    return network_settings(views, run)
+
+
+def _precision(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
+    """The decoder's arithmetic in float32 and in float64, for few and for all steps."""
+    most = views.rig.sequence.steps
+    for steps in (most,) if run.quick else (3, most):
+        for dtype in ("float32", "float64"):
+            make = partial(DecodeInType, views.rig, "vertical", steps, dtype=dtype)
+            yield Setting(f"precision-{steps:02d}-{dtype}", "precision", f"NumPy {dtype}, N={steps}", make, views)
+
+
+def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
+    """Small scenes photographed at each image size, by all steps, by few, and from one fringe."""
+    choices: tuple[tuple[Directions, int], ...] = (("both", views.rig.sequence.steps), ("vertical", 3))
+    for size in QUICK_SIZES if run.quick else SIZES:
+        scaled = views.rig.scaled(size)
+        try:
+            scaled.check_sampling()
+        except FppBenchError:
+            continue  # coarser than the fringes allow: no dataset of this rig has such a size
+        photographed = PhotographedViews(scaled, tuple(name for name in SIZE_OBJECTS if name in TEST_OBJECTS))
+        for direction, steps in choices:
+            make = partial(ClassicalMethod, scaled, direction, steps, run.threads)
+            title = f"classical N={steps}, {direction}"
+            yield Setting(f"size-{size:04d}-{direction}-{steps}", "sizes", title, make, photographed)
+        phase = partial(load_method, "phase", scaled, direction="horizontal")
+        yield Setting(f"size-{size:04d}-phase", "sizes", "phase horizontal", phase, photographed)
+
+
+class DecodeInType(ClassicalMethod):
+    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``.
+
+    The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from
+    one projector coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous
+    code, or lies outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is
+    iterated in float64.
+    """
+
+    def __init__(self, rig: Rig, direction: Direction, steps: int, dtype: str) -> None:
+        super().__init__(rig, direction, steps)
+        if rig.projector.is_distorted:
+            raise DecodeError("float32 against float64 is compared for a projector without distortion; this rig's has")
+        self.number: Callable[[Any], Any] = np.dtype(dtype).type
+        self.plan = plan_direction(rig, direction, steps, Limits())
+        # Axis of the projector's image across the fringes; components of R (x, y, 1) along it and forward, (H, W).
+        self.axis = 0 if direction == "vertical" else 1
+        x, y = (axis.astype(dtype) for axis in rig.camera.rays())
+        rotation = rig.R.astype(dtype)
+        self.rays = [rotation[row, 0] * x + rotation[row, 1] * y + rotation[row, 2] for row in (self.axis, 2)]
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        plan, number, dtype = self.plan, self.number, self.rays[0].dtype
+        grey = [frame for frame in (frames[index] for index in plan.frames) if frame is not None]
+        if len(grey) != len(plan.frames):
+            raise DecodeError(f"expected the {len(plan.frames)} frames {plan.frames}, {len(grey)} were captured")
+        sums = np.zeros((3, *grey[0].shape), dtype)
+        for image, weights in zip(grey, plan.weights.T.astype(dtype), strict=False):
+            levels = image.astype(dtype)
+            for total, weight in zip(sums, weights, strict=True):
+                total += weight * levels
+        mean, cosine, sine = sums
+        modulation = np.sqrt(cosine * cosine + sine * sine)
+        cells, trusted = decode_cells(np.stack(grey[len(plan.sinusoids) :]), mean, modulation)
+        turn = number(2 * np.pi)
+        phase = -np.arctan2(sine, cosine)
+        centre = plan.centres_rad.astype(dtype)[np.minimum(cells, len(plan.centres_rad) - 1)]
+        absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
+        return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
+
+    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        number, axis, device, t_m = self.number, self.axis, self.rig.projector, self.rig.t
+        ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
+        across, forward = self.rays
+        with np.errstate(all="ignore"):
+            depth_mm = (ideal * number(t_m[2]) - number(t_m[axis])) / (across - ideal * forward) * number(MM_PER_M)
+            near, far = self.rig.working_range_mm
+            valid = valid & (depth_mm >= near) & (depth_mm <= far)
+        return np.where(valid, depth_mm, 0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -289,19 +274,10 @@ def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
     """
     opened = DatasetFolder(run.dataset)
     views = choose_views(opened, run.views or (QUICK_VIEWS if run.quick else VIEWS_AN_OBJECT))
-    settings: list[Setting] = []
-    for group in (group for group in GROUPS if not run.only or group in run.only):
-        if group == "classical":
-            settings += classical_settings(views, run.threads, run.quick)
-        elif group == "phase":
-            settings += phase_settings(views, run.quick)
-        elif group == "precision":
-            settings += precision_settings(views, run.quick)
-        elif group == "sizes":
-            settings += size_settings(views.rig, run.threads, run.quick)
-        else:
-            from fpp_ml_bench.baselines.tradeoff.networks import network_settings  # torch takes a second
-
-            settings += network_settings(views, run)
+    makers: dict[Group, Callable[[StoredViews, TradeoffSettings], Iterator[Setting]]] = {
+        "classical": _classical, "phase": _phase, "networks": _networks, "precision": _precision, "sizes": _sizes,
+    }  # fmt: skip
+    groups = [group for group in GROUPS if not run.only or group in run.only]
+    settings = [setting for group in groups for setting in makers[group](views, run)]
     costs = not run.only or COSTS in run.only
     return Plan(opened, views, settings, package_ladders(views.rig, run.quick, more_ladders) if costs else [])

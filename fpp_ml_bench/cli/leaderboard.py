@@ -3,12 +3,12 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import METRICS
-from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import page
 
 SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
@@ -35,34 +35,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
         help=f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
     )  # fmt: skip
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables as Markdown")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the ranking as JSON")
+    one_file: dict[str, Any] = {"type": Path, "metavar": "FILE"}
+    parser.add_argument("--markdown", **one_file, help="also write the tables as Markdown")
+    parser.add_argument("--json", **one_file, help="also write the ranking as JSON")
     parser.add_argument(
         "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
         help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
     )  # fmt: skip
-    parser.add_argument(
-        "--page",
-        type=Path,
-        metavar="DIR",
-        help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
+    page_help = (
+        "write the static page of the shipped rows, or of those given: index.html and a page for each submission"
     )
-    parser.add_argument(
-        "--tradeoff", type=Path, metavar="FILE",
-        help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--readme", type=Path, metavar="FILE",
-        help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
-    )  # fmt: skip
-    parser.add_argument(
-        "--check",
-        action="store_true",
-        help="with --readme: write nothing; exit status 1 when the block is not up to date",
+    parser.add_argument("--page", type=Path, metavar="DIR", help=page_help)
+    tradeoff_help = "the tradeoff.json to show on it (default, for the shipped rows: the file that ships)"
+    parser.add_argument("--tradeoff", **one_file, help=f"with --page: {tradeoff_help}")
+    readme_help = (
+        "write the ranking between the leaderboard markers of this file, from the rows shipped with the package"
     )
-    parser.add_argument(
-        "--row", type=Path, metavar="FILE", help="write the given result as a row file for the leaderboard"
-    )
+    parser.add_argument("--readme", **one_file, help=readme_help)
+    check_help = "with --readme: write nothing; exit status 1 when the block is not up to date"
+    parser.add_argument("--check", action="store_true", help=check_help)
+    parser.add_argument("--row", **one_file, help="write the given result as a row file for the leaderboard")
     parser.add_argument(
         "--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
         help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
@@ -88,15 +80,20 @@ def run(args: argparse.Namespace) -> int:
     unnamed = leaderboard.shipped_rows() if published else leaderboard.discover(Path.cwd())
     entries = leaderboard.read_entries(leaderboard.expand(args.results) if args.results else unnamed)
     if args.readme is not None:
-        return _readme(args, leaderboard.update_readme(args.readme, leaderboard.rank(entries), args.check))
+        same = leaderboard.update_readme(args.readme, leaderboard.rank(entries), args.check)
+        if args.check and not same:
+            print(
+                f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
+                f"fpp-bench leaderboard --readme {args.readme}",
+                file=sys.stderr,
+            )
+            return 1
+        print(f"{args.readme}: {'the ranking is up to date with the rows' if same else 'written'}")
+        return 0
     groups, papers = leaderboard.rank(entries, args.sort), leaderboard.chosen_tables(args.paper)
     for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
-        if path is None:
-            continue
-        try:
-            write_atomically(path, text(groups, papers, args.sort).encode("utf-8"))
-        except OSError as error:
-            raise SubmissionError(f"{path} can't be written: {error.strerror}") from None
+        if path is not None:
+            leaderboard.write_text(path, text(groups, papers, args.sort))
     if args.page is not None:
         shipped = None if args.results else tradeoff.shipped_tradeoff()
         settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)
@@ -104,17 +101,4 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
     show(*leaderboard.group_tables(groups, args.sort, output_width()), *leaderboard.paper_rich_tables(papers))
-    return 0
-
-
-def _readme(args: argparse.Namespace, same: bool) -> int:
-    """Say whether README's block was the ``same``; the exit status."""
-    if args.check and not same:
-        print(
-            f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
-            f"fpp-bench leaderboard --readme {args.readme}",
-            file=sys.stderr,
-        )
-        return 1
-    print(f"{args.readme}: {'the ranking is up to date with the rows' if same else 'written'}")
     return 0

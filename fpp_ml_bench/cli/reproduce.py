@@ -8,7 +8,6 @@ from pathlib import Path
 
 from fpp_ml_bench.baselines import reproduce
 from fpp_ml_bench.baselines.training import PRESETS, TABLES
-from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.errors import RecipeError, TrainingError
 
 SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
@@ -19,27 +18,37 @@ EXAMPLES = (
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
-RUNS = Path("runs")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    add = parser.add_argument
-    add("table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}")
-    add("--preset", choices=PRESETS, default="cpu",
-        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU")  # fmt: skip
-    add("--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)")
-    add("--runs", type=Path, default=RUNS, metavar="DIR",
-        help="trainings, predictions and tables go below DIR/PRESET (default: runs)")  # fmt: skip
-    add("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
-    add("--only-missing", action="store_true",
+    parser.add_argument(
+        "table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}"
+    )
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="cpu",
+        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs"), metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
+    )  # fmt: skip
+    parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
+    parser.add_argument(
+        "--only-missing", action="store_true",
         help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
-        "again. Finished trainings are always kept")  # fmt: skip
-    add("--minutes", type=_minutes, metavar="M",
+        "again. Finished trainings are always kept",
+    )  # fmt: skip
+    parser.add_argument(
+        "--minutes", type=_minutes, metavar="M",
         help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-        "continues")  # fmt: skip
-    add("--anyway", action="store_true", help="train preset paper even without a GPU")
-    add("--list", action="store_true", help="show rows, recipes and their state, and stop")
+        "continues",
+    )  # fmt: skip
+    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
+    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
 
 
 def _minutes(text: str) -> float:
@@ -54,24 +63,23 @@ def _minutes(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
+    from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import show
 
     below = args.runs / args.preset
     folders = reproduce.Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
     tables = TABLES if args.table in (None, ALL) else (args.table,)
     if args.list:
-        return _list(tables, folders)
+        _list(tables, folders)
+        return OK
     if args.table is None:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
     from fpp_ml_bench.leaderboard import reproduced
 
     command = _command(args)
-    outcome = reproduce.reproduce(
-        reproduce.ReproduceSettings(
-            tables, folders, command, reproduced, args.data, args.only_missing, args.minutes, args.anyway,
-            report=_report,
-        )
-    )  # fmt: skip
+    options = (args.data, args.only_missing, args.minutes, args.anyway)
+    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report=_report)
+    outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
         orderings = reproduced.orderings_sentence(reproduced.orderings(lines))
@@ -96,12 +104,13 @@ def _command(args: argparse.Namespace) -> str:
     words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
     for option, value in (("--data", args.data), ("--rows", args.rows)):
         words += [] if value is None else [option, str(value)]
-    words += [] if args.runs == RUNS else ["--runs", str(args.runs)]
-    words += ["--only-missing"] if args.minutes is None else ["--only-missing", "--minutes", f"{args.minutes:g}"]
-    return shlex.join([*words, "--anyway"] if args.anyway else words)
+    words += [] if args.runs == Path("runs") else ["--runs", str(args.runs)]
+    words += ["--only-missing", *([] if args.minutes is None else ["--minutes", f"{args.minutes:g}"])]
+    words += ["--anyway"] if args.anyway else []
+    return shlex.join(words)
 
 
-def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> int:
+def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
     from rich.table import Table
 
     from fpp_ml_bench.cli.console import show
@@ -116,4 +125,3 @@ def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> int:
         table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
     show(table)
     print(f"{len(jobs)} trainings fill {sum(len(job.rows) for job in jobs)} rows.")
-    return OK

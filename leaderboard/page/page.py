@@ -19,9 +19,8 @@ from fpp_ml_bench.evaluation.result import PART_TITLES, result_json
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import tables
 from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
-from fpp_ml_bench.leaderboard.paper import PaperTable
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, picture_of, read_entry
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, PaperTable, picture_of, read_entry
 from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, SUBMISSIONS = "index.html", "data.json", "submissions"
@@ -41,11 +40,9 @@ _BOARD_ROW = "classical-18-vertical.json"
 def write_page(
     groups: Sequence[Group], papers: Sequence[PaperTable], out: Path, tradeoff: Tradeoff | None = None
 ) -> list[Path]:
-    """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``.
-
-    Returns the files written. Removes pages of submissions that are no longer ranked, and nothing else. Raises
-    SubmissionError where a file can't be written.
-    """
+    """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``;
+    returns the files. Removes pages of submissions that are no longer ranked, and nothing else. SubmissionError where a
+    file can't be written."""
     files = page_files(groups, papers, tradeoff)
     try:
         (out / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
@@ -119,17 +116,16 @@ def slug(entry: Entry) -> str:
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    entry = row.entry
-    return f"{entry.name} {row.short_name} {entry.result.submission.method} {tables.device(entry)}".casefold()
+    words = row.entry.name, row.short_name, row.entry.result.submission.method, tables.device(row.entry)
+    return " ".join(words).casefold()
 
 
 def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, int]]]]:
     """For each dataset its rankings: number, title, rows."""
     rankings = []
     for data, members in groupby(enumerate(groups), key=lambda numbered: numbered[1].key.data_title):
-        of_data = list(members)
+        links, of_data = [], list(members)
         several_targets = len({group.key.against for _, group in of_data}) > 1
-        links = []
         for number, group in of_data:
             target = f", {group.key.against}" if several_targets else ""
             split = f", {group.key.split} split" if group.key.split != "test" else ""

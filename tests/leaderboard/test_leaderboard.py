@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
+from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
 from fpp_ml_bench.leaderboard.groups import cut_at_word
-from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, SHOWN_BY_DEFAULT, paper_tables
+from fpp_ml_bench.leaderboard.rows import SHOWN_BY_DEFAULT, paper_tables
 from fpp_ml_bench.leaderboard.tables import markdown_text
 
 
@@ -155,11 +156,11 @@ def test_paper_rows_are_the_papers():
     assert rows["multi_frame", "all"].test_samples == 1560
 
 
-@pytest.mark.parametrize("choice", [*PAPER_TABLES, "all", "none"])
+@pytest.mark.parametrize("choice", [*TABLES, "all", "none"])
 def test_paper_tables_by_choice(choice, capsys, tmp_path):
     out = board(capsys, "--paper", choice, "--markdown", tmp_path / "t.md")
-    expected = PAPER_TABLES if choice == "all" else () if choice == "none" else (choice,)
-    for name in PAPER_TABLES:
+    expected = TABLES if choice == "all" else () if choice == "none" else (choice,)
+    for name in TABLES:
         assert (f"{name}: " in out) == (name in expected)
         assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (name in expected)
     assert SHOWN_BY_DEFAULT == ("architecture", "normalization")

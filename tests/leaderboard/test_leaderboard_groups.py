@@ -22,9 +22,9 @@ from fpp_ml_bench.leaderboard.groups import (
     short_names,
 )
 from fpp_ml_bench.leaderboard.page import page_files
-from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.ranking import rank, rank_ranges, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.readme_block import readme_block
+from fpp_ml_bench.leaderboard.rows import chosen_tables
+from fpp_ml_bench.leaderboard.tables import readme_block
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
 
 

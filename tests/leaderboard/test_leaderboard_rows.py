@@ -16,8 +16,8 @@ from fpp_ml_bench.evaluation.report import palette_png
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.readme_block import BEGIN, END, SHOWN, readme_block
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry, write_row
+from fpp_ml_bench.leaderboard.tables import BEGIN, END, SHOWN, readme_block
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """Trained networks on the command line and on the board: tracks, units, masks, and what is refused."""
 
+from html import unescape
+
 import numpy as np
 import pytest
 import torch
@@ -227,7 +229,7 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
     assert [group.key.track for group in groups] == ["metric", "oracle mask", "oracle range", "oracle range + mask"]
     assert all(len(group.rows) == 1 for group in groups)
     assert main(["leaderboard", *map(str, paths), "--page", str(tmp_path / "page")]) == 0
-    page = (tmp_path / "page" / "index.html").read_text()
+    page = unescape((tmp_path / "page" / "index.html").read_text())
     assert "oracle mask track" in page and "told the test sample's depth range and object mask" in page
     with pytest.raises(PublishError, match="no task for the oracle mask track"):
         task_of(groups[1].rows[0].entry.result, "masked.json")

@@ -18,8 +18,8 @@ from fpp_ml_bench.baselines.tradeoff.drawing import free_box
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report import escaped, page
 from fpp_ml_bench.leaderboard.page.page import group_scatter, page_files, slug
-from fpp_ml_bench.leaderboard.paper import chosen_tables
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
+from fpp_ml_bench.leaderboard.rows import chosen_tables
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,17 @@ from fpp_ml_bench.cli import reproduce as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.leaderboard.paper import PAPER_TABLES, paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
     Scored,
     orderings,
     orderings_sentence,
-    scored_result,
+    scored,
     table_lines,
     table_markdown,
 )
-from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.leaderboard.rows import Entry, paper_tables
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +37,12 @@ def folders(tmp_path, preset="cpu"):
 
 
 def test_the_command_knows_the_recipes_tables_and_presets():
-    assert PAPER_TABLES == command.TABLES == TABLES and command.PRESETS == PRESETS
+    assert command.TABLES == TABLES and command.PRESETS == PRESETS
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_rows_of_one_recipe_are_one_training(preset):
-    jobs = planned(PAPER_TABLES, preset)
+    jobs = planned(TABLES, preset)
     rows = [row for job in jobs for row in job.rows]
     assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 5 and len(jobs) == 23
     shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
@@ -58,8 +57,8 @@ def test_rows_of_one_recipe_are_one_training(preset):
 
 
 def test_lines_hold_the_papers_numbers(tmp_path, dataset):
-    jobs = planned(PAPER_TABLES, "cpu")
-    for table in PAPER_TABLES:
+    jobs = planned(TABLES, "cpu")
+    for table in TABLES:
         by_row = {line.row: line for line in table_lines(table, jobs, folders(tmp_path), dataset)}
         for row in paper_tables()[table].rows:
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
@@ -108,11 +107,12 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
     jobs, run_folders = planned(["normalization"], "cpu"), folders(tmp_path)
     first = open_dataset(dataset.path, jobs, run_folders, print)
     assert open_dataset(dataset.path, jobs, run_folders, print).fingerprint == first.fingerprint
-    recorded = json.loads(run_folders.dataset_record.read_text())
-    run_folders.dataset_record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
+    record = run_folders.runs / "dataset.json"
+    recorded = json.loads(record.read_text())
+    record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
     with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
         open_dataset(dataset.path, jobs, run_folders, print)
-    run_folders.dataset_record.write_text("{")
+    record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
         open_dataset(dataset.path, jobs, run_folders, print)
 
@@ -122,8 +122,8 @@ def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: E
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
     mean = float(np.mean(list(errors.values())))
     samples = {sample: (sample.rpartition("_")[0], error) for sample, error in errors.items()}
-    scored = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
-    return Line(label, label, load_recipe("loss/rmse"), scored, entry, paper)
+    of_samples = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
+    return Line(label, label, load_recipe("loss/rmse"), of_samples, entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -172,7 +172,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     ]
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored_result(entry.result))
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored(entry.result))
         for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]

@@ -88,9 +88,9 @@ def test_parts_are_the_walls_and_are_left_out_of_processor_time(world):
     assert [growth.stage for growth in time_ladder(quadratic(world, []), Rules(clock="processor"))] == ["look up"]
 
 
-def test_csv_of_growth(world, tmp_path):
+def test_csv_of_growth(world):
     growths = time_ladder(quadratic(world, []))
     lines = growth_csv(growths).splitlines()
     assert lines[0].startswith("stage,over,amount,seconds,exponent") and len(lines) == 1 + 3 * 4
     assert lines[1] == "look up,rows,4,0.016,2,2,2,2,steeper than linear"
-    assert not draw_growth([], tmp_path / "none.png") and not (tmp_path / "none.png").exists()
+    assert draw_growth([]) is None
