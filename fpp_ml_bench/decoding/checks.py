@@ -89,9 +89,8 @@ def check_frames(
     sampled = slice(None, None, step) if indices is None else indices[::step]
     levels = [flat[index][sampled] for index in plan.sinusoids]
     if len(levels) >= LEAST_STEPS_FOR_MEANS:
-        shifts = (
-            2 * np.pi * np.array([rig.sequence.frames[index].step for index in plan.sinusoids]) / rig.sequence.steps
-        )
+        steps = [rig.sequence.frames[index].step for index in plan.sinusoids]
+        shifts = 2 * np.pi * np.array(steps) / rig.sequence.steps
         model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
         wrong = _contradicting_mean(np.array([level.mean() for level in levels]), model, plan.weights)
     else:
