@@ -7,7 +7,7 @@ Only the module of the command that runs is imported, and such a module imports 
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -75,36 +75,29 @@ def parser_for(command: ModuleType, prog: str) -> argparse.ArgumentParser:
 def run_command(command: ModuleType, prog: str, argv: Sequence[str]) -> int:
     """Parse ``argv`` and run the command; expected errors become a message and an exit status."""
     args = parser_for(command, prog).parse_args(argv)
-    return guarded(lambda: command.run(args), prog)
-
-
-def guarded(run: Callable[[], int], prog: str) -> int:
-    """Exit status of ``run``; an error of this package, an unreadable file or Ctrl-C becomes a message."""
     try:
-        return run()
-    except FppBenchError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
+        status: int = command.run(args)
+        return status
+    except BrokenPipeError:
+        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
+        sys.stdout = None  # type: ignore[assignment]
         return BAD_INPUT
+    except (FppBenchError, OSError) as error:
+        return _refused(prog, error)
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)
         if extra is None:
             raise
-        print(
-            f"{prog}: error: this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'",
-            file=sys.stderr,
-        )
-        return BAD_INPUT
-    except BrokenPipeError:
-        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
-        sys.stdout = None  # type: ignore[assignment]
-        return BAD_INPUT
-    except OSError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         return INTERRUPTED
+
+
+def _refused(prog: str, problem: object) -> int:
+    print(f"{prog}: error: {problem}", file=sys.stderr)
+    return BAD_INPUT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,16 +120,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
     args, unknown = parser.parse_known_args(arguments)
     if unknown and unknown[0] == arguments[0]:
-        print(
-            f"fpp-bench: error: unknown option {arguments[0]!r} before a command; see fpp-bench --help", file=sys.stderr
-        )
-        return BAD_INPUT
+        return _refused("fpp-bench", f"unknown option {arguments[0]!r} before a command; see fpp-bench --help")
     if args.command is not None:
         from difflib import get_close_matches
 
         matches = get_close_matches(args.command, COMMANDS, n=1)
         hint = f"; did you mean {matches[0]!r}?" if matches else f"; there are {', '.join(COMMANDS)}"
-        print(f"fpp-bench: error: unknown command {args.command!r}{hint}", file=sys.stderr)
-        return BAD_INPUT
+        return _refused("fpp-bench", f"unknown command {args.command!r}{hint}")
     parser.print_help(sys.stderr if not arguments else sys.stdout)
     return BAD_INPUT
