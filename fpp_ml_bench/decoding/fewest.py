@@ -1,7 +1,7 @@
 """The fewest frames that a rig's working range needs: phase steps for a noise, Gray bits for the orders that can occur.
 
 A ray crosses few fringe periods within the range, but the Gray code tells all apart. A bit that is the same on every
-cell in view can be left out (`gray_bits_in_view`); no other can, as a phase at the edge of a cell where a bit changes
+cell in view can be left out (`gray_levels_in_view`); no other can, as a phase at the edge of a cell where a bit changes
 fits two cells without it. With both directions often no bit is needed (`orders_from_phases`): as in two-frequency
 unwrapping the two periods are unambiguous over their beat, and only the right pair of orders lies on the epipolar line.
 """
@@ -39,17 +39,19 @@ def reach_of(rig: Rig) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=16)
-def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
-    """Gray bits of a direction (0 = most significant) that change in the camera's view, background included."""
+def gray_levels_in_view(rig: Rig, direction: Direction) -> tuple[int | None, ...]:
+    """Grey level of each Gray bit (0 = most significant) that is the same everywhere in the camera's view, at any depth
+    in the range and on the background; None for a bit that changes."""
     in_view, bits = reach_of(rig)[:, AXES.index(direction)], rig.sequence.bits(direction)
     in_view = in_view[np.isfinite(in_view)]
-    last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
     if not in_view.size:
-        return tuple(range(bits))
+        return (None,) * bits
+    last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
     low, high = (int(cell_of(edge, rig.pitch(direction))) for edge in (in_view.min(), in_view.max()))
     cells = np.arange(max(low - CODE_MARGIN_CELLS, 0), min(high + CODE_MARGIN_CELLS, last) + 1)
     code = binary_to_gray(cells if cells.size else np.arange(last + 1))
-    return tuple(bit for bit in range(bits) if np.ptp(code >> (bits - 1 - bit) & 1))
+    values = (code >> shift & 1 for shift in reversed(range(bits)))
+    return tuple(None if np.ptp(value) else int(value[0]) * GREY_LEVELS for value in values)
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,8 @@ def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tu
     """Gray bits that must be captured for ``direction`` "vertical", "horizontal" or "both", per direction."""
     if direction == "both" and orders_from_phases(rig).unambiguous:
         return {"horizontal": (), "vertical": ()}
-    return {name: gray_bits_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
+    levels = {name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
+    return {name: tuple(bit for bit, level in enumerate(found) if level is None) for name, found in levels.items()}
 
 
 def fewest_steps(
@@ -137,19 +140,11 @@ def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPl
     joint = orders_from_phases(rig) if len(plans) == 2 else None
     if joint is not None and joint.unambiguous:
         return [replace(plan, gray=()) for plan in plans], joint
-    return [replace(plan, constant_levels=_constant_levels(rig, plan)) for plan in plans], None
-
-
-def _constant_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
-    """Grey level of each Gray frame that is the same on every cell in view, by frame index."""
-    needed = gray_bits_in_view(rig, plan.direction)
-    in_view = reach_of(rig)[0, AXES.index(plan.direction)]
-    in_view = in_view[np.isfinite(in_view)]
-    if not in_view.size:
-        return {}
-    code = int(binary_to_gray(cell_of(np.clip(in_view[0], 0, plan.length_px - 1), plan.pitch_px)))
-    levels = {frame: (code >> shift & 1) * GREY_LEVELS for shift, frame in enumerate(reversed(plan.gray))}
-    return {frame: levels[frame] for bit, frame in enumerate(plan.gray) if bit not in needed}
+    fewer = []
+    for plan in plans:
+        levels = zip(plan.gray, gray_levels_in_view(rig, plan.direction), strict=True)
+        fewer.append(replace(plan, constant_levels={frame: level for frame, level in levels if level is not None}))
+    return fewer, None
 
 
 def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
