@@ -20,19 +20,17 @@ PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"
 VIEW_DEGREES = (0, 60, 120, 180, 240, 300)
 VIEWS = tuple(f"A{degrees}" for degrees in VIEW_DEGREES)
 
-YCB_OBJECTS = (
+OBJECTS = (
     "master_chef_can", "cracker_box", "sugar_box", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "pudding_box",
     "gelatin_box", "potted_meat_can", "banana", "pitcher", "bleach_cleanser", "bowl", "mug", "power_drill",
     "wood_block", "scissors", "marker", "large_clamp",
-)  # fmt: skip
-WAREHOUSE_OBJECTS = (
+    # YCB above, warehouse below
     "eyeglasses", "open_book", "spray_bottle", "cleaning_bucket", "container_bottle", "container_tin", "vial",
     "lighting_candles", "magazine_stack", "wooden_boards", "paint_container_bottle", "paint_container_jar",
     "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
     "paint_brush", "paint_brush_large", "pallet_knife", "pallet_knife_large", "spraygun", "paint_thinner", "battery",
     "battery_case", "chalk_stick", "pen", "cork", "clamp", "boxcutter", "hammer", "duct_tape",
 )  # fmt: skip
-OBJECTS = YCB_OBJECTS + WAREHOUSE_OBJECTS
 
 VALIDATION_OBJECTS = ("mustard_bottle", "mug", "paint_brush_large", "paint_container_jar", "spraygun")
 TEST_OBJECTS = ("power_drill", "magazine_stack", "container_bottle", "wooden_boards", "large_clamp")

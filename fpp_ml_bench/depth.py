@@ -1,8 +1,4 @@
-"""The pixel sets on which scores are reported, the depth edges that split the object set, and normalised depth.
-
-Ground-truth statistics, training masks and the evaluator share the rule (paper Section 5.3.2): a pixel belongs to the
-object where the target depth is above 0 mm, else to the background.
-"""
+"""The pixel sets on which scores are reported, the depth edges that split the object set, and normalised depth."""
 
 import math
 from collections.abc import Sequence
@@ -15,15 +11,15 @@ from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M
 from fpp_ml_bench.skipping import skipping_enabled
 
 DEPTH_EDGE_JUMP_MM = 10.0
-"""A step between 4-neighbours above this is a depth edge at 960 px; it grows with the pixel footprint at other sizes.
-At 1.8 m a pixel covers 0.79 mm, so 10 mm per pixel is a surface tilted by 85 degrees from the image plane."""
+"""A step between 4-neighbours above this is a depth edge at 960 px (a surface tilted by 85 degrees from the image
+plane); it grows with the pixel footprint at other sizes."""
 Normalisation = Literal["raw", "global", "individual"]
 NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
 _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels of the object: target depth above 0. ``depth_mm`` (H, W) in mm, 0 = background; bool (H, W)."""
+    """Pixels of the object, bool (H, W): target depth above 0 mm, for statistics, masks and scores (paper 5.3.2)."""
     return depth_mm > 0
 
 
@@ -50,11 +46,8 @@ def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) ->
 
 
 def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
-    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px.
-
-    Both pixels beside an edge have distance 0, their neighbours 1, and so on; an image without edges has distance inf
-    everywhere.
-    """
+    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px; 0 for both pixels beside an
+    edge, inf in an image without edges."""
     import cv2
 
     edge = depth_edges(depth_mm, jump_mm)
@@ -65,11 +58,8 @@ def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = Non
 
 
 def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:
-    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W), computed by dilating the edges.
-
-    For the few pixels of a score's edge band this is several times faster than a distance transform, and needs no
-    OpenCV (whose import alone takes longer than scoring ten samples).
-    """
+    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W). By dilation, which for a narrow band is
+    several times faster than a distance transform, and needs no OpenCV (slower to import than ten samples to score)."""
     return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
 
 
@@ -122,10 +112,9 @@ def normalise(
 ) -> NDArray:  # fmt: skip
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
 
-    Single precision loses nothing where depth and range are float32: the difference of two such depths within a factor
-    of two of each other is exact (Sterbenz), and the division rounds once. Any other range, or depths of higher
-    precision, would lose digits by being rounded first: these are computed in float64 and rounded at the end.
-    Raises ``ValueError`` for an unknown name or a range that is not finite and ordered.
+    In single precision where depth and range are float32: the difference of two such depths within a factor of two is
+    exact (Sterbenz), and the division rounds once. Else in float64, rounded at the end. Raises ``ValueError`` for an
+    unknown name or a range that is not finite and ordered.
     """
     _check(name)
     result = np.empty(depth_mm.shape, dtype=np.float32) if out is None else out
@@ -149,18 +138,15 @@ def normalise(
 
 
 def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth_max_mm: float) -> NDArray[np.float64]:
-    """A network's output in the representation ``name`` back to mm; float64 of the same shape.
+    """A network's output in the representation ``name`` back to mm, float64; ``ValueError`` as `normalise`.
 
-    Under ``individual`` every pixel goes through the same affine map, so a predicted 0 becomes D_min (paper Section
-    5.3.2). Raises ``ValueError`` as `normalise`.
+    Under ``individual`` every pixel goes through the same affine map: 0 becomes D_min (paper Section 5.3.2).
     """
     _check(name)
     depth = values.astype(np.float64)
-    if name == "raw":
-        return depth
-    if name == "global":
-        return depth * MM_PER_M
-    return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
+    if name == "individual":
+        return depth * _span(depth_min_mm, depth_max_mm) + float(depth_min_mm)
+    return depth * MM_PER_M if name == "global" else depth
 
 
 def _span(depth_min_mm: float, depth_max_mm: float) -> float:

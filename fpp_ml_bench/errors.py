@@ -1,25 +1,6 @@
-"""The errors this package raises, as a small tree.
+"""The errors this package raises. A message says what was expected, what came, in which file or sample, and what to do.
 
-::
-
-    FppBenchError                 anything this package refuses; commands print it and exit with status 2
-    ├── RigError                  a rig file or value that does not describe a usable camera-projector pair
-    ├── DecodeError               frames that can't be decoded at all (shape, dtype, missing frames)
-    ├── MeshError                 a mesh that can't be read, is empty, or does not fit the working range
-    ├── DatasetError              a dataset folder that is absent, incomplete, damaged or of another version
-    │   ├── LayoutError           a published tree that breaks a rule of its layout
-    │   └── BuildError            a build that can't start or go on (locked, other settings, disk full)
-    ├── PredictionError           predictions that can't be scored: missing, extra, mis-shaped, not finite
-    ├── SubmissionError           a submission.yaml or result file with missing or wrong entries
-    ├── NetworkError              an unknown network or option, or an unsupported input size
-    ├── RecipeError               a recipe with an unknown key or an impossible value
-    ├── TrainingError             a training that diverged, or that can't start or go on
-    ├── WeightsError              a weights file that is damaged, foreign or made for other data
-    ├── DiagnosisError            a model that can't be diagnosed this way, an unknown probe or layer
-    ├── StabilityError            an unknown group of stability cases
-    └── PublishError              data or results that can't be published: no token, no network, refused by the Hub
-
-A message says what was expected, what came, in which file or sample, and what to do.
+Commands print an `FppBenchError` and exit with status 2.
 """
 
 

@@ -43,10 +43,7 @@ def printable(value: object, limit: int = NAME_LIMIT) -> str:
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """The file and its size in bytes.
-
-    Raises PredictionError, without the file's name, for anything but a regular file.
-    """
+    """The file and its size in bytes; PredictionError, without the file's name, for anything but a regular file."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
@@ -64,10 +61,7 @@ def opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
 def fill(stream: IO[Any], view: memoryview) -> int:
     """Fill ``view`` from the stream; the number of bytes read, fewer where the stream ends early."""
     done = 0
-    while done < len(view):
-        count = stream.readinto(view[done:])  # type: ignore[attr-defined]
-        if not count:
-            break
+    while count := stream.readinto(view[done:]):  # type: ignore[attr-defined]
         done += count
     return done
 
@@ -116,9 +110,7 @@ def file_hash(path: Path) -> str:
 @contextmanager
 def exclusive(lock_file: Path, folder: Path, activity: str) -> Iterator[None]:
     """Hold ``lock_file``, created with its folder if absent; `BuildError` for ``folder`` if another process has it.
-
-    The operating system releases the lock when the process ends in any way.
-    """
+    The operating system releases the lock when the process ends in any way."""
     import filelock
 
     lock = filelock.FileLock(lock_file, timeout=0)
@@ -154,9 +146,8 @@ def _strict_loader() -> type:
                 if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
                     raise yaml.YAMLError(f"line {key.start_mark.line + 1}: expected text as key")
                 if key.value in seen:
-                    raise yaml.YAMLError(
-                        f"line {key.start_mark.line + 1}: key {printable(key.value, 60)!r} is given twice"
-                    )
+                    line, name = key.start_mark.line + 1, printable(key.value, 60)
+                    raise yaml.YAMLError(f"line {line}: key {name!r} is given twice")
                 seen.add(key.value)
             return super().construct_mapping(node, deep=deep)
 

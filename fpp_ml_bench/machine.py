@@ -1,9 +1,7 @@
 """This machine and this process: its hardware, threads and memory, and whether numba compiles the kernels.
 
-Imports neither NumPy nor torch. Compiled kernels live in modules of their own that are imported only when
-`numba_enabled` says so, each beside a NumPy function that gives the same numbers; ray casting has no such function and
-is always compiled. The environment variable ``FPP_BENCH_NUMBA=0`` selects NumPy; so does a machine on which numba can't
-be imported.
+Imports neither NumPy nor torch. Compiled kernels are imported only when `numba_enabled` says so, each beside a NumPy
+function that gives the same numbers (but for ray casting, always compiled). ``FPP_BENCH_NUMBA=0`` selects NumPy.
 """
 
 import ctypes
@@ -14,11 +12,12 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -30,10 +29,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 @dataclass(frozen=True)
 class Hardware:
-    """``cores`` and ``memory_gib`` are what this process may use (affinity, container limits), not what is built in.
-
-    ``gpu`` names all visible NVIDIA GPUs, None without any; whether a method used them is recorded by the method.
-    """
+    """``cores`` and ``memory_gib`` are what this process may use (affinity, container limits), not what is built in;
+    ``gpu`` names all visible NVIDIA GPUs, None without any."""
 
     cpu: str
     cores: int
@@ -47,13 +44,10 @@ class Hardware:
 
 def describe_hardware() -> Hardware:
     """Describe this machine. Never raises; an unavailable value is ``"unknown"``, 0.0 GiB or None."""
-    return Hardware(
-        cpu=_cpu_model(),
-        cores=usable_cores(),
-        memory_gib=round(_usable_memory_bytes() / 1024.0**3, 1),
-        gpu=_gpu_names(),
-        platform=f"{platform.system()} {platform.release()} {platform.machine()}",
-    )
+    model = _found(r"^model name\s*:\s*(.+)$", "/proc/cpuinfo")
+    memory_gib = round(_usable_memory_bytes() / 1024.0**3, 1)
+    system = f"{platform.system()} {platform.release()} {platform.machine()}"
+    return Hardware(model or platform.processor() or "unknown", usable_cores(), memory_gib, _gpu_names(), system)
 
 
 def _read(path: str) -> str:
@@ -63,9 +57,10 @@ def _read(path: str) -> str:
         return ""
 
 
-def _cpu_model() -> str:
-    match = re.search(r"^model name\s*:\s*(.+)$", _read("/proc/cpuinfo"), flags=re.MULTILINE)
-    return (match.group(1).strip() if match else platform.processor()) or "unknown"
+def _found(pattern: str, path: str) -> str | None:
+    """What the pattern's group is in the first line of a file that matches."""
+    match = re.search(pattern, _read(path), flags=re.MULTILINE)
+    return match.group(1).strip() if match else None
 
 
 def usable_cores() -> int:
@@ -78,18 +73,15 @@ def usable_cores() -> int:
 
 
 def _usable_memory_bytes() -> float:
-    match = re.search(r"^MemTotal:\s*(\d+) kB", _read("/proc/meminfo"), flags=re.MULTILINE)
-    total = float(match.group(1)) * 1024.0 if match else 0.0
+    total = float(_found(r"^MemTotal:\s*(\d+) kB", "/proc/meminfo") or 0) * 1024.0
     limit = _read("/sys/fs/cgroup/memory.max").strip()
     return min(total, float(limit)) if limit.isdigit() and total else total
 
 
 def _gpu_names() -> str | None:
     """NVIDIA GPUs, from the driver's files, from torch if it is loaded already, or from ``nvidia-smi``."""
-    names = []
-    for path in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):
-        match = re.search(r"^Model:\s*(.+)$", _read(str(path)), flags=re.MULTILINE)
-        names += [match.group(1).strip()] if match else []
+    files = sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))
+    names = [name for file in files if (name := _found(r"^Model:\s*(.+)$", str(file))) is not None]
     torch = sys.modules.get("torch")
     if not names and torch is not None and hasattr(torch, "cuda") and torch.cuda.is_available():
         names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -100,11 +92,8 @@ def _gpu_names() -> str | None:
         except (OSError, subprocess.SubprocessError):
             listing = ""
         names = [line.strip() for line in listing.splitlines() if line.strip()]
-    if not names:
-        return None
-    return ", ".join(
-        f"{names.count(name)} x {name}" if names.count(name) > 1 else name for name in dict.fromkeys(names)
-    )
+    counted = (f"{count} x {name}" if count > 1 else name for name, count in Counter(names).items())
+    return ", ".join(counted) or None
 
 
 def limit_threads(threads: int) -> None:
@@ -113,11 +102,8 @@ def limit_threads(threads: int) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed, up to 2 GiB, instead of returning each large array to the system.
-
-    Every image and every training step asks for the same sizes again, and the page faults of new memory take longer
-    than the arithmetic. Linux only.
-    """
+    """Have glibc keep what is freed, up to 2 GiB (Linux only): every image and training step asks for the same sizes
+    again, and the page faults of new memory take longer than the arithmetic."""
     set_option = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if set_option is not None:
         set_option(_MMAP_THRESHOLD, 1 << 30)
@@ -125,11 +111,8 @@ def keep_freed_memory() -> None:
 
 
 def prepare_process() -> None:
-    """Keep freed memory, look for no pydantic plugins, and collect no cyclic garbage.
-
-    pydantic searches the metadata of every installed package for plugins, and this package uses none. The garbage
-    collector visits every imported object again and again; scoring leaves no reference cycles.
-    """
+    """Keep freed memory, look for no pydantic plugins (a search of every installed package), and collect no cyclic
+    garbage: the collector visits every imported object again and again, and scoring leaves no reference cycles."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.disable()
     keep_freed_memory()
@@ -151,17 +134,14 @@ def numba_enabled() -> bool:
 
 
 def njit(function: Function) -> Function:
-    """Compile ``function`` to run without the GIL; the machine code is kept on disk for the next process.
+    """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is.
 
-    No ``fastmath``, and no multiplication is fused with an addition: the order of every sum stays as written, so the
-    same input gives the same bytes on every processor and for any number of threads. Without numba the function is
-    returned as it is (correct and very slow).
+    No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
+    processor and for any number of threads.
     """
     if _numba() is None:
         return function
-    compiled: Any
     try:
-        compiled = _numba().njit(cache=True, nogil=True, error_model="numpy")(function)
+        return cast(Function, _numba().njit(cache=True, nogil=True, error_model="numpy")(function))
     except RuntimeError:  # neither the package folder nor the user's cache folder can be written
-        compiled = _numba().njit(nogil=True, error_model="numpy")(function)
-    return compiled
+        return cast(Function, _numba().njit(nogil=True, error_model="numpy")(function))

@@ -1,8 +1,7 @@
-"""Elementary functions that give the same bits on every processor.
+"""Elementary functions that give the same bits on every processor, for what decides a byte of a dataset.
 
-NumPy, the C library and BLAS choose their code by the processor's instruction set, and their last bits differ. What
-decides a byte of a dataset is therefore computed from operations that IEEE 754 rounds correctly (addition,
-multiplication, division, square root), each rounded on its own.
+The last bits of NumPy, the C library and BLAS differ between processors; the operations here (addition,
+multiplication, division, square root) IEEE 754 rounds correctly.
 """
 
 import math
@@ -63,10 +62,8 @@ def sine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
 
 
 def arctangent2(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """atan2(``y``, ``x``) in [-pi, pi], float64, to 2 units in the last place; 0 where both are 0.
-
-    The same operations as in `fpp_ml_bench.decoding.kernels`, which is faster.
-    """
+    """atan2(``y``, ``x``) in [-pi, pi], float64, to 2 units in the last place; 0 where both are 0. The same operations
+    as in `fpp_ml_bench.decoding.kernels`, which is faster."""
     ax, ay = np.abs(x), np.abs(y)
     small, large = np.minimum(ax, ay), np.maximum(ax, ay)
     upper = small > TAN_EIGHTH * large

@@ -1,8 +1,7 @@
 """The switch for skipping: leaving out work that a scene does not need (the default), or doing all of it.
 
-Code that leaves work out checks `skipping_enabled`. The results are the same bit by bit either way (the tests compare
-them); only time, memory traffic and the number of rays change. ``FPP_BENCH_SKIP=0`` in the environment, or the option
-``--no-skip`` of a command, switches skipping off, to measure its gain or to exclude it as the cause of a problem.
+The results are the same bit by bit either way. ``FPP_BENCH_SKIP=0`` in the environment, or the option ``--no-skip`` of
+a command, switches skipping off, to measure its gain or to exclude it as the cause of a problem.
 """
 
 import os
@@ -38,9 +37,8 @@ REPEATS = 3
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A kind of work, ``what``: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither read nor written, or
-    None where no bytes are involved; ``seconds_saved`` of processor time by ``rule``, or None with the reason in
-    ``rule``."""
+    """A kind of work, ``what``: ``done`` and ``left_out`` count ``unit``; ``bytes_saved`` neither read nor written
+    (None: none involved); ``seconds_saved`` of processor time by ``rule``, or None with the reason in ``rule``."""
 
     what: str
     unit: str
@@ -52,7 +50,6 @@ class LeftOut:
 
     @property
     def share(self) -> float:
-        """Share of the work that was left out, 0 to 1."""
         total = self.done + self.left_out
         return self.left_out / total if total else 0.0
 
@@ -67,15 +64,12 @@ class Explanation:
     skipping: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
         return {
-            "command": self.command,
-            "subject": self.subject,
-            "skipping": self.skipping,
+            "command": self.command, "subject": self.subject, "skipping": self.skipping,
             "left_out": [{**asdict(line), "share": round(line.share, 6)} for line in self.lines],
             "seconds_saved": sum(line.seconds_saved for line in self.lines if line.seconds_saved is not None),
             "bytes_saved": sum(line.bytes_saved or 0 for line in self.lines),
-        }
+        }  # fmt: skip
 
 
 def explained(command: str, subject: str, lines: list[LeftOut]) -> Explanation:

@@ -78,8 +78,13 @@ def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
     """Parse ``argv`` and run the command; an error of this package, an unreadable file or Ctrl-C becomes a message."""
     args = parser_for(command, prog).parse_args(argv)
     try:
-        return int(command.run(args))
-    except FppBenchError as error:
+        status: int = command.run(args)
+        return status
+    except BrokenPipeError:
+        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
+        sys.stdout = None  # type: ignore[assignment]
+        return BAD_INPUT
+    except (FppBenchError, OSError) as error:
         return _refused(prog, error)
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
@@ -87,12 +92,6 @@ def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
         if extra is None:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
-    except BrokenPipeError:
-        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
-        sys.stdout = None  # type: ignore[assignment]
-        return BAD_INPUT
-    except OSError as error:
-        return _refused(prog, error)
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         return INTERRUPTED

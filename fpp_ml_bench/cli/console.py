@@ -14,10 +14,8 @@ WIDTH_IN_PIPES = 140
 
 @contextmanager
 def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterator[Callable[[int], None]]:
-    """A rich progress bar over ``total`` steps; yields the function that advances it.
-
-    Shows the rate of ``unit``, of which a step counts ``per_step`` (52 images a sample), and the time left.
-    """
+    """A rich progress bar over ``total`` steps; yields the function that advances it. Shows the time left and the rate
+    of ``unit``, of which a step counts ``per_step`` (52 images a sample)."""
     from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.text import Text
 

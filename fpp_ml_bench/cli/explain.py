@@ -49,9 +49,8 @@ def explain(args: argparse.Namespace, account: Callable[[], Explanation]) -> Non
     for name in ("what", "unit", "done", "left out", "share", "bytes", "seconds"):
         table.add_column(name, justify="left" if name in ("what", "unit") else "right")
     for line in explanation.lines:
-        seconds, saved = "-", line.seconds_saved
-        if saved is not None:
-            seconds = f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
+        saved = line.seconds_saved
+        seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
         table.add_row(
             Text(line.what), line.unit, f"{line.done:,}", f"{line.left_out:,}", f"{100 * line.share:.1f}%",
             "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),

@@ -1,8 +1,4 @@
-"""Decoding a block of pixels: the stages, each compiled or in NumPy, then a depth or a reason for every pixel.
-
-`fpp_ml_bench.decoding.decode` cuts the image into blocks that fit the processor's cache and calls `decode_direction`,
-`within_reach` and `depth_and_reason` here.
-"""
+"""Decoding a block of pixels: the stages, each compiled or in NumPy, then a depth or a reason for every pixel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,29 +7,18 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench import optics
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.phase import choose_steps, compiled_kernels, minus_atan2, phase_weights, weighted_sums
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, rotated_ray
-from fpp_ml_bench.optics import (
-    AMBIGUOUS_FRACTION,
-    AXES,
-    INCONSISTENT_RAD,
-    Direction,
-    Maps,
-    Rig,
-    absolute_phase,
-    cell_centres_rad,
-    decode_cells,
-)
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.optics import AXES, Direction, Maps, Rig
 
 MIN_MODULATION = 5.0
 """Grey levels. At a read noise of 1 grey level and only 3 steps the phase noise is then 0.16 rad: a tenth of the pi/2
-that the fringe order tolerates, and about 7 mm of depth at 1.8 m. A smaller modulation means shadow, glare or no
-projector light."""
+that the fringe order tolerates, about 7 mm of depth at 1.8 m. Less means shadow, glare or no projector light."""
 CLIPPED_STEPS_DIVISOR = 9
-"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). With so many steps a clipped crest
-distorts the phase by under 5 mrad, since N steps cancel harmonics up to N - 2; with few steps it would bias it by tens
-of mrad."""
+"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). N steps cancel harmonics up to N - 2, so
+that a clipped crest then distorts the phase by under 5 mrad; with few steps it would be tens of mrad."""
 MAX_DISAGREEMENT_PX = 1.5
 """Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps
 gives a sigma of 0.5 px; a fringe order that is wrong by 1 shifts an 18 px fringe by more than 10 px."""
@@ -69,7 +54,7 @@ class Limits:
     min_modulation: float = MIN_MODULATION
     max_clipped_steps: int | None = None
     max_disagreement_px: float = MAX_DISAGREEMENT_PX
-    ambiguous_fraction: float = AMBIGUOUS_FRACTION
+    ambiguous_fraction: float = optics.AMBIGUOUS_FRACTION
 
 
 @dataclass(frozen=True)
@@ -109,7 +94,7 @@ def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -
         sinusoids=tuple(available[i] for i in chosen),
         gray=tuple(rig.sequence.gray(direction)),
         weights=phase_weights(2 * np.pi * np.array(chosen) / rig.sequence.steps),
-        centres_rad=cell_centres_rad(length, pitch),
+        centres_rad=optics.cell_centres_rad(length, pitch),
         pitch_px=pitch,
         length_px=length,
         max_clipped_steps=steps // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
@@ -128,9 +113,8 @@ class Coordinates:
 
     def at(self, indices: NDArray[np.intp]) -> "Coordinates":
         """The coordinates of the pixels at ``indices`` only."""
-        return Coordinates(
-            self.coordinate_px[indices], self.modulation[indices], self.phase[indices], self.reason[indices]
-        )
+        u, modulation, phase, reason = self.coordinate_px, self.modulation, self.phase, self.reason
+        return Coordinates(u[indices], modulation[indices], phase[indices], reason[indices])
 
 
 def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
@@ -144,6 +128,12 @@ def range_m(rig: Rig) -> tuple[float, float]:
     return near_mm / MM_PER_M, far_mm / MM_PER_M
 
 
+def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
+    """Projector px (u, v) of the rays' points at ``depth_m``; NaN behind the projector."""
+    x, y = rays
+    return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
+
+
 def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Projector coordinate of a block from its grey levels, uint8 (frames of the plan, n)."""
     steps, count = len(plan.sinusoids), grey.shape[1]
@@ -152,13 +142,13 @@ def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limit
         thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
         code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
         reasons = tuple(float(reason) for reason in _STAGE_REASONS)
-        kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
+        kernels.decode_block(grey, plan.weights, code, (*thresholds, optics.INCONSISTENT_RAD), reasons, results)
         return Coordinates(*results)
     mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
     modulation = np.sqrt(cosine * cosine + sine * sine)
     phase = minus_atan2(sine, cosine)
-    cells, trusted = decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
-    absolute, consistent = absolute_phase(phase, cells, plan.centres_rad)
+    cells, trusted = optics.decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
+    absolute, consistent = optics.absolute_phase(phase, cells, plan.centres_rad)
     coordinate = absolute * (plan.pitch_px / (2 * np.pi))
     faults = (
         modulation < limits.min_modulation,
@@ -175,13 +165,26 @@ def depth_and_reason(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Depth in mm, float32 (n,), 0 = none, and reason, uint8 (n,), of a block, from one direction or both."""
     reasons = [coordinates.reason for coordinates in measured.values()]
-    if len(reasons) == 1:
-        reason = reasons[0].copy()
-        depth_mm = _depth_from_one(measured, rays, rig)
+    kernels = None if rig.projector.is_distorted else compiled_kernels()
+    depth_mm = np.empty(len(reasons[0]))
+    if len(measured) == 1:
+        ((direction, coordinates),) = measured.items()
+        reason, coordinate_px = coordinates.reason.copy(), coordinates.coordinate_px
+        if kernels:
+            kernels.depth_from_coordinate(rays, coordinate_px, AXES.index(direction), geometry(rig), depth_mm)
+        else:
+            depth_mm = depth_from_coordinate(rays, coordinate_px, rig, direction)
     else:
         lower = np.minimum(*reasons)
         reason = np.where(lower == 0, np.maximum(*reasons), lower)
-        depth_mm, disagreement_px = _depth_from_both(measured, rays, rig)
+        u, v = (measured[direction].coordinate_px for direction in AXES)
+        # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
+        weights = tuple(measured[direction].modulation / rig.pitch(direction) for direction in AXES)
+        disagreement_px = np.empty(len(reason))
+        if kernels:
+            kernels.depth_from_both(rays, (u, v), weights, geometry(rig), (depth_mm, disagreement_px))
+        else:
+            depth_mm, disagreement_px = depth_from_both(rays, u, v, rig, *(weight * weight for weight in weights))
         reason[(reason == 0) & (disagreement_px > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
     near, far = rig.working_range_mm
     missing = np.isnan(depth_mm)
@@ -190,30 +193,6 @@ def depth_and_reason(
     reason[(reason == 0) & outside] = Reason.OUTSIDE_RANGE
     reason[((reason == 0) & missing) | np.isnan(rays[0])] = Reason.NO_RAY
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
-
-
-def _depth_from_one(measured: dict[Direction, Coordinates], rays: Maps, rig: Rig) -> NDArray[np.float64]:
-    ((direction, coordinates),) = measured.items()
-    kernels = compiled_kernels()
-    if kernels is None or rig.projector.is_distorted:
-        return depth_from_coordinate(rays, coordinates.coordinate_px, rig, direction)
-    depth_mm = np.empty(len(coordinates.reason))
-    kernels.depth_from_coordinate(rays, coordinates.coordinate_px, AXES.index(direction), geometry(rig), depth_mm)
-    return depth_mm
-
-
-def _depth_from_both(
-    measured: dict[Direction, Coordinates], rays: Maps, rig: Rig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    u, v = (measured[direction] for direction in AXES)
-    # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
-    weights = u.modulation / rig.pitch("vertical"), v.modulation / rig.pitch("horizontal")
-    kernels = compiled_kernels()
-    if kernels is None or rig.projector.is_distorted:
-        return depth_from_both(rays, u.coordinate_px, v.coordinate_px, rig, *(weight * weight for weight in weights))
-    results = np.empty(len(u.reason)), np.empty(len(u.reason))
-    kernels.depth_from_both(rays, (u.coordinate_px, v.coordinate_px), weights, geometry(rig), results)
-    return results
 
 
 def within_reach(
@@ -230,16 +209,10 @@ def within_reach(
         allowance = float(limits.max_disagreement_px), SLACK_PX
         kernels.reach(rays, coordinate_px, axis, geometry(rig), range_m(rig), allowance, reached)
         return reached
-    _, t, focals, centres = geometry(rig)
-    rotated = [rotated_ray(rays, rig, i) for i in range(3)]
     with np.errstate(all="ignore"):
-        near_z, far_z = (depth * rotated[2] + t[2] for depth in range_m(rig))
-        near_px, far_px = (
-            [focals[i] * (depth * rotated[i] + t[i]) / forward + centres[i] for i in range(2)]
-            for depth, forward in zip(range_m(rig), (near_z, far_z), strict=True)
-        )
+        near_px, far_px = (projected(rays, depth_m, rig) for depth_m in range_m(rig))
         along, across = (far_px[i] - near_px[i] for i in (axis, 1 - axis))
         margin = limits.max_disagreement_px * np.sqrt(along * along + across * across) / np.abs(across) + SLACK_PX
         low = np.minimum(near_px[axis], far_px[axis]) - margin
         high = np.maximum(near_px[axis], far_px[axis]) + margin
-        return ~(((coordinate_px < low) | (coordinate_px > high)) & (near_z > 0) & (far_z > 0))
+        return ~((coordinate_px < low) | (coordinate_px > high))

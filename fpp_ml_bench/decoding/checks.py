@@ -1,11 +1,8 @@
 """What can't be decoded is refused: frames, masks and limits that don't fit, and sinusoids whose capture failed.
 
-Every pixel follows ``A + C cos delta_n + S sin delta_n``, and so does the mean over any set of pixels. With seven or
-more steps, a mean that contradicts the other means is therefore detected in any scene; the three or more redundant
-equations tell a wrong frame (dead, dimmed or flashed) from a scene that violates the model (gamma on a few pixels).
-With four to six steps only a black frame can be detected, by comparison with the frame half a period later. Three steps
-have no redundancy. Without this check a wrong frame would go unnoticed and cause a phase error of up to
-(2/N) (A + B) / B.
+A failed frame would cause a phase error of up to (2/N) (A + B) / B. Means over any set of pixels follow ``A + C cos
+delta_n + S sin delta_n`` as each pixel does; with seven or more steps, redundant equations tell a frame that
+contradicts the others from a scene that violates the model. With four to six steps only a black frame can be detected.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +13,6 @@ from numpy.typing import NDArray
 from fpp_ml_bench.decoding.blocks import DirectionPlan, Limits
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
-from fpp_ml_bench.optics import Sequence as FrameSequence
 
 SAMPLED_PX = 4096
 LEAST_PX = 64
@@ -25,12 +21,12 @@ LEAST_OFF_GREY = 16.0
 LEAST_OFF_SHARE = 0.3
 """A frame is wrong when its mean deviates by more than both limits: no lamp flickers by 30%."""
 AGREEMENT_GREY = 3.0
-"""Largest residual of the other frames' means. Quantisation, noise and clipping leave less; above it,
-the scene does not follow the model (a strong gamma on a few pixels), and then no frame is reported."""
+"""Largest residual of the other frames' means. Above it, the scene does not follow the model (a strong gamma on a few
+pixels), and no frame is reported."""
 LEAST_STEPS_FOR_MEANS = 7
 OPPOSITE_SPAN_GREY = 40
-"""A correct frame is black only where all phases are within 0.2 rad of its minimum. The frame half a period later (36
-degrees off that for five steps) then spans at most a fifth of the modulation."""
+"""A correct frame is black only where all phases are within 0.2 rad of its minimum; the frame half a period later then
+spans at most a fifth of the modulation."""
 
 
 def check_limits(limits: Limits) -> None:
@@ -80,15 +76,11 @@ def mask_indices(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.int
 
 
 def check_frames(
-    flat: Mapping[int, NDArray[np.uint8]],
-    plan: DirectionPlan,
-    indices: NDArray[np.intp] | None,
-    sequence: FrameSequence,
+    flat: Mapping[int, NDArray[np.uint8]], plan: DirectionPlan, indices: NDArray[np.intp] | None, rig: Rig
 ) -> None:
     """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others.
 
-    ``flat`` frames by index, uint8 (pixels,); ``indices`` of the pixels to decode (None: all). Tests at most
-    `SAMPLED_PX` of them, evenly spread.
+    ``flat`` frames by index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested.
     """
     pixel_count = len(flat[plan.sinusoids[0]]) if indices is None else len(indices)
     if pixel_count < LEAST_PX or len(plan.sinusoids) < 4:
@@ -97,23 +89,24 @@ def check_frames(
     sampled = slice(None, None, step) if indices is None else indices[::step]
     levels = [flat[index][sampled] for index in plan.sinusoids]
     if len(levels) >= LEAST_STEPS_FOR_MEANS:
-        shifts = 2 * np.pi * np.array([sequence.frames[index].step for index in plan.sinusoids]) / sequence.steps
+        steps = [rig.sequence.frames[index].step for index in plan.sinusoids]
+        shifts = 2 * np.pi * np.array(steps) / rig.sequence.steps
         model = np.stack([np.ones(len(shifts)), np.cos(shifts), np.sin(shifts)], axis=1)
         wrong = _contradicting_mean(np.array([level.mean() for level in levels]), model, plan.weights)
     else:
         wrong = _black_frame(levels)
     if wrong is not None:
-        position, fault = wrong
+        title = rig.sequence.frames[plan.sinusoids[wrong[0]]].title
         raise DecodeError(
-            f"frame {sequence.frames[plan.sinusoids[position]].title}: {fault}: its capture failed (dead, dimmed or "
-            "flashed frame); take it again, or decode with steps that leave it out"
+            f"frame {title}: {wrong[1]}: its capture failed (dead, dimmed or flashed frame); take it again, or decode "
+            "with steps that leave it out"
         )
 
 
 def _contradicting_mean(
     means: NDArray[np.float64], model: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[int, str] | None:
-    """Index of the frame whose mean contradicts the others, and what is wrong with it; None where no frame does."""
+    """Position of the frame whose mean contradicts the others, and what is wrong with it."""
     fitted = model @ (weights @ means)
     influence = np.einsum("ij,ji->i", model, weights)
     deviations = np.abs(means - fitted) / (1 - influence)  # from the prediction of the other frames alone
@@ -129,10 +122,7 @@ def _contradicting_mean(
 
 
 def _black_frame(levels: list[NDArray[np.uint8]]) -> tuple[int, str] | None:
-    """Index of the frame that is black at every pixel while the frame half a period later varies, and the fault.
-
-    Where a correct frame is black everywhere, both are at an extreme of the fringe, and the later frame can't vary.
-    """
+    """Position of the frame that is black at every pixel while the frame half a period later varies, and the fault."""
     for position, level in enumerate(levels):
         opposite = levels[(position + len(levels) // 2) % len(levels)]
         if not level.any() and np.ptp(opposite) >= OPPOSITE_SPAN_GREY:

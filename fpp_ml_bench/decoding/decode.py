@@ -13,16 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding.blocks import (
-    Coordinates,
-    DirectionPlan,
-    Limits,
-    Reason,
-    decode_direction,
-    depth_and_reason,
-    plan_direction,
-    within_reach,
-)
+from fpp_ml_bench.decoding import blocks
+from fpp_ml_bench.decoding.blocks import Coordinates, DirectionPlan, Limits, Reason
 from fpp_ml_bench.decoding.checks import check_frames, check_limits, flat_frames, mask_indices
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
 from fpp_ml_bench.errors import DecodeError
@@ -48,15 +40,12 @@ class Measured:
     modulation: NDArray[np.float32]
     phase: NDArray[np.float64]
 
-    def reshaped(self, shape: tuple[int, int]) -> "Measured":
-        return Measured(self.coordinate_px.reshape(shape), self.modulation.reshape(shape), self.phase.reshape(shape))
-
 
 @dataclass(frozen=True)
 class Decoded:
     """``depth_mm`` float32 (H, W), 0 = none; ``reason`` uint8 (H, W), a `Reason` code each; ``counts`` pixels per
     reason (lower-case names, all present); ``frames_used`` indices into the sequence; ``details`` by direction, empty
-    unless `decode_stack` was called with ``details``."""
+    unless asked for; ``second_px`` pixels at which the second direction's frames were read."""
 
     depth_mm: NDArray[np.float32]
     reason: NDArray[np.uint8]
@@ -64,23 +53,6 @@ class Decoded:
     frames_used: tuple[int, ...]
     details: dict[Direction, Measured] = field(default_factory=dict)
     second_px: int = 0
-    """Pixels at which the second direction's frames were read; `decode_stack` with ``reasons=False`` may skip some."""
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What is decoded and how; the same for every block."""
-
-    frames: dict[int, NDArray[np.uint8]]
-    rig: Rig
-    plans: list[DirectionPlan]
-    limits: Limits
-    joint: JointCode | None
-    pixels: NDArray[np.intp] | None
-    """Flat indices of the pixels to decode; None: all."""
-    details: bool
-    depth_alone: bool
-    """Whether the second direction may be left out where the first shows that there is no depth."""
 
 
 @dataclass
@@ -100,47 +72,50 @@ class _Block:
         self.measured = {direction: measured.at(selected) for direction, measured in self.measured.items()}
 
 
-def _indices_if_few(mask: NDArray[np.bool_]) -> NDArray[np.intp] | None:
-    """Indices of the True entries of ``mask`` (n,), if they are few enough to be picked out."""
-    indices = np.flatnonzero(mask)
-    return indices if len(indices) <= MOST_PICKED_SHARE * len(mask) else None
-
-
+@dataclass
 class _Image:
-    """Results of the whole image as flat arrays, filled block by block; no pixel belongs to two blocks."""
+    """What is decoded and how, and the results, filled block by block; no pixel belongs to two blocks.
 
-    def __init__(self, job: _Job) -> None:
-        size = job.rig.camera.height * job.rig.camera.width
-        self.job = job
-        self.pixel_count = size if job.pixels is None else len(job.pixels)
+    ``pixels`` flat indices of those to decode (None: all). ``depth_alone``: whether the second direction may be left
+    out where the first shows that there is no depth.
+    """
+
+    frames: dict[int, NDArray[np.uint8]]
+    rig: Rig
+    plans: list[DirectionPlan]
+    limits: Limits
+    joint: JointCode | None
+    pixels: NDArray[np.intp] | None
+    depth_alone: bool
+    details: dict[Direction, Measured]
+
+    def __post_init__(self) -> None:
+        size = self.rig.camera.height * self.rig.camera.width
+        self.pixel_count = size if self.pixels is None else len(self.pixels)
         self.depth_mm = np.zeros(size, dtype=np.float32)
         self.reason = np.full(size, Reason.NOT_ASKED, dtype=np.uint8)
-        self.rays = tuple(axis.reshape(-1) for axis in job.rig.camera.rays())
-        self.details: dict[Direction, Measured] = {}
-        for plan in job.plans if job.details else []:
-            u, b, phase = np.full(size, np.nan), np.full(size, np.nan, dtype=np.float32), np.full(size, np.nan)
-            self.details[plan.direction] = Measured(u, b, phase)
+        self.rays = tuple(axis.reshape(-1) for axis in self.rig.camera.rays())
 
     def decode_from(self, start: int) -> int:
         """Decode a block; returns the number of its pixels that were read in every direction."""
-        job, stop = self.job, min(start + BLOCK_PX, self.pixel_count)
-        block = _Block(slice(start, stop) if job.pixels is None else job.pixels[start:stop])
-        self._measure(block, job.plans[0])
-        if job.depth_alone:
+        stop = min(start + BLOCK_PX, self.pixel_count)
+        block = _Block(slice(start, stop) if self.pixels is None else self.pixels[start:stop])
+        self._measure(block, self.plans[0])
+        if self.depth_alone:
             self._keep_within_reach(block)
         count = len(block)
-        for plan in job.plans[1:]:
+        for plan in self.plans[1:]:
             self._measure(block, plan)
-        if job.joint:
-            self._find_orders(block, job.joint)
-        pixels = block.pixels
-        self.depth_mm[pixels], self.reason[pixels] = depth_and_reason(
-            block.measured, self._rays(block), job.rig, job.limits
-        )
+        if self.joint:
+            self._find_orders(block, self.joint)
+        pixels, measured = block.pixels, block.measured
+        results = blocks.depth_and_reason(measured, self._rays(block), self.rig, self.limits)
+        self.depth_mm[pixels], self.reason[pixels] = results
         for direction, details in self.details.items():
-            measured = block.measured[direction]
-            details.coordinate_px[pixels] = np.where(measured.reason == 0, measured.coordinate_px, np.nan)
-            details.modulation[pixels], details.phase[pixels] = measured.modulation, measured.phase
+            found = measured[direction]
+            coordinate_px = np.where(found.reason == 0, found.coordinate_px, np.nan)
+            details.coordinate_px.reshape(-1)[pixels] = coordinate_px
+            details.modulation.reshape(-1)[pixels], details.phase.reshape(-1)[pixels] = found.modulation, found.phase
         return count
 
     def _rays(self, block: _Block) -> Maps:
@@ -153,12 +128,12 @@ class _Image:
             if index in plan.constant_levels:
                 row[:] = plan.constant_levels[index]
             elif isinstance(block.pixels, slice):
-                row[:] = self.job.frames[index][block.pixels]
+                row[:] = self.frames[index][block.pixels]
             else:
                 # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
-                self.job.frames[index].take(block.pixels, out=row, mode="clip")
-        decode = decode_wrapped if self.job.joint else decode_direction
-        block.measured[plan.direction] = decode(levels, plan, self.job.limits)
+                self.frames[index].take(block.pixels, out=row, mode="clip")
+        decode = decode_wrapped if self.joint else blocks.decode_direction
+        block.measured[plan.direction] = decode(levels, plan, self.limits)
 
     def _keep_within_reach(self, block: _Block) -> None:
         """Reduce the block to the pixels that can still get a depth after the first direction, if they are few.
@@ -167,27 +142,24 @@ class _Image:
         """
         ((direction, first),) = block.measured.items()
         values = first.coordinate_px, *self._rays(block)
-
-        def undecided(part: slice) -> NDArray[np.bool_]:
+        for part in (slice(None, None, SAMPLING), slice(None)):
             coordinate, x, y = (np.ascontiguousarray(value[part]) for value in values)
-            reached = within_reach(coordinate, (x, y), direction, self.job.rig, self.job.limits)
-            return reached & (first.reason[part] == 0)
-
-        if _indices_if_few(undecided(slice(None, None, SAMPLING))) is None:
-            return
-        if (selected := _indices_if_few(undecided(slice(None)))) is not None:
-            self.reason[block.pixels] = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
-            block.keep(selected)
+            reached = blocks.within_reach(coordinate, (x, y), direction, self.rig, self.limits)
+            selected = np.flatnonzero(reached & (first.reason[part] == 0))
+            if len(selected) > MOST_PICKED_SHARE * len(reached):
+                return
+        self.reason[block.pixels] = np.where(first.reason == 0, Reason.OUTSIDE_RANGE, first.reason)
+        block.keep(selected)
 
     def _find_orders(self, block: _Block, joint: JointCode) -> None:
         """The fringe orders that both phases give together; reduces the block to the pixels that have orders."""
-        orders, distance_px = nearest_pair(block.measured, self._rays(block), self.job.rig, joint)
+        orders, distance_px = nearest_pair(block.measured, self._rays(block), self.rig, joint)
         # NOT_ASKED, the highest code, marks pixels without a reason here.
         lowest = np.minimum(*(np.where(m.reason == 0, Reason.NOT_ASKED, m.reason) for m in block.measured.values()))
         unclear = (lowest == Reason.NOT_ASKED) & ~(distance_px <= joint.tolerance_px)
         reason = np.where(unclear, Reason.DIRECTIONS_DISAGREE, lowest)
-        selected = None if self.details else _indices_if_few(reason == Reason.NOT_ASKED)
-        if selected is not None:
+        selected = np.flatnonzero(reason == Reason.NOT_ASKED)
+        if len(selected) <= MOST_PICKED_SHARE * len(reason) and not self.details:
             self.reason[block.pixels] = reason
             block.keep(selected)
             orders = {direction: order[selected] for direction, order in orders.items()}
@@ -195,7 +167,7 @@ class _Image:
             for measured in block.measured.values():
                 measured.reason[unclear] = Reason.DIRECTIONS_DISAGREE
         for direction, order in orders.items():
-            block.measured[direction] = with_order(block.measured[direction], order, self.job.rig, direction)
+            block.measured[direction] = with_order(block.measured[direction], order, self.rig, direction)
 
 
 def decode_stack(
@@ -212,25 +184,19 @@ def decode_stack(
 ) -> Decoded:
     """Depth in mm from a captured sequence.
 
-    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views (nothing is stacked or
-    kept) or an array (F, H, W); a frame that is not needed may be None. Black and white are never needed: the
-    threshold of the Gray code is the sinusoids' own mean.
-
+    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views or an array (F, H, W); a
+    frame that is not needed may be None. Black and white never are: the Gray code's threshold is the sinusoids' mean.
     ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
     needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels at which the two coordinates
     disagree by more than ``limits.max_disagreement_px`` across the epipolar line.
-
     ``steps``: how many of each direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible.
     Where they can't be even (N is not a multiple), the phase is the least-squares solution.
-
     ``mask`` bool (H, W): pixels to decode; all others get `Reason.NOT_ASKED` and have no influence. The result is the
     same bit by bit for any number of ``threads``, and inside the mask the same as without a mask. ``details``: also
     return coordinates, modulation and wrapped phase.
-
-    ``reasons`` False: only the depth has to be right. A pixel that the first direction shows to lie outside the working
-    range (`decoding.blocks`), or to have no coordinate, is then not read in the second direction. The depth
-    is the same bit by bit; the reason is the first direction's, or OUTSIDE_RANGE.
-
+    ``reasons`` False: a pixel that the first direction shows to lie outside the working range (`decoding.blocks`), or
+    to have no coordinate, is not read in the second direction. The depth is the same bit by bit; the reason is the
+    first direction's, or OUTSIDE_RANGE.
     ``fewest``: read only the Gray frames that the rig's working range needs (`decoding.fewest`). With "both"
     usually none is needed, and the fringe orders come from the two phases together. A depth in range is the same bit
     by bit, except at pixels whose directions disagree by nearly the allowed distance (`JointCode.tolerance_px`).
@@ -247,22 +213,25 @@ def decode_stack(
     check_limits(limits)
     step_count = rig.sequence.steps if steps is None else steps
     directions: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
-    plans = [plan_direction(rig, name, step_count, limits) for name in directions]
-    joint: JointCode | None = None
+    plans, joint = [blocks.plan_direction(rig, name, step_count, limits) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
     flat = flat_frames(frames, used, rig)
-    shape = (rig.camera.height, rig.camera.width)
+    shape = rig.camera.height, rig.camera.width
     pixels = mask_indices(mask, shape)
     for plan in plans:
-        check_frames(flat, plan, pixels, rig.sequence)
+        check_frames(flat, plan, pixels, rig)
     # With a mask of most of the image, decoding whole blocks and clearing the rest is faster than reading by index.
     dense = pixels is not None and not details and len(pixels) > MOST_PICKED_SHARE * shape[0] * shape[1]
     dense = dense and skipping_enabled()
     depth_alone = len(plans) == 2 and joint is None and not (reasons or details or rig.projector.is_distorted)
     depth_alone = depth_alone and skipping_enabled()
-    image = _Image(_Job(flat, rig, plans, limits, joint, None if dense else pixels, details, depth_alone))
+    measured = {
+        name: Measured(np.full(shape, np.nan), np.full(shape, np.nan, dtype=np.float32), np.full(shape, np.nan))
+        for name in (directions if details else ())
+    }
+    image = _Image(flat, rig, plans, limits, joint, None if dense else pixels, depth_alone, measured)
     starts = range(0, image.pixel_count, BLOCK_PX)
     if threads == 1 or len(starts) < 2:
         second_px = sum(map(image.decode_from, starts))
@@ -273,11 +242,6 @@ def decode_stack(
         outside = ~np.asarray(mask).reshape(-1)
         image.depth_mm[outside], image.reason[outside] = 0.0, Reason.NOT_ASKED
     counts = np.bincount(image.reason, minlength=len(Reason))
-    return Decoded(
-        depth_mm=image.depth_mm.reshape(shape),
-        reason=image.reason.reshape(shape),
-        counts={reason.name.lower(): int(counts[reason]) for reason in Reason},
-        frames_used=used,
-        details={name: measured.reshaped(shape) for name, measured in image.details.items()},
-        second_px=second_px if len(plans) == 2 else 0,
-    )
+    by_reason = {reason.name.lower(): int(counts[reason]) for reason in Reason}
+    depth_mm, reason = image.depth_mm.reshape(shape), image.reason.reshape(shape)
+    return Decoded(depth_mm, reason, by_reason, used, measured, second_px if len(plans) == 2 else 0)

@@ -1,15 +1,9 @@
 """The fewest frames that a rig's working range needs: phase steps for a noise, Gray bits for the orders that can occur.
 
-A pixel's ray crosses only a few fringe periods within the working range (2.4 and 1.9 with the paper's rig), while the
-Gray code tells all periods of the pattern apart. There are two ways to capture fewer Gray frames:
-
-- A bit that is the same on every cell the camera can see, at any depth between the near end of the range and the
-  background, carries no information (`gray_bits_in_view`). A single direction needs every bit that changes somewhere in
-  view: without it, the codes on either side of the change are mirror images, and a phase at a cell's edge fits two
-  cells.
-- With both directions, no bit may be needed (`orders_from_phases`): the two fringes' periods along the ray differ, and
-  together they are unambiguous over their beat, as in two-frequency unwrapping. The (u, v) of the right pair of orders
-  lies on the pixel's epipolar line; that of a wrong pair is several px away. Own derivation.
+A ray crosses few fringe periods within the range, but the Gray code tells all apart. A bit that is the same on every
+cell in view can be left out (`gray_levels_in_view`); no other can, as a phase at the edge of a cell where a bit changes
+fits two cells without it. With both directions often no bit is needed (`orders_from_phases`): as in two-frequency
+unwrapping the two periods are unambiguous over their beat, and only the right pair of orders lies on the epipolar line.
 """
 
 import math
@@ -21,16 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.decoding.blocks import (
-    MAX_DISAGREEMENT_PX,
-    Coordinates,
-    DirectionPlan,
-    Limits,
-    Reason,
-    decode_direction,
-    geometry,
-    range_m,
-)
+from fpp_ml_bench.decoding import blocks
+from fpp_ml_bench.decoding.blocks import MAX_DISAGREEMENT_PX, Coordinates, DirectionPlan, Limits, Reason
 from fpp_ml_bench.decoding.phase import compiled_kernels
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
@@ -49,37 +35,32 @@ def reach_of(rig: Rig) -> NDArray[np.float64]:
     rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
     columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
     x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
-    return np.array([_projected((x, y), depth_m, rig) for depth_m in (*range_m(rig), rig.background_m)])
-
-
-def _projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
-    """Projector px (u, v) of the rays' points at ``depth_m``."""
-    x, y = rays
-    return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
+    return np.array([blocks.projected((x, y), depth_m, rig) for depth_m in (*blocks.range_m(rig), rig.background_m)])
 
 
 @lru_cache(maxsize=16)
-def gray_bits_in_view(rig: Rig, direction: Direction) -> tuple[int, ...]:
-    """Gray bits of a direction (0 = most significant frame) that change within the camera's view. All other bits are
-    the same on every cell in view, in the working range and on the background."""
+def gray_levels_in_view(rig: Rig, direction: Direction) -> tuple[int | None, ...]:
+    """Grey level of each Gray bit (0 = most significant) that is the same everywhere in the camera's view, at any depth
+    in the range and on the background; None for a bit that changes."""
     in_view, bits = reach_of(rig)[:, AXES.index(direction)], rig.sequence.bits(direction)
     in_view = in_view[np.isfinite(in_view)]
-    last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
     if not in_view.size:
-        return tuple(range(bits))
+        return (None,) * bits
+    last = cell_count(rig.pattern_length(direction), rig.pitch(direction)) - 1
     low, high = (int(cell_of(edge, rig.pitch(direction))) for edge in (in_view.min(), in_view.max()))
     cells = np.arange(max(low - CODE_MARGIN_CELLS, 0), min(high + CODE_MARGIN_CELLS, last) + 1)
     code = binary_to_gray(cells if cells.size else np.arange(last + 1))
-    return tuple(bit for bit in range(bits) if np.ptp(code >> (bits - 1 - bit) & 1))
+    values = (code >> shift & 1 for shift in reversed(range(bits)))
+    return tuple(None if np.ptp(value) else int(value[0]) * GREY_LEVELS for value in values)
 
 
 @dataclass(frozen=True)
 class JointCode:
     """How well both directions' phases together fix the orders, in projector px across the epipolar line.
 
-    ``least_gap_px``: smallest distance of a wrong pair of orders from the right pair within the range;
-    ``background_gap_px``: smallest distance at which the background plane could pass for a point within the range.
-    ``driver``: the direction of which a ray crosses more periods within the range; ``most_periods``: at most so many.
+    ``least_gap_px``: smallest distance of a wrong pair of orders from the right one; ``background_gap_px``: smallest at
+    which the background could pass for a point in range. ``driver``: the direction of which a ray crosses more periods
+    within the range, ``most_periods`` at most.
     """
 
     least_gap_px: float
@@ -102,17 +83,14 @@ class JointCode:
 def orders_from_phases(rig: Rig) -> JointCode:
     """How well two wrapped phases alone give the orders of both directions within the working range.
 
-    A wrong pair is i periods off in u and j in v, with (i, j) not (0, 0); both stay within the segment that the range
-    covers on the epipolar line, extended by the decoder's tolerance at either end. Its distance from the line is
-    ``|i P_u e_v - j P_v e_u|``, e the line's unit direction. This holds only for projectors without distortion, whose
-    epipolar lines are straight; for all others both gaps are 0.
+    A wrong pair is i periods off in u and j in v, not both 0, within the segment that the range and the decoder's
+    tolerance cover on the epipolar line. Its distance from the line is ``|i P_u e_v - j P_v e_u|``, e the line's unit
+    direction. Own derivation; a distorted projector's epipolar lines are not straight, and both gaps are 0.
     """
-    if rig.projector.is_distorted:
-        return JointCode(0.0, 0.0)
     near, far, background = reach_of(rig)
     line = far - near
     usable = np.isfinite(line).all(axis=0) & np.isfinite(background).all(axis=0) & (np.hypot(*line) > 0)
-    if not usable.any():
+    if rig.projector.is_distorted or not usable.any():
         return JointCode(0.0, 0.0)
     near, far, background, line = near[:, usable], far[:, usable], background[:, usable], line[:, usable]
     e = line / np.hypot(*line)
@@ -136,12 +114,10 @@ def orders_from_phases(rig: Rig) -> JointCode:
 
 def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
     """Gray bits that must be captured for ``direction`` "vertical", "horizontal" or "both", per direction."""
-    if direction == "both":
-        if orders_from_phases(rig).unambiguous:
-            return {"horizontal": (), "vertical": ()}
-        return {name: gray_bits_in_view(rig, name) for name in DIRECTIONS}
-    name: Direction = "vertical" if direction == "vertical" else "horizontal"
-    return {name: gray_bits_in_view(rig, name)}
+    if direction == "both" and orders_from_phases(rig).unambiguous:
+        return {"horizontal": (), "vertical": ()}
+    levels = {name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
+    return {name: tuple(bit for bit, level in enumerate(found) if level is None) for name, found in levels.items()}
 
 
 def fewest_steps(
@@ -164,27 +140,16 @@ def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPl
     joint = orders_from_phases(rig) if len(plans) == 2 else None
     if joint is not None and joint.unambiguous:
         return [replace(plan, gray=()) for plan in plans], joint
-    return [replace(plan, constant_levels=_constant_levels(rig, plan)) for plan in plans], None
-
-
-def _constant_levels(rig: Rig, plan: DirectionPlan) -> dict[int, int]:
-    """Grey level of each Gray frame that is the same on every cell in view, by frame index."""
-    needed = gray_bits_in_view(rig, plan.direction)
-    in_view = reach_of(rig)[0, AXES.index(plan.direction)]
-    in_view = in_view[np.isfinite(in_view)]
-    if not in_view.size:
-        return {}
-    last = plan.length_px - 1
-    code = int(binary_to_gray(cell_of(np.clip(in_view[0], 0, last), plan.pitch_px)))
-    bits = len(plan.gray)
-    return {
-        frame: (code >> (bits - 1 - bit) & 1) * GREY_LEVELS for bit, frame in enumerate(plan.gray) if bit not in needed
-    }
+    fewer = []
+    for plan in plans:
+        levels = zip(plan.gray, gray_levels_in_view(rig, plan.direction), strict=True)
+        fewer.append(replace(plan, constant_levels={frame: level for frame, level in levels if level is not None}))
+    return fewer, None
 
 
 def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Phase and modulation of a block without Gray frames; reasons that depend on a fringe order are cleared."""
-    coordinates = decode_direction(grey, plan, limits)
+    coordinates = blocks.decode_direction(grey, plan, limits)
     reason = coordinates.reason
     reason[(reason == Reason.INCONSISTENT_ORDER) | (reason == Reason.OUTSIDE_PATTERN)] = 0
     return coordinates
@@ -207,9 +172,10 @@ def nearest_pair(
     orders = {AXES[a]: order_a, AXES[b]: order_b}
     if kernels := compiled_kernels():
         results, search = (order_a, order_b, nearest), (tolerance_px, tries)
-        kernels.joint_orders(rays, (first, second), a, geometry(rig), range_m(rig), pitches, search, results)
+        geometry, range_m = blocks.geometry(rig), blocks.range_m(rig)
+        kernels.joint_orders(rays, (first, second), a, geometry, range_m, pitches, search, results)
         return orders, nearest
-    near, far = (_projected(rays, depth_m, rig) for depth_m in range_m(rig))
+    near, far = (blocks.projected(rays, depth_m, rig) for depth_m in blocks.range_m(rig))
     with np.errstate(all="ignore"):
         line = far[0] - near[0], far[1] - near[1]
         slope, share = line[b] / line[a], np.abs(line[a]) / np.hypot(*line)

@@ -1,9 +1,8 @@
 """Wrapped phase, modulation and mean from N phase-shifted frames (paper Eqs. 1 and 2).
 
-The model is ``I_n = A + B cos(phi + delta_n)`` with ``delta_n = 2 pi n / N``. Written as ``A + C cos delta_n + S sin
-delta_n`` with ``C = B cos phi`` and ``S = -B sin phi`` it is linear, and least squares over any three or more
-different shifts is one weighted sum of the frames for each of A, C and S. For equal steps the weights are 1/N, (2/N)
-cos delta_n and (2/N) sin delta_n, and ``phi = -atan2(S, C)`` is the paper's Eq. 2.
+``I_n = A + B cos(phi + delta_n)`` with ``delta_n = 2 pi n / N`` is linear as ``A + C cos delta_n + S sin delta_n``, C =
+B cos phi, S = -B sin phi: least squares is a weighted sum of the frames for each of A, C and S, and ``phi = -atan2(S,
+C)``. For equal steps the weights are 1/N, (2/N) cos delta_n and (2/N) sin delta_n (Eq. 2).
 """
 
 from collections.abc import Iterable
@@ -36,21 +35,16 @@ def compiled_kernels() -> ModuleType | None:
 
 
 def choose_steps(steps: int, count: int) -> tuple[int, ...]:
-    """``count`` of ``steps`` frames, spread over the circle as evenly as they go: floor(i steps / count + 1/2).
-
-    Exactly equal where ``count`` divides ``steps``. Raises `DecodeError` for fewer than 3 or more than ``steps``.
-    """
+    """``count`` of ``steps`` frames, spread as evenly as they go: floor(i steps / count + 1/2). Raises `DecodeError`
+    for fewer than 3 or more than ``steps``."""
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 3 <= count <= steps:
         raise DecodeError(f"steps: expected a whole number from 3 to the {steps} that were projected, got {count!r}")
     return tuple((2 * i * steps + count) // (2 * count) for i in range(count))
 
 
 def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
-    """Weights of the frames in A, C and S: float64 (3, N) for N phase shifts in rad.
-
-    Closed form for equal steps, else the least-squares pseudo-inverse. Raises `DecodeError` where the shifts don't
-    determine a phase (fewer than three different ones).
-    """
+    """Weights of the frames in A, C and S: float64 (3, N) for N phase shifts in rad. Closed form for equal steps, else
+    the least-squares pseudo-inverse. Raises `DecodeError` for fewer than three different shifts."""
     shifts = np.asarray(shifts_rad, dtype=np.float64)
     if shifts.ndim != 1 or len(shifts) < 3 or not np.all(np.isfinite(shifts)):
         raise DecodeError(f"shifts_rad: expected at least 3 finite phase shifts in rad, got {shifts_rad!r}")
@@ -61,9 +55,8 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
     if np.abs(weights @ model - np.eye(3)).max() < 1e-12:
         return np.ascontiguousarray(weights)
     if np.linalg.cond(model) > 1e6:
-        raise DecodeError(
-            f"shifts_rad: the shifts {shifts.tolist()} don't determine a phase; 3 different ones are needed"
-        )
+        listed = shifts.tolist()
+        raise DecodeError(f"shifts_rad: the shifts {listed} don't determine a phase; 3 different ones are needed")
     return np.ascontiguousarray(np.linalg.pinv(model))
 
 
@@ -94,9 +87,8 @@ def wrapped_phase(
     mean, cosine, sine = weighted_sums(images, weights)
     phase = minus_atan2(sine, cosine).astype(dtype)
     phase[phase >= np.asarray(np.pi, dtype=dtype)] = -np.pi  # float32 rounds the last values below pi up to it
-    return Phase(
-        phase, np.sqrt(cosine * cosine + sine * sine).astype(dtype, copy=False), mean.astype(dtype, copy=False)
-    )
+    modulation = np.sqrt(cosine * cosine + sine * sine)
+    return Phase(phase, modulation.astype(dtype, copy=False), mean.astype(dtype, copy=False))
 
 
 def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -112,10 +104,7 @@ def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> li
 
 
 def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor.
-
-    +pi is mapped to -pi.
-    """
+    """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor."""
     if kernels := compiled_kernels():
         phase = np.empty(np.shape(sine))
         kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())

@@ -18,15 +18,14 @@ from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, distort
 
 GAUSS_NEWTON_STEPS = 3
-"""The algebraic start is exact for a projector beside the camera (t_2 = 0) and close otherwise. Each step squares the
-relative error; after three steps it is below float64's resolution."""
+"""The algebraic start is exact for a projector beside the camera (t_2 = 0), close otherwise, and each step squares its
+error; after three steps it is below float64's resolution."""
 FIXED_POINT_STEPS = 50
 FIXED_POINT_TOLERANCE = 1e-13
 """Largest last change, in normalised units, of a projector coordinate after its distortion was removed by iteration."""
 LEAST_PARALLAX = 2.0**-49
-"""Least ``|a_0 - x_p a_2|``, relative to the magnitudes of its terms and of the coordinate. Its round-off is up to
-8 x 2^-53 of those magnitudes; below this limit ray and projector plane count as parallel: up to half of the depth
-would be round-off."""
+"""Least ``|a_0 - x_p a_2|``, relative to the magnitudes of its terms and of the coordinate, of which its round-off is
+up to 8 x 2^-53. Below it ray and plane count as parallel: up to half of the depth would be round-off."""
 
 
 class DepthFromBoth(NamedTuple):
@@ -51,9 +50,8 @@ def _depth_in_front(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.
 def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
     """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown.
 
-    The ray supplies the second coordinate. Each step takes the depth from the present estimate, projects the point and
-    subtracts its distortion from the measured coordinate. This shrinks the error by the distortion's slope (a few
-    percent for real lenses). Coordinates that do not settle to `FIXED_POINT_TOLERANCE` in `FIXED_POINT_STEPS` are NaN.
+    The ray supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
+    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN.
     """
     device = rig.projector
     measured = (coordinate - device.centre[axis]) / device.focal[axis]
@@ -71,11 +69,11 @@ def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> N
 
 
 def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """Depth in mm from one projector coordinate per pixel, float64; NaN where there is no depth.
+    """Depth in mm from one projector coordinate per pixel, float64; NaN where there is no depth (NaN input, ray
+    parallel to the projector plane, intersection behind a device, or a distortion that can't be inverted).
 
     ``rays``: normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for
-    ``direction`` "vertical", v_p for "horizontal", in px, same shape. No depth: NaN input, ray and projector plane
-    parallel, intersection behind either device, or a projector distortion that can't be inverted.
+    ``direction`` "vertical", v_p for "horizontal", in px, same shape.
     """
     if direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
@@ -83,10 +81,8 @@ def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direct
     centre, focal = device.centre[axis], device.focal[axis]
     coordinate = np.asarray(coordinate_px, dtype=np.float64)
     with np.errstate(all="ignore"):
-        if device.is_distorted:
-            ideal = _ideal_coordinate(rays, coordinate, rig, axis)
-        else:
-            ideal = (coordinate - centre) / focal
+        undistorted = not device.is_distorted
+        ideal = (coordinate - centre) / focal if undistorted else _ideal_coordinate(rays, coordinate, rig, axis)
         forward = rotated_ray(rays, rig, 2)
         along, across = rotated_ray(rays, rig, axis), ideal * forward
         depth = (ideal * rig.t[2] - rig.t[axis]) / (along - across)
@@ -100,11 +96,10 @@ def depth_from_both(
 ) -> DepthFromBoth:
     """Depth in mm from both projector coordinates by weighted least squares in projector px, float64; NaN = no depth.
 
-    ``weight_u`` and ``weight_v`` are 1 / sigma^2 of the coordinates, up to a common factor; with sigma proportional to
-    pitch over modulation that is (B / P)^2. Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of
-    linear functions: algebraic start, then `GAUSS_NEWTON_STEPS` where the projector is not beside the camera. The
-    residual lies across the epipolar line: ``disagreement_px`` is the measured point's distance from the line, for any
-    weights. With a distorted projector the residual is counted in undistorted px.
+    ``weight_u`` and ``weight_v``: 1 / sigma^2 of the coordinates, up to a common factor; for sinusoids (B / P)^2.
+    Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear functions: algebraic start, then
+    `GAUSS_NEWTON_STEPS`. ``disagreement_px`` is the measured point's distance from the epipolar line, for any weights,
+    in undistorted px.
     """
     device = rig.projector
     u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)

@@ -1,11 +1,9 @@
 """Gray code in half periods, and the fringe order from it.
 
-A cell is half a fringe period, so code and wrapped phase overlap: the phase alone fixes the position up to whole
-periods, and the cell only has to select the period. The fringe order is the whole number k that brings
-``phi + 2 pi k`` nearest to the cell's centre. A bit misread at a cell edge gives the neighbouring cell, whose centre is
-half a period away. But at an edge the true phase is a quarter of a period from BOTH centres, so k stays right, with a
-quarter of a period to spare on either side. The classical code with one cell per period has its edges where the phase
-wraps, and there the order can be wrong by 1; a median filter hides such errors but moves depth edges.
+The fringe order is the whole number k that brings ``phi + 2 pi k`` nearest to the cell's centre. A bit misread at an
+edge gives the neighbouring cell, half a period away; but at an edge the true phase is a quarter of a period from BOTH
+centres, so k stays right. The classical code with one cell per period has its edges where the phase wraps, and there
+the order can be wrong by 1; a median filter hides such errors but moves depth edges.
 """
 
 import math
@@ -51,11 +49,8 @@ def bits_needed(length_px: int, pitch_px: float) -> int:
 
 
 def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
-    """Absolute phase at the centre of each cell, float64 (cells,).
-
-    This is the centre of the pixels that a cell contains: with 9 px per cell, pixels 9j to 9j + 8, thus 9j + 4, half a
-    pixel before (j + 1/2) P/2. Ignoring that half pixel would reduce the tolerance of a quarter period.
-    """
+    """Absolute phase at the centre of the pixels of each cell, float64 (cells,): with 9 px per cell 9j + 4. Half a
+    pixel later, at (j + 1/2) P/2, it would reduce the tolerance of a quarter period."""
     edges = np.ceil(np.arange(cell_count(length_px, pitch_px) + 1) * (pitch_px / 2))
     return (edges[:-1] + edges[1:] - 1) / 2 * (2 * np.pi / pitch_px)
 
@@ -63,13 +58,11 @@ def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
 def decode_cells(
     bits: ArrayLike, threshold: ArrayLike, modulation: ArrayLike, ambiguous_fraction: float = AMBIGUOUS_FRACTION
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Cell numbers and whether they can be trusted, from the Gray frames of a direction.
+    """Cell numbers and whether they can be trusted, int32 and bool (H, W), from the Gray frames of a direction.
 
-    ``bits`` (n, H, W) grey levels, most significant bit first; ``threshold`` and ``modulation`` (H, W) grey levels: the
-    mean A and amplitude B of the same direction's sinusoids. Returns int32 (H, W) cells and bool (H, W).
-
-    A bit within ``ambiguous_fraction`` B of the threshold is ambiguous. Adjacent cells differ in exactly one bit, so
-    a cell is trusted when no bit is ambiguous, or when a single bit is and flipping it gives a neighbour.
+    ``bits`` (n, H, W) grey levels, most significant bit first; ``threshold`` and ``modulation`` (H, W): the mean A and
+    amplitude B of its sinusoids. A bit within ``ambiguous_fraction`` B of the threshold is ambiguous; a cell is trusted
+    when no bit is, or when a single bit is and flipping it gives a neighbour.
     """
     mean, amplitude = np.asarray(threshold, dtype=np.float64), np.asarray(modulation, dtype=np.float64)
     margin = ambiguous_fraction * amplitude
@@ -90,11 +83,8 @@ def decode_cells(
 def absolute_phase(
     phase: NDArray[np.float64], cells: NDArray[np.int32], centres_rad: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Absolute phase ``phi + 2 pi k`` with k nearest to the cell's centre, and whether the two agree.
-
-    ``phase`` rad (H, W), ``cells`` int (H, W), ``centres_rad`` from `cell_centres_rad`. Returns float64 rad (H, W) and
-    bool (H, W): the cell exists on the pattern and its centre is within `INCONSISTENT_RAD`.
-    """
+    """Absolute phase ``phi + 2 pi k`` with k nearest to the cell's centre, float64 rad (H, W), and whether the two
+    agree, bool (H, W): the cell exists and its centre, of `cell_centres_rad`, is within `INCONSISTENT_RAD`."""
     centre = centres_rad[np.minimum(cells, len(centres_rad) - 1)]
     absolute = phase + 2 * np.pi * np.floor((centre - phase) / (2 * np.pi) + 0.5)
     return absolute, (cells < len(centres_rad)) & (np.abs(absolute - centre) <= INCONSISTENT_RAD)

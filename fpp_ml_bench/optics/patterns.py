@@ -1,9 +1,8 @@
 """The projected patterns: N-step sinusoids and a phase-aligned Gray code, as 8-bit images.
 
 Step n of the fringes of period P is ``127.5 + 127.5 cos(2 pi w / P + 2 pi n / N)`` along the varying coordinate w
-(paper Eq. 1). The Gray code counts HALF periods: cell j holds the pixels with floor(w / (P / 2)) = j, coded by the
-reflected binary code, most significant bit first, 0 or 255. A cell edge therefore never falls together with both ends
-of the phase: see `fpp_ml_bench.optics.gray_code` for why that cures the half-period slip.
+(paper Eq. 1). The Gray code counts HALF periods (see `fpp_ml_bench.optics.gray_code`): cell j holds the pixels with
+floor(w / (P / 2)) = j, in reflected binary code, most significant bit first, 0 or 255.
 """
 
 from pathlib import Path
@@ -19,11 +18,8 @@ from fpp_ml_bench.portable import cosine_of_turns
 
 
 def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
-    """Frame ``index`` along the coordinate it varies with: uint8 (L,), L = projector height or width.
-
-    Horizontal fringes and code vary along the rows (L = height), vertical ones along the columns (L = width); black and
-    white are constant, (1,). Raises `RigError` for an index outside the sequence.
-    """
+    """Frame ``index`` along the coordinate it varies with, uint8: (height,) for horizontal fringes and code, (width,)
+    for vertical, (1,) for black and white. Raises `RigError` for an index outside the sequence."""
     if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
         raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
     frame = rig.sequence.frames[index]
@@ -35,8 +31,7 @@ def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
         steps, half = rig.sequence.steps, GREY_LEVELS / 2
         turns = (position * steps + frame.step * pitch) / (pitch * steps)
         return np.rint(half + half * cosine_of_turns(turns)).astype(np.uint8)
-    code = binary_to_gray(cell_of(position, pitch))
-    bit = code >> (rig.sequence.bits(frame.direction) - 1 - frame.step) & 1
+    bit = binary_to_gray(cell_of(position, pitch)) >> (rig.sequence.bits(frame.direction) - 1 - frame.step) & 1
     return (bit * GREY_LEVELS).astype(np.uint8)
 
 
@@ -55,10 +50,8 @@ def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
 
 
 def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:
-    """Write every pattern as ``A_{i}.png`` (8-bit grey, lossless) into ``folder`` and return the paths in frame order.
-
-    Raises `FppBenchError` when the folder can't be made or a file can't be written.
-    """
+    """Write every pattern as ``A_{i}.png`` (8-bit grey, lossless) into ``folder`` and return the paths in frame order;
+    `FppBenchError` where the folder can't be made or a file can't be written."""
     import cv2
 
     target = Path(folder)

@@ -1,13 +1,8 @@
 """Pinhole model with lens distortion: the camera, or a projector as an inverse camera.
 
-Pixel centres lie at integer coordinates, so that an image W px wide spans -0.5 to W - 0.5 (OpenCV's convention).
-The lens is OpenCV's five-parameter model: with r^2 = x^2 + y^2 and coefficients (k1, k2, p1, p2, k3)::
-
-    x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
-    y_d = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
-
-The polynomial folds back beyond some radius; a point out there has no image, and `distort` and `undistort` answer NaN
-for it.
+Pixel centres lie at integer coordinates, so that an image W px wide spans -0.5 to W - 0.5, and the lens is OpenCV's
+model with the coefficients (k1, k2, p1, p2, k3), `distortion_polynomial`. It folds back beyond some radius; a point out
+there has no image, and `distort` and `undistort` answer NaN for it.
 """
 
 import math
@@ -29,8 +24,8 @@ INVERSE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
 START_TABLE = 4096
 MAX_CONDITION = 2.0**26
-"""Largest accepted condition number of the intrinsic matrix, with lengths in image sizes: inverting it then costs half
-of double precision's digits. The paper's camera has 3; a focal length of 0.01 px or 10^10 px reaches the limit."""
+"""Of the intrinsic matrix, with lengths in image sizes: inverting it then costs half of double precision's digits. The
+paper's camera has 3; a focal length of 0.01 px or 10^10 px reaches the limit."""
 
 
 def is_distorted(coefficients: Coefficients) -> bool:
@@ -52,7 +47,7 @@ def _radial(r2: NDArray, coefficients: Coefficients) -> NDArray:
 
 
 def distortion_polynomial(x: NDArray, y: NDArray, coefficients: Coefficients) -> Maps:
-    """The model itself, without a look at its fold: arithmetic only, so that arrays of any library pass through."""
+    """The model without a look at its fold: arithmetic only, so that arrays of any library pass through."""
     _, _, p1, p2, _ = coefficients
     r2, cross = x * x + y * y, x * y
     radial = _radial(r2, coefficients)
@@ -89,11 +84,11 @@ def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients
 
 
 def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
-    """Ideal normalised coordinates of distorted ones, by Newton's method in float64, checked by distorting again.
+    """Ideal normalised coordinates of distorted ones, float64; NaN where none within the fold reproduces the input to
+    `INVERSE_TOLERANCE`.
 
-    Newton starts at the inverse of the radial part, read off a table: from the distorted point itself it overshoots
-    where the polynomial flattens out, and misses points that have an inverse. Where no ideal point within the fold
-    reproduces the input to `INVERSE_TOLERANCE`, both coordinates are NaN.
+    Newton's method from the inverse of the radial part, read off a table: from the distorted point itself it overshoots
+    where the polynomial flattens out, and misses points that have an inverse.
     """
     xd, yd = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not is_distorted(coefficients):
@@ -120,6 +115,12 @@ def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
     return np.where(good, xi, np.nan), np.where(good, yi, np.nan)
 
 
+def require(met: object, message: str) -> None:
+    """Raise `RigError` with ``message`` unless ``met``."""
+    if not met:
+        raise RigError(message)
+
+
 def number(value: object, name: str, *, positive: bool = False) -> float:
     """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
@@ -134,17 +135,14 @@ def numbers(value: object, count: int, name: str) -> tuple[float, ...]:
     if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
         raise RigError(f"{name}: expected {count} numbers, got {value!r}")
     entries = list(value)
-    if len(entries) != count:
-        raise RigError(f"{name}: expected {count} numbers, got {len(entries)}")
+    require(len(entries) == count, f"{name}: expected {count} numbers, got {len(entries)}")
     return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera, or a projector as an inverse camera: size and intrinsics in px, distortion (k1, k2, p1, p2, k3).
-
-    Raises `RigError` for sizes that are not positive integers, focal lengths that are not positive, non-finite values.
-    """
+    """Size and intrinsics in px, distortion (k1, k2, p1, p2, k3). Raises `RigError` for sizes that are not positive
+    integers, focal lengths that are not positive, non-finite values."""
 
     width: int
     height: int
@@ -166,12 +164,12 @@ class Pinhole:
         w, h = self.width, self.height
         matrix = np.array([[self.fx / w, 0, (self.cx + 0.5) / w], [0, self.fy / h, (self.cy + 0.5) / h], [0, 0, 1]])
         condition = float(np.linalg.cond(matrix)) if np.isfinite(matrix).all() else math.inf
-        if not condition <= MAX_CONDITION:
-            raise RigError(
-                f"fx, fy, cx, cy: the intrinsic matrix {self.fx:g}, {self.fy:g}, {self.cx:g}, {self.cy:g} px of a "
-                f"{w} x {h} px image is nearly singular: condition number {condition:.3g}, accepted up to "
-                f"{MAX_CONDITION:.3g}; give focal lengths and principal point in px"
-            )
+        require(
+            condition <= MAX_CONDITION,
+            f"fx, fy, cx, cy: the intrinsic matrix {self.fx:g}, {self.fy:g}, {self.cx:g}, {self.cy:g} px of a {w} x "
+            f"{h} px image is nearly singular: condition number {condition:.3g}, accepted up to {MAX_CONDITION:.3g}; "
+            "give focal lengths and principal point in px",
+        )
 
     @property
     def is_distorted(self) -> bool:
@@ -206,10 +204,8 @@ class Pinhole:
         return xd * self.fx + self.cx, yd * self.fy + self.cy
 
     def rays(self) -> Maps:
-        """Ideal normalised coordinates (x, y) of every pixel: two float64 (H, W) read-only maps; the ray is (x, y, 1).
-
-        Pixels whose distortion can't be inverted are NaN. The two latest cameras' maps are kept.
-        """
+        """Ideal normalised coordinates (x, y) of every pixel, NaN where the distortion can't be inverted: two float64
+        (H, W) read-only maps; the ray is (x, y, 1). The two latest cameras' maps are kept."""
         return _rays(self)
 
     def project(self, points_m: ArrayLike) -> Maps:

@@ -1,8 +1,7 @@
 """The rig: camera and projector as pinholes with lens distortion, and the pose between them.
 
-Conventions: OpenCV's. The camera frame has x right, y down, z forward; a point goes from the camera's frame to the
-projector's by ``X_p = R X_c + t`` in metres; pixel centres lie at integer coordinates, so that an image W px wide spans
--0.5 to W - 0.5. The default rig is the paper's (Section 2.2 and Table 1).
+OpenCV's conventions: the camera frame has x right, y down, z forward; a point goes from the camera's frame to the
+projector's by ``X_p = R X_c + t`` in metres.
 
 A rig file is YAML or JSON; reading is strict, and writing and reading again gives an equal rig::
 
@@ -32,7 +31,7 @@ from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.gray_code import bits_needed, cell_count
-from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers
+from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
 from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, PAPER_SEQUENCE, Direction, Sequence
 
 ROTATION_TOLERANCE = 1e-6
@@ -48,10 +47,10 @@ Matrix3 = tuple[tuple[float, float, float], ...]
 class Rig:
     """Camera, projector, the pose between them, and the sequence that is projected.
 
-    ``rotation`` (three rows) and ``translation_m`` take any sequence or array and are kept as tuples, so that a rig is
-    hashable and compares by value; `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal
-    fringes along the projector's rows, ``pitch_vertical_px`` that of the vertical ones along its columns. Raises
-    `RigError` for a pose that is no rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit.
+    ``rotation`` (three rows) and ``translation_m`` are kept as tuples, so that a rig is hashable and compares by value;
+    `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal fringes along the projector's
+    rows, ``pitch_vertical_px`` that of the vertical ones along its columns. Raises `RigError` for a pose that is no
+    rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit.
     """
 
     camera: Pinhole
@@ -71,8 +70,7 @@ class Rig:
         if isinstance(self.rotation, str | dict) or not isinstance(self.rotation, Iterable):
             raise RigError(f"rotation: expected three rows of three numbers, got {self.rotation!r}")
         rows = tuple(numbers(row, 3, f"rotation[{i}]") for i, row in enumerate(self.rotation))
-        if len(rows) != 3:
-            raise RigError(f"rotation: expected three rows of three numbers, got {len(rows)} rows")
+        require(len(rows) == 3, f"rotation: expected three rows of three numbers, got {len(rows)} rows")
         translation = numbers(self.translation_m, 3, "translation_m")
         near_far = numbers(self.working_range_mm, 2, "working_range_mm")
         settings: dict[str, Any] = {"rotation": rows, "translation_m": translation, "working_range_mm": near_far}
@@ -83,46 +81,41 @@ class Rig:
             object.__setattr__(self, name, value)
         self.R.setflags(write=False)
         self.t.setflags(write=False)
-        self._check_pose()
-        self._check_range()
+        self._check_pose_and_range()
         for direction in DIRECTIONS:
             self._check_code(direction)
 
-    def _check_pose(self) -> None:
+    def _check_pose_and_range(self) -> None:
         error = float(np.abs(self.R @ self.R.T - np.eye(3)).max())
-        if error > ROTATION_TOLERANCE:
-            raise RigError(
-                f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROTATION_TOLERANCE:g}; "
-                "write more digits or give a rotation vector"
-            )
-        if np.linalg.det(self.R) < 0:
-            raise RigError("rotation: determinant is -1, a mirror image; check the sign of one axis")
-        if not np.any(self.t):
-            raise RigError("translation_m: the baseline is zero, so no depth can be triangulated")
-
-    def _check_range(self) -> None:
+        require(
+            error <= ROTATION_TOLERANCE,
+            f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROTATION_TOLERANCE:g}; "
+            "write more digits or give a rotation vector",
+        )
+        mirrored = np.linalg.det(self.R) < 0
+        require(not mirrored, "rotation: determinant is -1, a mirror image; check the sign of one axis")
+        require(np.any(self.t), "translation_m: the baseline is zero, so no depth can be triangulated")
         near, far = self.working_range_mm
-        if not 0 < near < far:
-            raise RigError(f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm")
-        if not near <= self.standoff_m * MM_PER_M <= far:
-            raise RigError(f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm")
-        if self.background_m * MM_PER_M <= far:
-            raise RigError(
-                f"background_m: {self.background_m:g} m must lie beyond the working range, which ends at {far:g} mm"
-            )
+        require(0 < near < far, f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm")
+        outside = f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm"
+        require(near <= self.standoff_m * MM_PER_M <= far, outside)
+        require(
+            self.background_m * MM_PER_M > far,
+            f"background_m: {self.background_m:g} m must lie beyond the working range, which ends at {far:g} mm",
+        )
 
     def _check_code(self, direction: Direction) -> None:
         pitch, length = self.pitch(direction), self.pattern_length(direction)
-        if not SMALLEST_PITCH_PX <= pitch <= length:
-            raise RigError(
-                f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px"
-            )
+        require(
+            SMALLEST_PITCH_PX <= pitch <= length,
+            f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px",
+        )
         bits, needed = self.sequence.bits(direction), bits_needed(length, pitch)
-        if bits < needed:
-            raise RigError(
-                f"sequence.bits_{direction}: {length} px hold {cell_count(length, pitch)} Gray cells of half a period "
-                f"({pitch / 2:g} px), which need {needed} bits, got {bits}"
-            )
+        require(
+            bits >= needed,
+            f"sequence.bits_{direction}: {length} px hold {cell_count(length, pitch)} Gray cells of half a period "
+            f"({pitch / 2:g} px), which need {needed} bits, got {bits}",
+        )
 
     def pitch(self, direction: Direction) -> float:
         """Fringe period in projector px."""
@@ -171,10 +164,8 @@ class Rig:
         x, y = self.camera.normalised(*pixel)
         depth = np.atleast_1d(np.asarray(depth_m, dtype=np.float64))
         seen = self.project(np.stack([x * depth, y * depth, depth], axis=-1))[axis]
-        if not np.all(np.isfinite(seen)):
-            raise RigError(
-                "the projector does not look at what the camera's central pixel sees: check rotation and signs"
-            )
+        unseen = "the projector does not look at what the camera's central pixel sees: check rotation and signs"
+        require(np.all(np.isfinite(seen)), unseen)
         return seen
 
     def periods_in_range(self, direction: Direction) -> float:
@@ -183,10 +174,8 @@ class Rig:
         return abs(float(near - far)) / self.pitch(direction)
 
     def image_px_per_period(self, direction: Direction) -> float:
-        """Image px a fringe period covers at the image centre, on a plane square to the axis at the standoff.
-
-        Central difference over one image px along the axis that the fringes vary; 22.56 for the paper's rig at 960 px.
-        """
+        """Image px a fringe period covers at the image centre, on a plane square to the axis at the standoff: central
+        difference over one image px along the axis that the fringes vary; 22.56 for the paper's rig at 960 px."""
         left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
         change = abs(float(right - left))
         return self.pitch(direction) / change if change > 0 else math.inf
@@ -230,40 +219,14 @@ _RIG_KEYS = (
 )  # fmt: skip
 
 
-def _mapping(value: object, keys: Iterable[str], name: str) -> Mapping[str, Any]:
+def _mapping(value: object, keys: Iterable[str], name: str) -> dict[str, Any]:
     prefix, expected = f"{name}: " if name else "", ", ".join(keys)
     if not isinstance(value, Mapping):
         raise RigError(f"{prefix}expected a mapping with the keys {expected}, got {value!r}")
     problems = [f"unknown key {key}" for key in value if key not in keys]
     problems += [f"missing key {key}" for key in keys if key not in value]
-    if problems:
-        raise RigError(f"{prefix}{', '.join(problems)}; expected exactly {expected}")
-    return value
-
-
-def _pinhole(value: object, name: str) -> Pinhole:
-    entries = _mapping(value, [entry.name for entry in fields(Pinhole)], name)
-    try:
-        return Pinhole(**entries)
-    except RigError as error:
-        raise RigError(f"{name}.{error}") from error
-
-
-def _sequence(value: object) -> Sequence:
-    entries = _mapping(value, [entry.name for entry in fields(Sequence)], "sequence")
-    for key, entry in entries.items():
-        if isinstance(entry, bool) or not isinstance(entry, int):
-            raise RigError(f"sequence.{key}: expected a whole number, got {entry!r}")
-    try:
-        return Sequence(**entries)
-    except ValueError as error:
-        raise RigError(f"sequence: {error}") from error
-
-
-def _rotation(value: object) -> Any:
-    if isinstance(value, list | tuple) and len(value) == 3 and not any(isinstance(v, list | tuple) for v in value):
-        return rotation_matrix(numbers(value, 3, "rotation")).tolist()
-    return value
+    require(not problems, f"{prefix}{', '.join(problems)}; expected exactly {expected}")
+    return dict(value)
 
 
 def rig_from_dict(data: object) -> Rig:
@@ -271,27 +234,40 @@ def rig_from_dict(data: object) -> Rig:
 
     Raises `RigError` naming the key for anything unknown, missing, of the wrong type, or impossible as a rig.
     """
-    entries = dict(_mapping(data, _RIG_KEYS, ""))
+    entries = _mapping(data, _RIG_KEYS, "")
     pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
     for device in ("camera", "projector"):
-        entries[device] = _pinhole(entries[device], device)
-    entries |= {"rotation": _rotation(entries["rotation"]), "sequence": _sequence(entries["sequence"])}
+        values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
+        try:
+            entries[device] = Pinhole(**values)
+        except RigError as error:
+            raise RigError(f"{device}.{error}") from error
+    turn = entries["rotation"]
+    if isinstance(turn, list | tuple) and len(turn) == 3 and not any(isinstance(v, list | tuple) for v in turn):
+        entries["rotation"] = rotation_matrix(numbers(turn, 3, "rotation")).tolist()
+    counts = _mapping(entries["sequence"], [entry.name for entry in fields(Sequence)], "sequence")
+    for key, count in counts.items():
+        whole = isinstance(count, int) and not isinstance(count, bool)
+        require(whole, f"sequence.{key}: expected a whole number, got {count!r}")
+    try:
+        entries["sequence"] = Sequence(**counts)
+    except ValueError as error:
+        raise RigError(f"sequence: {error}") from error
     return Rig(**entries, pitch_horizontal_px=pitch["horizontal"], pitch_vertical_px=pitch["vertical"])
 
 
 def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     mapping: dict[Any, Any] = {}
     for key, value in pairs:
-        if key in mapping:
-            raise RigError(f"key {key} is given twice in the same mapping; keep one entry")
+        require(key not in mapping, f"key {key} is given twice in the same mapping; keep one entry")
         mapping[key] = value
     return mapping
 
 
 def _is_json(path: Path) -> bool:
-    if path.suffix.lower() not in (".yaml", ".yml", ".json"):
-        raise RigError(f"{path}: expected a rig file ending in .yaml, .yml or .json")
-    return path.suffix.lower() == ".json"
+    suffix = path.suffix.lower()
+    require(suffix in (".yaml", ".yml", ".json"), f"{path}: expected a rig file ending in .yaml, .yml or .json")
+    return suffix == ".json"
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -300,8 +276,7 @@ def load_rig(path: str | Path) -> Rig:
     as_json = _is_json(file)
     try:
         text = file.read_text(encoding="utf-8")
-        if not text.strip():
-            raise RigError(f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
+        require(text.strip(), f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
         return rig_from_dict(json.loads(text, object_pairs_hook=_unique_keys) if as_json else strict_yaml(text))
     except RigError as error:
         raise RigError(f"{file}: {error}") from error

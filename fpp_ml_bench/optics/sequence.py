@@ -30,12 +30,10 @@ class Frame:
 
     @property
     def column(self) -> str:
-        """Name of this frame's dataset column."""
         return f"frame_{self.index:02d}"
 
     @property
     def title(self) -> str:
-        """Description for captions and messages."""
         part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}",
                 "gray": f"{self.direction} Gray bit {self.step}"}.get(self.kind, self.kind)  # fmt: skip
         return f"{self.index}: {part}"
@@ -52,11 +50,10 @@ class Sequence:
     def __post_init__(self) -> None:
         if self.steps < 3:
             raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
-        if min(self.bits_horizontal, self.bits_vertical) < 1 or max(self.bits_horizontal, self.bits_vertical) > 15:
-            raise ValueError(
-                f"Gray bits must be 1 to 15 per direction, got {self.bits_horizontal} horizontal and "
-                f"{self.bits_vertical} vertical"
-            )
+        horizontal, vertical = self.bits_horizontal, self.bits_vertical
+        if not (1 <= horizontal <= 15 and 1 <= vertical <= 15):
+            given = f"{horizontal} horizontal and {vertical} vertical"
+            raise ValueError(f"Gray bits must be 1 to 15 per direction, got {given}")
 
     def __len__(self) -> int:
         return 2 * self.steps + self.bits_horizontal + self.bits_vertical + 2
@@ -96,16 +93,10 @@ class Sequence:
     def config(self, name: str) -> tuple[int, ...]:
         """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``."""
         horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
-        table = {
-            "single_shot": (0,),
-            "horizontal": horizontal,
-            "vertical": vertical,
-            "sinusoidal": horizontal + vertical,
-            "all": tuple(range(len(self))),
-        }
-        if name not in table:
+        frames = ((0,), horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
+        if name not in CONFIGS:
             raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
-        return table[name]
+        return frames[CONFIGS.index(name)]
 
 
 PAPER_SEQUENCE = Sequence()

@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.blocks import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, gray_bits_in_view, orders_from_phases
+from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, orders_from_phases
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import DIRECTIONS, paper_rig
@@ -23,11 +23,22 @@ COARSE = replace(
 
 def test_bits_that_are_constant_in_view_are_not_needed():
     # 912 / 20 = 46 cells and 1140 / 18 = 64 cells need 6 bits each, of 7.
-    assert gray_bits_in_view(COARSE, "vertical") == gray_bits_in_view(COARSE, "horizontal") == (1, 2, 3, 4, 5, 6)
-    assert gray_bits_in_view(PAPER, "vertical") == gray_bits_in_view(PAPER, "horizontal") == tuple(range(7))
+    assert (
+        fewest_gray_bits(COARSE, "vertical")["vertical"]
+        == fewest_gray_bits(COARSE, "horizontal")["horizontal"]
+        == (1, 2, 3, 4, 5, 6)
+    )
+    assert (
+        fewest_gray_bits(PAPER, "vertical")["vertical"]
+        == fewest_gray_bits(PAPER, "horizontal")["horizontal"]
+        == tuple(range(7))
+    )
     # In a tenth of the pattern fewer bits change.
     narrow = replace(PAPER, camera=replace(PAPER.camera, fx=20_000.0, fy=20_000.0), working_range_mm=(1790.0, 1810.0))
-    assert len(gray_bits_in_view(narrow, "vertical")) < 7 and gray_bits_in_view(narrow, "vertical")[-1] == 6
+    assert (
+        len(fewest_gray_bits(narrow, "vertical")["vertical"]) < 7
+        and fewest_gray_bits(narrow, "vertical")["vertical"][-1] == 6
+    )
 
 
 def test_two_phases_of_the_papers_rig_by_hand():
@@ -41,7 +52,7 @@ def test_two_phases_of_the_papers_rig_by_hand():
     # Equal baselines and pitches: both phases are equal and don't determine the order.
     alike = replace(PAPER, translation_m=(0.1, -0.1, 0.0))
     assert orders_from_phases(alike).least_gap_px == pytest.approx(0, abs=1e-9)
-    assert fewest_gray_bits(alike, "both") == {name: gray_bits_in_view(alike, name) for name in DIRECTIONS}
+    assert fewest_gray_bits(alike, "both") == {name: fewest_gray_bits(alike, name)[name] for name in DIRECTIONS}
     assert not orders_from_phases(LENSES).unambiguous
 
 
