@@ -122,7 +122,7 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
         every = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
-        lines.append(Line(row, label, recipe, every and scored(every), entry, paper_mm))
+        lines.append(Line(row, label, recipe, None if every is None else scored(every), entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
 

@@ -186,4 +186,4 @@ def paper_tables() -> dict[str, PaperTable]:
 def chosen_tables(choice: str | None) -> list[PaperTable]:
     """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
     several = {None: SHOWN_BY_DEFAULT, "all": TABLES, "none": ()}
-    return [paper_tables()[name] for name in several.get(choice, (choice,))]
+    return [paper_tables()[name] for name in several.get(choice, (str(choice),))]

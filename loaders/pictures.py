@@ -30,8 +30,8 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     for number, (title, image, colours, low, high) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)
-        nearest = {} if colours == _GREY else {"interpolation": "nearest"}
-        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, **nearest)
+        nearest = None if colours == _GREY else "nearest"
+        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=nearest)
         if colours != _GREY:
             bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
             bar.set_label("mm", fontsize=8)

@@ -179,7 +179,7 @@ def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Im
     side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
     maps = (gap, question.inside.astype(np.float32))
     mean_gap, share = (cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps)
-    return mean_gap / np.maximum(share, 1e-3)
+    return mean_gap / np.maximum(share, 1e-3)  # type: ignore[return-value]  # cv2 keeps float32
 
 
 def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:

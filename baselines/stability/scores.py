@@ -70,7 +70,7 @@ for _family, _grid in {
     "shape of the object": {"name": NAMES, "low_mm": (1700.0,), "span_mm": (200.0,), "stored": ("float32",),
                             "kind": _KINDS},
 }.items():  # fmt: skip
-    NORMALISATION.family(_family, "mm", **_grid)(round_trip)
+    NORMALISATION.family(_family, "mm", **_grid)(round_trip)  # type: ignore[arg-type]
 
 
 @NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)

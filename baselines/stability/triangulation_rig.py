@@ -103,7 +103,9 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
     # Where the bound exceeds half of the depth, the number is round-off and must be as behind the camera.
     nothing = ~(bound < 0.5) | ~(exact.astype(float) > 0)
     error = np.where(nothing, np.inf, relative(depth_mm, exact))
-    return worst(error, bound, np.isnan(depth_mm), float(np.mean(nothing | indistinct)), float(condition.max()))
+    return worst(
+        error, bound, np.isnan(depth_mm), float(np.mean(nothing | np.asarray(indistinct))), float(condition.max())
+    )
 
 
 def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Direction, turned: bool = False) -> Outcome:

@@ -95,10 +95,10 @@ def network_settings(views: StoredViews, run: TradeoffSettings) -> Iterator[Sett
     for unet_width, precision in product(default_widths if run.widths is None else run.widths, precisions):
         emulated = notes.get(precision)
         if not emulated or unet_width <= EMULATED_WIDTH:
-            make = partial(Untrained, unet_width, precision, views, run.threads)
+            make_untrained = partial(Untrained, unet_width, precision, views, run.threads)
             key, title = f"network-width-{unet_width:03d}-{precision}", f"UNet width {unet_width}, {precision}"
             note = f"{NOT_TRAINED}; {emulated}" if emulated else NOT_TRAINED
-            yield Setting(key, "networks", title, make, views, False, note)
+            yield Setting(key, "networks", title, make_untrained, views, False, note)
 
 
 def _trained(path: Path, depth_range: DepthRange | None, precision: str, views: StoredViews, threads: int) -> Method:

@@ -93,7 +93,7 @@ class Panel:
     @classmethod
     def of(cls, title: str, history: list[Record], x: str, labels: Mapping[str, str], log: bool = False) -> "Panel":
         """The values of the keys ``labels`` over those of ``x``, where there are some."""
-        lines = {}
+        lines: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
         for key, label in labels.items():
             points = [(record[x], record[key]) for record in history if record.get(key) is not None]
             lines[label] = ([at for at, _ in points], [value for _, value in points])

@@ -18,10 +18,12 @@ from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Frame, Rig, Sequence
 
 AUTO = "auto"
-_SH, _SV, _GH, _GV = (
+_Run = tuple[str, Direction]
+_RUNS: tuple[_Run, _Run, _Run, _Run] = (
     ("sinusoid", "horizontal"), ("sinusoid", "vertical"), ("gray", "horizontal"), ("gray", "vertical"),
 )  # fmt: skip
-LAYOUTS: dict[str, tuple[tuple[str, Direction], ...]] = {
+_SH, _SV, _GH, _GV = _RUNS
+LAYOUTS: dict[str, tuple[_Run, ...]] = {
     "paper": (_SH, _SV, _GH, _GV),
     "vertical-first": (_SV, _SH, _GV, _GH),
     "by-direction": (_SH, _GH, _SV, _GV),
