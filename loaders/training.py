@@ -35,10 +35,10 @@ class FringeDepth(NamedTuple):
 class FringeDepthDataset(Dataset[FringeDepth]):
     """Pairs of a frame and the depth map of its sample (paper Sections 3.3 and 5.4).
 
-    config : the frames that form pairs: ``single_shot`` (frame 0), ``horizontal``, ``vertical``, ``sinusoidal`` or
-        ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
-    normalisation : ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] from the sample's own D_min and D_max).
-    background_removed : set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
+    ``config``: the frames that form pairs: ``single_shot`` (frame 0), ``horizontal``, ``vertical``, ``sinusoidal`` or
+    ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
+    ``normalisation``: ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] from the sample's own D_min and D_max).
+    ``background_removed``: set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
 
     Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. In a single
     process `batches` is faster, as it reuses its buffers. Raises `DatasetError` for a missing folder, split or config.

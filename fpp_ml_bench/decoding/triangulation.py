@@ -139,7 +139,7 @@ def depth_noise_mm(
     """Standard deviation of the depth in mm that intensity noise causes, float64.
 
     ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical
-    axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / |du/dZ|; for the
+    axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / ``|du/dZ|``; for the
     paper's rig sigma_Z is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add.
     Projector distortion is ignored; it changes the slope by a few percent.
     """
