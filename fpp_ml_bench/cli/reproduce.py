@@ -1,5 +1,7 @@
 """``fpp-bench reproduce``: the paper's tables, trained and scored here."""
 
+from __future__ import annotations
+
 import argparse
 import shlex
 import sys
