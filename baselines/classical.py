@@ -1,7 +1,7 @@
 """Classical multi-frame FPP: N-step phase, Gray-code order, triangulation (paper Section 2.1).
 
-It is the benchmark's reference: what the optics allow when 10 to 50 frames are captured instead of one. With all steps
-and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact`` shows its error.
+With all steps and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact``
+shows its error.
 """
 
 import numpy as np
@@ -45,13 +45,11 @@ class ClassicalMethod(Method):
             self.settings = {**self.settings, "fewest": True}
 
     def decode(self, frames: Frames, reasons: bool = True) -> Decoded:
-        """Full result of a captured sequence; frames that are not in `frames_used` may be None. ``reasons`` False is
-        faster where only the depth is wanted: see `decode_stack`."""
+        """`decode_stack` of a captured sequence; frames that are not in `frames_used` may be None."""
         return decode_stack(
             frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads, reasons=reasons,
             fewest=self.fewest,
         )  # fmt: skip
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background or not measured."""
         return self.decode(frames, reasons=False).depth_mm

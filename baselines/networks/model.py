@@ -29,10 +29,8 @@ Fringe = NDArray[np.uint8] | NDArray[np.floating[Any]]
 
 def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trained_on: str) -> Tensor:
     """Images (B, H, W), uint8 or float in [0, 1], as the network's input: float32 (B, 1, H, W) in [0, 1], on the CPU.
-
-    ``size`` (H, W) is what the network ``trained_on`` was trained at. Raises `PredictionError` for another size, shape
-    or dtype, and for values that are NaN or outside [0, 1].
-    """
+    ``size`` (H, W): what the network ``trained_on`` was trained at. `PredictionError` for another size, shape or dtype,
+    and for values that are NaN or outside [0, 1]."""
     images = [np.asarray(image) for image in fringes]
     if not images:
         raise PredictionError("expected at least one fringe image, got none")
@@ -232,10 +230,8 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A network with its weights, in eval mode. ``heads`` turn an individually normalised output into mm, or None.
-
-    ``sha256`` is that of the weights file.
-    """
+    """A network with its weights, in eval mode. ``heads`` turn an individually normalised output into mm, or None;
+    ``sha256`` is that of the weights file."""
 
     network: FringeNetwork
     config: ModelConfig
@@ -296,11 +292,9 @@ class Model:
 
 
 def load(name_or_path: str | Path, device: str | None = None) -> Model:
-    """The weights ``name_or_path``, shipped with the package or a ``.safetensors`` file, as a `Model`.
-
-    ``device``: ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one. Raises `WeightsError` for an
-    unknown name (the message lists the shipped ones), a damaged or foreign file, or a device that does not exist.
-    """
+    """The weights ``name_or_path``, shipped with the package or a ``.safetensors`` file, as a `Model`. ``device``:
+    ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one. `WeightsError` for an unknown name, a damaged
+    or foreign file, or a device that does not exist."""
     weights = open_weights(weights_path(name_or_path))
     with torch.device("meta"):
         network = build(weights.config.network, **weights.config.options)

@@ -1,7 +1,6 @@
 """Fitting the range heads (`RangeHeads`) to a frozen network: closed forms, a few seconds."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +38,8 @@ def fit_heads(
     """Tensors of the `RangeHeads` of ``network``, which is not changed; ``save_weights(..., heads=...)`` stores them.
 
     Mean range, ridge regression and mask come from the training split; the ridge's strength and the masks' thresholds
-    (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. ``progress`` is called
-    with the number of pairs done; there are three passes, one over training and two over validation pairs.
+    (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. ``progress`` is given the
+    number of pairs done.
 
     Raises `WeightsError` for a network of another normalisation, a dataset of another size or fingerprint than
     ``config`` says, or without an object in either split; `PredictionError` where the network's output is not finite.
@@ -67,16 +66,6 @@ def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str
     """
     model = load(weights)
     save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
-
-
-@dataclass
-class _Batch:
-    """``values``: network output (B, 1, H, W); ``depth_mm`` (B, H, W), 0 = background; ``range_mm`` (B, 2): D_min and
-    span."""
-
-    values: Tensor
-    depth_mm: NDArray[np.float32]
-    range_mm: Values
 
 
 class _Pairs:
@@ -107,24 +96,25 @@ class _Pairs:
         self.size = source.size
         self.batch = max(1, min(4, _PIXELS_AT_ONCE // (self.size[0] * self.size[1])))
 
-    def run(self) -> Iterator[_Batch]:
+    def run(self) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
+        """Network output (B, 1, H, W), depth in mm (B, H, W), and D_min and span (B, 2)."""
         for batch in self.data.batches(self.batch, self.order):
             values = represent(self.network, batch.fringe.to(self.device), self.name)
             depth = [self.data.source.depth_mm(self.data.samples[int(row)]) for row in batch.row]
             edges = batch.depth_range_mm.double().numpy()
             span = np.stack([edges[:, 0], edges[:, 1] - edges[:, 0]], axis=1)
-            yield _Batch(values, np.stack(depth), span)
+            yield values, np.stack(depth), span
             self.progress(len(depth))
 
 
 def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     pooled, ranges, features, costs, labels = [], [], [], [], []
     rng = np.random.default_rng(_SEED)
-    for batch in train.run():
+    for _, depth_mm, range_mm in train.run():
         pooled.append(train.probe.pooled().numpy())
-        ranges.append(batch.range_mm)
+        ranges.append(range_mm)
         layer = train.probe.pixels(train.size).flatten(2)
-        for number, depth in enumerate(batch.depth_mm):
+        for number, depth in enumerate(depth_mm):
             for label in (True, False):
                 label_pixels = np.flatnonzero(object_mask(depth) == label)
                 if not label_pixels.size:
@@ -134,7 +124,7 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
                 labels.append(np.full(sampled.size, label))
                 # A wrong label costs about the whole depth: the true depth of a missed object pixel, or the depth that
                 # a background pixel would get.
-                cost = depth.ravel()[sampled] if label else np.full(sampled.size, batch.range_mm[number].sum())
+                cost = depth.ravel()[sampled] if label else np.full(sampled.size, range_mm[number].sum())
                 costs.append(cost * (label_pixels.size / sampled.size))
     train_ranges = np.concatenate(ranges)
     lows, highs = train_ranges[:, 0], train_ranges.sum(axis=1)
@@ -142,7 +132,7 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     mask_weight, mask_bias = _logistic(
         torch.cat(features), torch.from_numpy(np.concatenate(labels)), torch.from_numpy(np.concatenate(costs)).double()
     )
-    validation_features = [(validation.probe.pooled().numpy(), batch.range_mm) for batch in validation.run()]
+    validation_features = [(validation.probe.pooled().numpy(), range_mm) for _, _, range_mm in validation.run()]
     validation_pooled, validation_ranges = (np.concatenate(part) for part in zip(*validation_features, strict=True))
     strength, weight, bias, error_mm = _ridge(
         np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges
@@ -155,11 +145,11 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
         report=torch.zeros(6, dtype=torch.float64),
     )  # fmt: skip
     tallies = {twin: _Tally() for twin in TWINS}
-    for batch in validation.run():
+    for values, depth_mm, _ in validation.run():
         logits = heads.logits(validation.probe, validation.size).cpu().numpy()[:, 0]
         for twin, tally in tallies.items():
-            depth = heads.unmasked_mm(batch.values, heads.depth_range_mm(validation.probe, twin))
-            tally.add(logits, depth.cpu().numpy()[:, 0], batch.depth_mm)
+            depth = heads.unmasked_mm(values, heads.depth_range_mm(validation.probe, twin))
+            tally.add(logits, depth.cpu().numpy()[:, 0], depth_mm)
     best = {twin: tally.best() for twin, tally in tallies.items()}
     heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
     report = HeadReport(

@@ -1,7 +1,4 @@
-"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given.
-
-Its weights file holds the network in half precision.
-"""
+"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,10 +35,8 @@ class NetFile:
 
 
 def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
-    """Write ``network`` to ``path`` in half precision, complete or not at all; the file's SHA-256.
-
-    Raises `WeightsError` for tensors that are not finite in half precision, and for a path that can't be written.
-    """
+    """Write ``network`` to ``path`` in half precision, complete or not at all; the file's SHA-256. `WeightsError` for
+    tensors that are not finite in half precision, and for a path that can't be written."""
     tensors = {}
     for name, tensor in network.state_dict().items():
         tensors[name] = tensor.detach().cpu().half() if tensor.is_floating_point() else tensor
@@ -52,11 +47,8 @@ def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
 
 def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile:
     """Configuration and network of shipped weights or of a file, float32; ``folded``: for inference alone
-    (`PhaseNet.folded`), False to train on.
-
-    Raises `WeightsError`, naming the file, the expected and the actual content and the cure, for a file that is absent,
-    damaged, of another kind or version, or whose tensors do not fit its configuration.
-    """
+    (`PhaseNet.folded`), False to train on. `WeightsError` for a file that is absent, damaged, of another kind or
+    version, or whose tensors do not fit its configuration."""
     path = weights_path(name_or_path, SHIPPED)
     shown = printable(str(path), 500)
     config, tensors, digest = read_file(path, PHASE_NETWORKS)

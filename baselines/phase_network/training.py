@@ -109,12 +109,10 @@ class Recipe:
         return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain mapping of everything."""
         return json.loads(json.dumps(asdict(self)))
 
     @property
     def digest(self) -> str:
-        """Hex digest of everything."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
@@ -123,7 +121,6 @@ Batch = dict[str, Tensor]
 
 
 def batch_of(windows: list[Window]) -> Batch:
-    """The windows as tensors."""
     fields = Window.__dataclass_fields__
     batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
     batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
@@ -201,7 +198,6 @@ class PhaseNetTraining(Training):
 
     @property
     def _next_validation(self) -> int:
-        """Step after which the coming interval ends."""
         every = self.recipe.validate_every
         return min((self.steps_done // every + 1) * every, self.recipe.steps)
 
@@ -312,7 +308,6 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
 
 
 def with_lead(answers: Answers, lead: float) -> Answers:
-    """Answers with ``lead`` added to the logit of the base order."""
     return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
 
 

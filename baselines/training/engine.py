@@ -48,8 +48,8 @@ DIVERGED = 1e6
 class Training(ABC):
     """A training's state and loop; a subclass says what is trained on what, at which rate, and how it is validated.
 
-    ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, whatever compiles or
-    distributes them, as they are saved and restored. ``identity``: recipe and data, which a checkpoint must share.
+    ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, not compiled or
+    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share.
     """
 
     name: str
@@ -129,7 +129,8 @@ class Training(ABC):
         """Train to the end, or until an interval would outlast ``minutes`` since ``started``; one is always trained.
         Returns the seconds so far, those of earlier calls included."""
         with Display(self.name, self.total_steps, show and self.accelerator.is_main_process) as display:
-            self._show(display)
+            if self.history:
+                display.update(self.steps_done, self.progress())
             last_interval_s = 0.0
             while not self.over:
                 in_time = minutes is None or perf_counter() - started + last_interval_s < 60 * minutes
@@ -137,8 +138,14 @@ class Training(ABC):
                 if not broadcast_object_list([last_interval_s == 0 or in_time])[0]:
                     break
                 began = perf_counter()
-                self._finish_interval(self._train_interval(display), began)
-                self._show(display)
+                record = self.validated(self._train_interval(display), began)
+                self.history.append(record)
+                self.recorded(record)
+                if self.accelerator.is_main_process:
+                    self._save()
+                    write_log(self.out, self.history)
+                self.accelerator.wait_for_everyone()
+                display.update(self.steps_done, self.progress())
                 last_interval_s = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process and self.history:
@@ -180,10 +187,6 @@ class Training(ABC):
             words = "processes found different checkpoints; give a folder that all machines share"
             raise TrainingError(f"{self.out}: {words}")
 
-    def _show(self, display: Display) -> None:
-        if self.history:
-            display.update(self.steps_done, self.progress())
-
     def _train_interval(self, display: Display) -> dict[str, float]:
         """One pass over `batches`; the mean over them of everything the objective logs."""
         batches = self.batches()
@@ -220,16 +223,6 @@ class Training(ABC):
     def limit(self) -> float:
         """Loss above which the training has diverged."""
         return DIVERGED * (self.first_loss or math.inf)
-
-    def _finish_interval(self, losses: dict[str, float], began: float) -> None:
-        """Validate and save everything."""
-        record = self.validated(losses, began)
-        self.history.append(record)
-        self.recorded(record)
-        if self.accelerator.is_main_process:
-            self._save()
-            write_log(self.out, self.history)
-        self.accelerator.wait_for_everyone()
 
     def _save(self) -> None:
         tensors: dict[str, Tensor] = {}

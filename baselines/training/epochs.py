@@ -44,7 +44,7 @@ def spread(pairs: int, drawn: int | None) -> list[int]:
 
 
 class BatchRead(Dataset[FringeDepth]):
-    """`FringeDepthDataset` read a batch at a time, as torch's loader asks when the dataset offers ``__getitems__``."""
+    """`FringeDepthDataset` read a batch at a time, as torch's loader asks of what offers ``__getitems__``."""
 
     def __init__(self, source: FringeDepthDataset) -> None:
         self.source = source

@@ -1,8 +1,5 @@
 """Recipes: a YAML file for each row of a table, with the differences from the recipe it extends (Sections 5.3-5.6).
-
-A recipe says what is trained and how; a preset (``cpu``, ``paper``) sets the image size and what depends on the
-machine. Resolved, the two are a `Recipe`: every number that the training depends on, with a digest.
-"""
+Resolved with a preset, which sets what depends on the machine, it is every number that a training depends on."""
 
 import hashlib
 import json
@@ -22,7 +19,6 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.optics import CONFIGS
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-_EXTENDS = "extends"
 _LONGEST_CHAIN = 8
 _NETWORK_TITLES = {
     "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
@@ -75,9 +71,8 @@ class Loss(StrictModel):
 class Recipe(StrictModel):
     """Everything that a training depends on.
 
-    ``size`` is the image's width and height in px. ``pairs_per_epoch`` pairs of frame and depth are drawn
-    for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``options`` go to
-    `networks.build`.
+    ``size``: the image's width and height in px. ``pairs_per_epoch`` are drawn for each epoch, ``validation_pairs``
+    evenly over the validation split; null takes all. ``options`` go to `networks.build`.
     """
 
     preset: Text
@@ -115,7 +110,7 @@ class Recipe(StrictModel):
 
     @property
     def data_config(self) -> str:
-        """Which frames are training pairs of their own: a name of `fpp_ml_bench.optics.sequence.CONFIGS`."""
+        """Which frames are training pairs of their own, one of `CONFIGS`."""
         return self.frames
 
     @property
@@ -135,7 +130,6 @@ class Recipe(StrictModel):
         return ", ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and mappings; `recipe_from_dict` is the way back."""
         return self.model_dump(mode="json")
 
     @property
@@ -152,13 +146,9 @@ def table_rows(table: str) -> tuple[str, ...]:
 
 
 def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
-    """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset.
-
-    The preset scales the shipped recipes; the entries of your own file are used unchanged.
-
-    Raises RecipeError for an unknown recipe, preset or key, an impossible value, or an endless chain of
-    ``extends``.
-    """
+    """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset, which scales
+    the shipped recipes alone. RecipeError for an unknown recipe, preset or key, an impossible value, or an endless
+    chain of ``extends``."""
     path = _recipe_path(name_or_path)
     shipped, own = _resolved(path, 0)
     content = _merge(shipped, own)
@@ -206,7 +196,7 @@ def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
     if depth > _LONGEST_CHAIN:
         raise RecipeError(f"{path}: more than {_LONGEST_CHAIN} recipes extend one another; does one extend itself?")
     content = _read(path)
-    parent = content.pop(_EXTENDS, None)
+    parent = content.pop("extends", None)
     is_users_own = not path.resolve().is_relative_to(RECIPES)
     if parent is None:
         return ({}, content) if is_users_own else (content, {})
@@ -219,10 +209,7 @@ def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> dict[str, Any]:
     """``above`` over ``below``; mappings key by key, but one with a ``name`` of its own, or ``options``, as a whole.
-
-    ``pick``: keys of nested mappings that ``below`` does not have are left out (a preset's entries for another kind of
-    schedule).
-    """
+    ``pick``: keys of nested mappings that ``below`` does not have (another kind of schedule) are left out."""
     merged = dict(below)
     for key, value in above.items():
         old = below.get(key)

@@ -32,26 +32,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    limit_threads(args.threads)
-    with as_asked(args):
-        return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.cli.console import progress_bar
 
-    opened = storage.DatasetFolder(args.dataset)
-    method = chosen_method(args, opened)
-    samples = len(opened.samples(args.split))
-    with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
-        finished = baselines.predict_split(opened, method, args.split, args.out, advance)
-    print(
-        f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-        f"{finished.seconds_per_sample:.3f} s a sample (median)"
-    )
-    how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
-    print(f"next: fpp-eval {args.out} {how} --json result.json")
-    explain(args, lambda: baselines.explain_predict(opened, method, args.split))
+    limit_threads(args.threads)
+    with as_asked(args):
+        opened = storage.DatasetFolder(args.dataset)
+        method = chosen_method(args, opened)
+        samples = len(opened.samples(args.split))
+        with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
+            finished = baselines.predict_split(opened, method, args.split, args.out, advance)
+        print(
+            f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+            f"{finished.seconds_per_sample:.3f} s a sample (median)"
+        )
+        how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
+        print(f"next: fpp-eval {args.out} {how} --json result.json")
+        explain(args, lambda: baselines.explain_predict(opened, method, args.split))
     return 0
 
 
