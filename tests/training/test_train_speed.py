@@ -8,7 +8,7 @@ import pytest
 import scipy.io
 from conftest import TINY_SIZE, tiny_settings
 
-from fpp_ml_bench.loaders.published import write_tree
+from fpp_ml_bench.loaders.published.exporting import write_tree
 from fpp_ml_bench.loaders.render import build
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
