@@ -137,9 +137,21 @@ class TracedObject:
 
     def blocked(self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the object lies between each origin and its target, both (n, 3) in camera coordinates; bool (n,)."""
-        blocked = np.zeros(len(origins_m), dtype=bool)
-        any_hit(*self._tree, origins_m, targets_m, blocked)
-        return blocked
+        return self.met(origins_m, targets_m, any_suffices=True)[1] >= 0
+
+    def met(
+        self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64], any_suffices: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Where the lines from origins to targets, both (n, 3), first meet the object: the share of the way, float64
+        (n,), and the triangle as a row of `tree_corners`, int32 (n,), -1 for none. `nearest_hit` says more."""
+        along, triangle = np.empty(len(origins_m)), np.empty(len(origins_m), dtype=np.int32)
+        nearest_hit(*self._tree, origins_m, targets_m, any_suffices, along, triangle)
+        return along, triangle
+
+    @property
+    def tree_corners(self) -> NDArray[np.float64]:
+        """Corners of the triangles, float64 (F, 3, 3), in the order of the box tree."""
+        return self._tree[0]
 
     @cached_property
     def _tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
@@ -287,11 +299,12 @@ def build_tree(corners, order, starts, boxes):  # type: ignore[no-untyped-def]
 
 
 @njit
-def any_hit(corners, starts, boxes, origins, targets, blocked):  # type: ignore[no-untyped-def]
-    """Whether a triangle lies between each origin and its target, both (n, 3); fills ``blocked`` bool (n,).
+def nearest_hit(corners, starts, boxes, origins, targets, any_suffices, along, triangle):  # type: ignore[no-untyped-def]
+    """The nearest triangle between each origin and its target, both (n, 3): fills ``triangle`` int32 (n,), -1 for none,
+    and ``along`` float64 (n,), its place as a share of the way, 1 for none. With ``any_suffices`` any triangle will do.
 
-    ``corners`` in the order of the tree (`build_tree`). The boxes only save work: they are wider than what they
-    hold, so the answer is that of all triangles.
+    ``corners`` in the order of the tree (`build_tree`), which ``triangle`` counts in. The boxes only save work: they
+    are wider than what they hold, so the answer is that of all triangles; of two at the same place the earlier one.
     """
     leaves = boxes.shape[0] // 2
     stack = np.empty(64, np.int64)
@@ -299,13 +312,13 @@ def any_hit(corners, starts, boxes, origins, targets, blocked):  # type: ignore[
         ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
         dx, dy, dz = targets[i, 0] - ox, targets[i, 1] - oy, targets[i, 2] - oz
         ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
-        blocked[i] = False
+        best, seen = 1.0, -1
         size = 1
         stack[0] = 1
-        while size > 0 and not blocked[i]:
+        while size > 0 and not (any_suffices and seen >= 0):
             size -= 1
             node = stack[size]
-            near, far = 0.0, 1.0
+            near, far = 0.0, best
             # NaN (0 times inf: the ray runs in the plane of a side) leaves both bounds as they are.
             s, t = (boxes[node, 0] - ox) * ix, (boxes[node, 3] - ox) * ix
             near, far = max(near, min(s, t)), min(far, max(s, t))
@@ -332,7 +345,7 @@ def any_hit(corners, starts, boxes, origins, targets, blocked):  # type: ignore[
                     continue
                 ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
                 nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-                along = (nx * ax + ny * ay + nz * az) / (nx * dx + ny * dy + nz * dz)
-                if 0.0 < along < 1.0:
-                    blocked[i] = True
-                    break
+                share = (nx * ax + ny * ay + nz * az) / (nx * dx + ny * dy + nz * dz)
+                if 0.0 < share < best or (share == best and seen > f):
+                    best, seen = share, f
+        along[i], triangle[i] = best, seen
