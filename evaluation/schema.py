@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer
 
-from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.errors import FppBenchError, SubmissionError
 from fpp_ml_bench.files import printable, text_problem
 
 MAX_PROBLEMS = 50
@@ -65,10 +65,12 @@ def problems_of(error: ValidationError) -> list[str]:
     return lines
 
 
-def validate(model: type[Model], value: Any, path: Path, kind: str) -> Model:
-    """``value`` as ``model``, or SubmissionError naming ``path`` and every key that is wrong."""
+def validate(
+    model: type[Model], value: Any, path: Path, kind: str, raised: type[FppBenchError] = SubmissionError
+) -> Model:
+    """``value`` as ``model``, or the error ``raised`` naming ``path`` and every key that is wrong."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
         lines = "\n  ".join(problems_of(error))
-        raise SubmissionError(f"{printable(str(path), 500)} is no valid {kind}:\n  {lines}") from None
+        raise raised(f"{printable(str(path), 500)} is no valid {kind}:\n  {lines}") from None

@@ -84,7 +84,20 @@ def power(base: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
     mantissa = np.where(low, 2.0 * mantissa, mantissa)
     s = (mantissa - 1.0) / (mantissa + 1.0)
     logarithm = s * _polynomial(s * s, _LOGARITHM) + (binary - low) * _LN2
-    scaled = exponent * logarithm
-    whole = np.rint(scaled / _LN2)
-    result = np.ldexp(_polynomial(scaled - whole * _LN2, _EXPONENTIAL), whole.astype(np.int32))
-    return np.where(base > 0.0, result, 0.0 if exponent > 0 else 1.0)
+    return np.where(base > 0.0, exponential(exponent * logarithm), 0.0 if exponent > 0 else 1.0)
+
+
+def exponential(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """e to the ``x``, float64 of the same shape, relative error below 1e-15 for x from -20 to 20."""
+    whole = np.rint(x / _LN2)
+    return np.ldexp(_polynomial(x - whole * _LN2, _EXPONENTIAL), whole.astype(np.int32))
+
+
+def gaussian_weights(variance: float, sigmas: float = 4.0) -> NDArray[np.float64]:
+    """A Gaussian of ``variance`` > 0 samples^2 at whole samples, up to ``sigmas``, summing to 1; float64 (2 r + 1,).
+    Below 0.4, where samples of a Gaussian have another variance, the three weights that have it."""
+    if variance < 0.4:
+        return np.array([variance / 2, 1.0 - variance, variance / 2])
+    reach = math.ceil(sigmas * math.sqrt(variance))
+    weights = exponential(np.arange(-reach, reach + 1.0) ** 2 / (-2.0 * variance))
+    return weights / math.fsum(weights)

@@ -13,6 +13,7 @@ The ``data`` group alone is the `single_shot` configuration, which plain ``datas
 """
 
 from dataclasses import dataclass, field
+from enum import IntFlag
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,26 @@ from fpp_ml_bench.optics import CONFIGS, Sequence
 
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")
-DEPTH, DEPTH_EXACT = "depth", "depth_exact"
+DEPTH, DEPTH_EXACT, FLAGS, COVER = "depth", "depth_exact", "flags", "cover"
 RANGE = ("depth_min", "depth_max")
 SINGLE_SHOT_FRAME = 0
+
+
+class Flag(IntFlag):
+    """What is special about a pixel of a generated view, bit by bit.
+
+    UNLIT: object that the camera sees and the projector does not light. MIXED: surfaces at different depths share the
+    pixel. Both are `VOID`: even without noise there is no depth to trust. SATURATED: white light exceeds the largest
+    grey level. INTERREFLECTION: further bounces bring a quarter or more of the projector's direct light.
+    """
+
+    UNLIT = 1
+    MIXED = 2
+    SATURATED = 4
+    INTERREFLECTION = 8
+
+
+VOID = Flag.UNLIT | Flag.MIXED
 
 
 @dataclass
@@ -41,6 +59,8 @@ class Row:
     depth_mm: NDArray[np.float32]
     depth_exact_mm: NDArray[np.float32] | None
     measured: dict[str, Any] = field(default_factory=dict)
+    flags: NDArray[np.uint8] | None = None
+    cover: NDArray[np.uint8] | None = None
 
 
 def stored_groups(sequence: Sequence, stored: str) -> dict[str, tuple[int, ...]]:

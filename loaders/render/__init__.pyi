@@ -2,13 +2,13 @@ from .builder import assembly_of as assembly_of
 from .builder import build as build
 from .builder import explain_build as explain_build
 from .builder import plan_build as plan_build
-from .illumination import Backdrop as Backdrop
 from .illumination import LitPixels as LitPixels
-from .illumination import background_plane as background_plane
-from .illumination import hit_points_m as hit_points_m
 from .illumination import light_surface as light_surface
-from .illumination import lit_object as lit_object
 from .illumination import projector_centre_m as projector_centre_m
+from .light import Light as Light
+from .light import load_light as load_light
+from .light import named_light as named_light
+from .lighting import Lighting as Lighting
 from .meshes import load_user_mesh as load_user_mesh
 from .meshes import read_mesh_list as read_mesh_list
 from .meshes import single_mesh as single_mesh
@@ -19,7 +19,6 @@ from .raycast import PixelRays as PixelRays
 from .raycast import TracedObject as TracedObject
 from .scene import PRESETS as PRESETS
 from .scene import BuildSettings as BuildSettings
-from .scene import Lighting as Lighting
 from .scene import SolidMesh as SolidMesh
 from .scene import UserMesh as UserMesh
 from .scene import modulation_at as modulation_at
@@ -27,5 +26,4 @@ from .scene import place as place
 from .scene import preset_settings as preset_settings
 from .scene import turned as turned
 from .sensor import Exposure as Exposure
-from .sensor import Noise as Noise
 from .view import Studio as Studio

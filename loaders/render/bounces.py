@@ -7,15 +7,73 @@ of the range, and rho the albedo. Surfaces are matte for this light. Between sur
 normal, as an irradiance cache does (Ward, Rubinstein and Clear 1988).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.loaders.render.illumination import projector_centre_m, shine
+from fpp_ml_bench.loaders.render.light import Light
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.loaders.render.scene import turned
 from fpp_ml_bench.loaders.render.surfels import RAYS, SurfelGrid, Surfels
 from fpp_ml_bench.machine import njit
+from fpp_ml_bench.optics import Rig
 
 SMALLEST = 2e-4
 """A bounce that adds less everywhere, a twentieth of a grey level, is the last."""
 MOST_BOUNCES = 64
+PLANE_CELLS, PLANE_POINTS = 24, 6
+"""Cells along the longer side of the plane's lit part, and points across a cell."""
+_TOGETHER = 64
+
+
+@dataclass(frozen=True)
+class PlaneLight:
+    """What the lit part of the background plane sends back in each frame: ``table`` float64 (Y, X, F), in cells of
+    ``cell_m`` from ``corner_m`` (x, y) on, at ``distance_m``; camera coordinates."""
+
+    table: NDArray[np.float64]
+    corner_m: NDArray[np.float64]
+    cell_m: float
+    distance_m: float
+
+    @classmethod
+    def of(cls, rig: Rig, light: Light, pattern: PatternLight) -> "PlaneLight":
+        """Of the plane square to the camera's axis, without an object before it."""
+        u, v = np.meshgrid([-0.5, rig.projector.width - 0.5], [-0.5, rig.projector.height - 0.5])
+        x, y = rig.projector.normalised(u.ravel(), v.ravel())
+        centre = projector_centre_m(rig)
+        way = np.column_stack([x, y, np.ones(4)])
+        way = way[:, :1] * rig.R[0] + way[:, 1:2] * rig.R[1] + way[:, 2:] * rig.R[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (rig.background_m - centre[2]) / way[:, 2]
+        across = centre[:2] + share[:, None] * way[:, :2]
+        frames = len(pattern.table)
+        if not (np.isfinite(across).all() and (share > 0).all()):  # a projector that looks past the plane
+            return cls(np.zeros((1, 1, frames)), np.zeros(2), 1.0, rig.background_m)
+        corner, extent = across.min(axis=0), np.ptp(across, axis=0)
+        cell = float(extent.max()) / PLANE_CELLS
+        columns, rows = (max(int(np.ceil(length / cell)), 1) for length in extent)
+        fine_x = corner[0] + (np.arange(columns * PLANE_POINTS) + 0.5) * (cell / PLANE_POINTS)
+        fine_y = corner[1] + (np.arange(rows * PLANE_POINTS) + 0.5) * (cell / PLANE_POINTS)
+        grid = np.stack(np.meshgrid(fine_x, fine_y), axis=-1).reshape(-1, 2)
+        points = np.column_stack([grid, np.full(len(grid), rig.background_m)])
+        arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
+        table = np.zeros((frames, len(points)))
+        pattern.read(arriving.place, arriving.irradiance, table)
+        cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
+        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * light.surface.albedo, corner, cell, rig.background_m)
+
+    def upon(self, surfels: Surfels, degrees: float, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""
+        arriving = np.zeros((len(surfels.grid.area_m2), self.table.shape[2]))
+        from_plane(
+            surfels.open_starts, np.ascontiguousarray(turned(surfels.open_directions, degrees)),
+            np.ascontiguousarray(turned(surfels.grid.position_m, degrees) + offset_m), self.distance_m, self.corner_m,
+            self.cell_m, self.table, arriving,
+        )  # fmt: skip
+        return arriving
 
 
 def between_surfels(
@@ -77,11 +135,11 @@ def from_plane(  # type: ignore[no-untyped-def]
 def at_points(
     grid: SurfelGrid, values: NDArray[np.float64], position_m: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Values of surfels (K, F) at surface points, float32 (n, F); 0 where no surfel is near.
+    """Values of surfels (K, F) at surface points, float32 (F, n); 0 where no surfel is near.
 
     ``position_m`` and unit ``normal`` float64 (n, 3), object coordinates.
     """
-    out = np.empty((len(position_m), values.shape[1]), dtype=np.float32)
+    out = np.empty((values.shape[1], len(position_m)), dtype=np.float32)
     interpolate(
         grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal, grid.area_m2, values, position_m, normal,
         out,
@@ -93,13 +151,13 @@ def at_points(
 def interpolate(  # type: ignore[no-untyped-def]
     corner, cell, table, position, normal, area, values, points, facing, out
 ):
-    """Weighted means of the surfels within a cell's width of each point: fills ``out`` (n, F).
+    """Weighted means of the surfels within a cell's width of each point: fills ``out`` (F, n).
 
     The weight is the surfel's area, times (1 - d^2)^2 at a distance of d cells, times the fourth power of the cosine
     between the normals: it fades to nothing, so the mean is continuous. Without a surfel in reach the nearest counts.
     """
     nearby, weights = np.empty(27 * 6, np.int64), np.empty(27 * 6)
-    sums = np.empty(values.shape[1])
+    sums = np.empty((_TOGETHER, values.shape[1]))
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = facing[i, 0], facing[i, 1], facing[i, 2]
@@ -129,10 +187,15 @@ def interpolate(  # type: ignore[no-untyped-def]
         if total <= 0.0:
             nearby[0], weights[0], total = nearest, 1.0, 1.0
             count = 1 if nearest >= 0 else 0
-        sums[:] = 0.0
+        row = sums[i % _TOGETHER]
+        row[:] = 0.0
         for entry in range(count):
             share, source = weights[entry] / total, values[nearby[entry]]
-            for f in range(sums.size):
-                sums[f] += share * source[f]
-        for f in range(sums.size):
-            out[i, f] = sums[f]
+            for f in range(row.size):
+                row[f] += share * source[f]
+        done = i % _TOGETHER + 1
+        if done == _TOGETHER or i + 1 == points.shape[0]:
+            first = i + 1 - done
+            for f in range(row.size):
+                for j in range(done):
+                    out[f, first + j] = sums[j, f]

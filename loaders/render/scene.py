@@ -1,11 +1,11 @@
-"""What a build is asked for, and where things stand: settings, light, and an object placed before the camera.
+"""What a build is asked for, and where things stand: settings, and an object placed before the camera.
 
 Two builds with equal settings give equal bytes. An object stands on its turning axis, at a fixed or a drawn distance.
 Object coordinates are metres with z up and the turning axis as z. Camera coordinates are the rig's: x right, y down,
 z forward. At angle 0 the object's +x axis points away from the camera (paper Section 3.1: R_z(60 degrees x i)).
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from difflib import get_close_matches
 from hashlib import blake2b
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, MM_PER_M, OBJECTS, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
+from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
@@ -52,8 +53,7 @@ class BuildSettings:
     placement: PlacementRule = "fixed"
     stored: str = "all"
     seed: int = 42
-    noise_sigma_grey: float = 1.0
-    shadows: bool = False
+    light: Light = field(default_factory=lambda: named_light("paper"))
     user_meshes: tuple[UserMesh, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -75,8 +75,6 @@ class BuildSettings:
             raise BuildError(f"placement {self.placement!r}: expected {' or '.join(PLACEMENTS)}")
         if self.stored not in CONFIGS:
             raise BuildError(f"frames {self.stored!r}: expected one of {', '.join(CONFIGS)}")
-        if not 0 <= self.noise_sigma_grey <= 50:
-            raise BuildError(f"noise of {self.noise_sigma_grey} grey levels: expected 0 to 50")
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
@@ -85,7 +83,7 @@ class BuildSettings:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
         return {
             "objects": list(self.objects), "placement": self.placement, "frames": self.stored, "seed": self.seed,
-            "noise_sigma_grey": self.noise_sigma_grey, "shadows": self.shadows,
+            "light": self.light.model_dump(mode="json"),
             "user_meshes": [
                 {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(mesh).items()
                  if key != "path"}
@@ -100,22 +98,10 @@ def preset_settings(preset: str, size: int | None = None) -> BuildSettings:
     return BuildSettings(rig=paper_rig(size or preset_size), objects=objects)
 
 
-@dataclass(frozen=True)
-class Lighting:
-    """Exposure and material. ``white_grey``: grey level of a white pattern on a surface that faces the projector at the
-    near end of the working range, so that nothing in range saturates; ``ambient_grey``: light besides the projector."""
-
-    white_grey: float = 225.0
-    ambient_grey: float = 6.0
-    specular: float = 0.15
-    roughness: float = 0.95
-    shadows: bool = False
-
-
-def modulation_at(rig: Rig, depth_mm: float, lighting: Lighting | None = None) -> float:
+def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:
     """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
     by the inverse square of the distance."""
-    white = (lighting or Lighting()).white_grey
+    white = (light or named_light("paper")).camera.reference_grey
     return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
 
 
@@ -126,6 +112,34 @@ class SolidMesh:
     name: str
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
+
+
+def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
+    """The rig that photographs where ``rig`` is its calibration: the projector turned and its principal point shifted,
+    so that points in the working range land ``calibration_px`` (RMS) beside where the calibration puts them."""
+    if calibration_px == 0:
+        return rig
+    draws = [2 * uniform(seed, "calibration", part) - 1 for part in ("x", "y", "z", "u", "v")]
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    x, y = (axis[::16, ::16].ravel() for axis in rig.camera.rays())
+    points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * depth for depth in (near_m, far_m)])
+    before = rig.project(points)
+    scale = 1.0 / rig.projector.fx
+    for _ in range(3):  # displacements are all but linear in the scale
+        turn = np.array(draws[:3]) * (scale / 2)
+        cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+        square = np.array([[sum(cross[i, k] * cross[k, j] for k in range(3)) for j in range(3)] for i in range(3)])
+        small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (cross + square)  # Cayley's formula
+        rotation = [[sum(small[i, k] * rig.R[k, j] for k in range(3)) for j in range(3)] for i in range(3)]
+        shift_m = [sum(small[i, k] * rig.t[k] for k in range(3)) for i in range(3)]
+        shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
+        projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
+        rows = tuple(tuple(float(value) for value in row) for row in rotation)
+        other = replace(rig, projector=projector, rotation=rows, translation_m=tuple(map(float, shift_m)))
+        u, v = other.project(points)
+        squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
+        scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))
+    return other
 
 
 def uniform(*name: object) -> float:
@@ -140,6 +154,13 @@ def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float6
     x = cosine * vertices_m[:, 0] - sine * vertices_m[:, 1]
     y = sine * vertices_m[:, 0] + cosine * vertices_m[:, 1]
     return np.column_stack([-y, -vertices_m[:, 2], x])
+
+
+def unturned(points_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """The inverse of `turned`: object coordinates of points (n, 3) about the turning axis along the camera's axes."""
+    cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
+    x, y = points_m[:, 2], -points_m[:, 0]
+    return np.column_stack([cosine * x + sine * y, cosine * y - sine * x, -points_m[:, 1]])
 
 
 def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[float, float]:

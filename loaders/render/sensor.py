@@ -1,8 +1,9 @@
-"""From lit pixels to the bytes of frames: pattern light, counter-based noise and 8-bit quantisation.
+"""From light to the bytes of frames: pattern light, bounces, electrons, counter-based noise, converter and response.
 
 The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit hash of the pixel number
 under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles, which is
 normal, reaches 5.2 sigma and has 16 million levels (docs/generating.md). So any subset of pixels can be exposed alone.
+Noise follows EMVA 1288: a variance of read noise, and one of shot noise that is the number of electrons.
 """
 
 from collections.abc import Sequence
@@ -16,8 +17,10 @@ from scipy.special import ndtri
 
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
-from fpp_ml_bench.machine import njit, numba_enabled
-from fpp_ml_bench.optics import Rig, pattern_profiles
+from fpp_ml_bench.loaders.render.light import CameraLight, Light
+from fpp_ml_bench.loaders.render.projector import PatternLight, fill_pattern, response_table
+from fpp_ml_bench.machine import njit
+from fpp_ml_bench.optics import Rig
 
 TABLE_BITS = 12
 _FLOAT = np.float32
@@ -34,10 +37,21 @@ class Noise:
     shot_per_grey: float
 
     @classmethod
-    def of_sigma(cls, sigma_grey: float) -> "Noise":
-        """Noise of standard deviation ``sigma_grey`` at mid-grey (127.5); half its variance is shot noise."""
-        variance = float(sigma_grey) ** 2
-        return cls(read_variance=variance / 2, shot_per_grey=variance / 2 / _MID_GREY)
+    def of_camera(cls, camera: CameraLight) -> "Noise":
+        """Noise of a camera with its full well at grey level 255; none without a full well."""
+        if camera.full_well_e is None:
+            return cls(0.0, 0.0)
+        electrons = camera.full_well_e / GREY_LEVELS
+        return cls(read_variance=(camera.read_noise_e / electrons) ** 2, shot_per_grey=1.0 / electrons)
+
+
+def camera_noise(sigma_grey: float) -> dict[str, float | None]:
+    """Full well and read noise of a camera with a noise of ``sigma_grey`` grey levels at mid-grey (127.5), half of its
+    variance shot noise; as values for `CameraLight`."""
+    if sigma_grey == 0:
+        return {"full_well_e": None, "read_noise_e": 0.0}
+    electrons = 2 * _MID_GREY / float(sigma_grey) ** 2
+    return {"full_well_e": electrons * GREY_LEVELS, "read_noise_e": float(sigma_grey) / np.sqrt(2) * electrons}
 
 
 @cache
@@ -76,110 +90,222 @@ def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDA
     return table[h & mask] + table[(h >> np.uint32(TABLE_BITS)) & mask]
 
 
-def quantise(
-    signal_grey: NDArray[np.float32], pixels: NDArray[np.uint32], keys: NDArray[np.uint32], noise: Noise
-) -> NDArray[np.uint8]:
-    """The sensor's grey levels: signal plus noise, rounded and clipped to 0..255; uint8 of the signal's shape."""
-    sigma = np.sqrt(_FLOAT(noise.read_variance) + _FLOAT(noise.shot_per_grey) * signal_grey)
-    value = signal_grey + sigma * standard_normal(pixels, keys) + _FLOAT(0.5)
-    return np.clip(value, _FLOAT(0), _FLOAT(255)).astype(np.uint8)
+
+@dataclass(frozen=True)
+class Sensor:
+    """What turns the light of a pixel into a byte: black level in grey levels, noise, and the 8-bit grey level of each
+    code of the converter, uint8 (2^bits,)."""
+
+    black_grey: float
+    noise: Noise
+    grey_of_code: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, camera: CameraLight) -> "Sensor":
+        codes = np.arange(1 << camera.bits)
+        if camera.response == 1.0:
+            grey = codes * (GREY_LEVELS / codes[-1])
+        else:
+            curve = response_table(camera.response)
+            grey = GREY_LEVELS * np.interp(codes / codes[-1], np.arange(GREY_LEVELS + 1) / GREY_LEVELS, curve)
+        return cls(camera.black_grey, Noise.of_camera(camera), np.rint(grey).astype(np.uint8))
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """What every frame of a dataset shares.
+    """What every frame of a dataset shares. ``flicker``: relative sigma of the lamp from frame to frame."""
 
-    ``light`` float32 (F, L + 1): pattern light in [0, 1] along the coordinate each frame varies with, the last entry
-    repeated; ``vertical`` bool (F,): whether that is the projector's u (else v; black and white vary with neither).
-    """
-
-    light: NDArray[np.float32]
-    vertical: NDArray[np.bool_]
-    noise: Noise
+    pattern: PatternLight
+    sensor: Sensor
+    flicker: float = 0.0
 
     @classmethod
-    def of(cls, rig: Rig, noise: Noise) -> "Exposure":
-        """Pattern light as the projector's 8-bit images give it."""
-        light = pattern_profiles(rig).astype(np.float32) / _FLOAT(GREY_LEVELS)
-        vertical = np.array([frame.direction == "vertical" for frame in rig.sequence])
-        return cls(np.pad(light, ((0, 0), (0, 1)), mode="edge"), vertical, noise)
+    def of(cls, rig: Rig, light: Light) -> "Exposure":
+        pattern = PatternLight.of(rig, light.projector, light.camera.rays_across > 1)
+        return cls(pattern, Sensor.of(light.camera), light.projector.flicker)
 
     def expose(
         self, frames: Sequence[int], lit: LitPixels, pixels: NDArray[np.uint32], stream: tuple[object, ...],
         out: NDArray[np.uint8] | None = None,
     ) -> NDArray[np.uint8]:  # fmt: skip
-        """Frames at flat image positions ``pixels`` uint32 (n,), which ``lit`` describes in that order.
+        """Frames at flat image positions ``pixels`` uint32 (n,), which ``lit`` describes in that order; where it has m
+        times as many points, a pixel is the mean of m in turn.
 
         ``stream`` names the view's noise, ``(seed, object, view)``. Returns uint8 (k, n), one row per entry of
         ``frames``, written into ``out`` if given.
         """
         result = np.empty((len(frames), pixels.size), dtype=np.uint8) if out is None else out
-        keys = np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
-        u, v = lit.lookup["vertical"], lit.lookup["horizontal"]
-        if numba_enabled():
-            expose_kernel(
-                result, np.array(frames, dtype=np.int64), self.light, self.vertical, u.index, u.weight, v.index,
-                v.weight, lit.gain, lit.ambient, pixels, normal_table(), keys, _FLOAT(self.noise.read_variance),
-                _FLOAT(self.noise.shot_per_grey),
-            )  # fmt: skip
-            return result
-        for row, index in enumerate(frames):
-            lookup, light = (u if self.vertical[index] else v), self.light[index]
-            low = light[lookup.index]
-            pattern = low + lookup.weight * (light[lookup.index + np.uint16(1)] - low)
-            result[row] = quantise(lit.ambient + lit.gain * pattern, pixels, keys[row], self.noise)
+        expose_kernel(result, *self._light(frames, lit, stream), pixels, *self._sensor(frames, stream))
         return result
+
+    def radiance(
+        self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...], out: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """The light of pixels in grey levels before the lens and the sensor: fills ``out`` float32 (k, n)."""
+        radiance_kernel(out, *self._light(frames, lit, stream))
+        return out
+
+    def sense(
+        self, frames: Sequence[int], radiance: NDArray[np.float32], pixels: NDArray[np.uint32],
+        stream: tuple[object, ...], out: NDArray[np.uint8],
+    ) -> NDArray[np.uint8]:  # fmt: skip
+        """The sensor's answer to ``radiance`` (k, n): fills ``out`` uint8 (k, n)."""
+        sense_kernel(out, radiance, pixels, *self._sensor(frames, stream))
+        return out
+
+    def _light(self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...]) -> tuple:
+        p = lit.place
+        lamp = np.ones(len(frames), dtype=np.float32)
+        if self.flicker:
+            keys = np.array([stream_keys(*stream, "lamp", index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+            lamp += np.float32(self.flicker) * np.array([standard_normal(np.zeros(1, np.uint32), k)[0] for k in keys])
+        bounced = np.empty((0, 0), dtype=np.float32) if lit.bounced is None else lit.bounced
+        return (
+            np.array(frames, dtype=np.int64), self.pattern.table, self.pattern.vertical, p.u_index, p.u_weight,
+            p.v_index, p.v_weight, p.level, p.level_weight, lit.gain, lit.ambient, bounced, lamp,
+        )  # fmt: skip
+
+    def _sensor(self, frames: Sequence[int], stream: tuple[object, ...]) -> tuple:
+        keys = np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+        noise, sensor = self.sensor.noise, self.sensor
+        plain = np.array_equal(sensor.grey_of_code, np.arange(GREY_LEVELS + 1))
+        return (
+            normal_table(), keys, _FLOAT(noise.read_variance), _FLOAT(noise.shot_per_grey), _FLOAT(sensor.black_grey),
+            np.empty(0, dtype=np.uint8) if plain else sensor.grey_of_code,
+        )  # fmt: skip
+
+
+@njit
+def fill_signal(  # type: ignore[no-untyped-def]
+    signal, row, frame, table, vertical, u_index, u_weight, v_index, v_weight, level, level_weight, gain, ambient,
+    bounced, lamp, start,
+):  # fmt: skip
+    """Light of the points from ``start`` on in one frame: fills ``signal`` float32 (n,)."""
+    stop = start + signal.size
+    # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
+    blur, share = level[start:stop], level_weight[start:stop]
+    if vertical[frame]:
+        fill_pattern(signal, table[frame], u_index[start:stop], u_weight[start:stop], blur, share)
+    else:
+        fill_pattern(signal, table[frame], v_index[start:stop], v_weight[start:stop], blur, share)
+    factor, offset, flash = gain[start:stop], ambient[start:stop], lamp[row]
+    for k in range(signal.size):
+        signal[k] = offset[k] + flash * factor[k] * signal[k]
+    if bounced.size > 0:
+        more = bounced[frame, start:stop]
+        for k in range(signal.size):
+            signal[k] += flash * more[k]
+
+
+@njit
+def average(signal, pixels, samples):  # type: ignore[no-untyped-def]
+    """Means of ``samples`` points in turn, in place, into the first ``pixels`` entries."""
+    if samples > 1:
+        share = np.float32(1.0 / samples)
+        for k in range(pixels):
+            total = np.float32(0)
+            for j in range(samples):
+                total += signal[k * samples + j]
+            signal[k] = total * share
+
+
+@njit
+def fill_bytes(  # type: ignore[no-untyped-def]
+    target, signal, numbers, hashes, normal, first, second, table, read_variance, shot_per_grey, black, grey_of_code
+):
+    """The sensor's answer to ``signal``: fills ``target`` uint8 (n,). ``numbers``: hashed pixel numbers uint32 (n,)."""
+    n = target.size
+    for k in range(n):
+        h = numbers[k] ^ first
+        h ^= h >> np.uint32(16)
+        h = np.uint32(h * np.uint32(0x7FEB352D))
+        h ^= h >> np.uint32(15)
+        h = np.uint32(h + second)
+        h = np.uint32(h * np.uint32(0x846CA68B))
+        h ^= h >> np.uint32(16)
+        hashes[k] = h
+    for k in range(n):
+        h = hashes[k]
+        normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
+    if grey_of_code.size == 0:
+        for k in range(n):
+            value = signal[k] + black + np.sqrt(read_variance + shot_per_grey * signal[k]) * normal[k] + np.float32(0.5)
+            value = min(max(value, np.float32(0)), np.float32(255))
+            target[k] = np.uint8(np.int32(value))
+    else:
+        most = grey_of_code.size - 1
+        scale = np.float32(most / 255.0)
+        for k in range(n):
+            value = signal[k] + black + np.sqrt(read_variance + shot_per_grey * signal[k]) * normal[k]
+            code = min(max(value * scale + np.float32(0.5), np.float32(0)), np.float32(most))
+            target[k] = grey_of_code[np.int32(code)]
 
 
 @njit
 def expose_kernel(  # type: ignore[no-untyped-def]
-    out, frames, light, vertical, u_index, u_weight, v_index, v_weight, gain, ambient, pixels, table, keys,
-    read_variance, shot_per_grey,
+    out, frames, light, vertical, u_index, u_weight, v_index, v_weight, level, level_weight, gain, ambient, bounced,
+    lamp, pixels, table, keys, read_variance, shot_per_grey, black, grey_of_code,
 ):  # fmt: skip
     """Expose ``frames`` (k,) at n pixels: row i of ``out`` uint8 (k, n) is frame ``frames[i]``.
 
-    ``light`` float32 (F, L + 1): pattern light along the coordinate in which it varies, u where ``vertical`` bool (F,)
-    is True, else v. Per pixel: indices and weights of the lookup, ``gain``, ``ambient``, pixel number ``pixels``
-    uint32. ``keys`` uint32 (k, 2): noise streams.
+    ``light`` (F, S, L + 1) and ``vertical`` as in `PatternLight`, then the places and brightnesses of the points
+    (`LitPixels`), ``lamp`` float32 (k,), pixel numbers uint32 (n,), and ``keys`` uint32 (k, 2) of the noise streams.
 
     Pixels are processed in chunks, with all frames for each chunk, so that values common to the frames (a pixel's place
     in the pattern, its brightness) are read from memory once. Each stage is a separate loop, because the compiler turns
     simple loops into vector instructions (2.5 times faster here than a single loop with all stages).
     """
-    numbers = np.empty(_CHUNK, np.uint32)
-    hashes = np.empty(_CHUNK, np.uint32)
-    normal = np.empty(_CHUNK, np.float32)
-    lit = np.empty(_CHUNK, np.float32)
-    for start in range(0, pixels.size, _CHUNK):
-        # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
-        stop = min(start + _CHUNK, pixels.size)
-        n = stop - start
-        u_low, u_share = u_index[start:stop], u_weight[start:stop]
-        v_low, v_share = v_index[start:stop], v_weight[start:stop]
-        factor, offset, number = gain[start:stop], ambient[start:stop], pixels[start:stop]
+    samples = gain.size // max(pixels.size, 1)
+    step = max(_CHUNK // max(samples, 1), 1)
+    numbers, hashes = np.empty(step, np.uint32), np.empty(step, np.uint32)
+    normal, signal = np.empty(step, np.float32), np.empty(step * max(samples, 1), np.float32)
+    for start in range(0, pixels.size, step):
+        n = min(start + step, pixels.size) - start
+        number = pixels[start : start + n]
         for k in range(n):
             numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
         for row in range(frames.size):
-            profile, target = light[frames[row]], out[row, start:stop]
-            first, second = keys[row, 0], keys[row, 1]
-            for k in range(n):
-                h = numbers[k] ^ first
-                h ^= h >> np.uint32(16)
-                h = np.uint32(h * np.uint32(0x7FEB352D))
-                h ^= h >> np.uint32(15)
-                h = np.uint32(h + second)
-                h = np.uint32(h * np.uint32(0x846CA68B))
-                h ^= h >> np.uint32(16)
-                hashes[k] = h
-            for k in range(n):
-                h = hashes[k]
-                normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
-            index, weight = (u_low, u_share) if vertical[frames[row]] else (v_low, v_share)
-            for k in range(n):
-                low = profile[index[k]]
-                lit[k] = low + weight[k] * (profile[index[k] + 1] - low)
-            for k in range(n):
-                signal = offset[k] + factor[k] * lit[k]
-                value = signal + np.sqrt(read_variance + shot_per_grey * signal) * normal[k] + np.float32(0.5)
-                value = min(max(value, np.float32(0)), np.float32(255))
-                target[k] = np.uint8(np.int32(value))
+            fill_signal(
+                signal[: n * samples], row, frames[row], light, vertical, u_index, u_weight, v_index, v_weight, level,
+                level_weight, gain, ambient, bounced, lamp, start * samples,
+            )  # fmt: skip
+            average(signal, n, samples)
+            fill_bytes(
+                out[row, start : start + n], signal[:n], numbers, hashes, normal, keys[row, 0], keys[row, 1], table,
+                read_variance, shot_per_grey, black, grey_of_code,
+            )  # fmt: skip
+
+
+@njit
+def radiance_kernel(  # type: ignore[no-untyped-def]
+    out, frames, light, vertical, u_index, u_weight, v_index, v_weight, level, level_weight, gain, ambient, bounced,
+    lamp,
+):  # fmt: skip
+    """The light of ``frames`` (k,) at n pixels: fills ``out`` float32 (k, n)."""
+    count = out.shape[1]
+    samples = gain.size // max(count, 1)
+    signal = np.empty(_CHUNK * max(samples, 1), np.float32)
+    for start in range(0, count, _CHUNK):
+        n = min(start + _CHUNK, count) - start
+        for row in range(frames.size):
+            fill_signal(
+                signal[: n * samples], row, frames[row], light, vertical, u_index, u_weight, v_index, v_weight, level,
+                level_weight, gain, ambient, bounced, lamp, start * samples,
+            )  # fmt: skip
+            average(signal, n, samples)
+            out[row, start : start + n] = signal[:n]
+
+
+@njit
+def sense_kernel(out, radiance, pixels, table, keys, read_variance, shot_per_grey, black, grey_of_code):  # type: ignore[no-untyped-def]
+    """The sensor's answer to ``radiance`` float32 (k, n) at n pixels: fills ``out`` uint8 (k, n)."""
+    numbers, hashes, normal = np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.float32)
+    for start in range(0, pixels.size, _CHUNK):
+        n = min(start + _CHUNK, pixels.size) - start
+        for k in range(n):
+            numbers[k] = np.uint32(pixels[start + k] * np.uint32(0x9E3779B1))
+        for row in range(out.shape[0]):
+            fill_bytes(
+                out[row, start : start + n], radiance[row, start : start + n], numbers, hashes, normal, keys[row, 0],
+                keys[row, 1], table, read_variance, shot_per_grey, black, grey_of_code,
+            )  # fmt: skip

@@ -198,11 +198,11 @@ def assign_hits(  # type: ignore[no-untyped-def]
         target[i] = -1
         if f < 0:
             continue
-        x, y, z = origin[i, 0] + along[i] * way[i, 0], origin[i, 1] + along[i] * way[i, 1], origin[i, 2] + along[i] * way[i, 2]
-        ux, uy, uz = corners[f, 1, 0] - corners[f, 0, 0], corners[f, 1, 1] - corners[f, 0, 1], corners[f, 1, 2] - corners[f, 0, 2]
-        vx, vy, vz = corners[f, 2, 0] - corners[f, 0, 0], corners[f, 2, 1] - corners[f, 0, 1], corners[f, 2, 2] - corners[f, 0, 2]
+        a, b, c, to = corners[f, 0], corners[f, 1], corners[f, 2], way[i]
+        x, y, z = origin[i, 0] + along[i] * to[0], origin[i, 1] + along[i] * to[1], origin[i, 2] + along[i] * to[2]
+        ux, uy, uz, vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        turn = -1.0 if nx * way[i, 0] + ny * way[i, 1] + nz * way[i, 2] > 0.0 else 1.0
+        turn = -1.0 if nx * to[0] + ny * to[1] + nz * to[2] > 0.0 else 1.0
         length = turn * np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / length, ny / length, nz / length
         cx, cy, cz = int((x - corner[0]) / cell), int((y - corner[1]) / cell), int((z - corner[2]) / cell)

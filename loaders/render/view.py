@@ -6,29 +6,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, sample_name
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, VIEW_DEGREES, VIEWS, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask, object_near_edge
-from fpp_ml_bench.loaders.render.illumination import Backdrop, LitPixels, lit_object
+from fpp_ml_bench.loaders.render.illumination import LitPixels
+from fpp_ml_bench.loaders.render.lighting import Lighting
+from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pixels, vignetting
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import BuildSettings, Lighting, SolidMesh, place
-from fpp_ml_bench.loaders.render.sensor import Exposure, Noise
-from fpp_ml_bench.loaders.sample import Row, stored_frames
+from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
+from fpp_ml_bench.loaders.render.sensor import Exposure
+from fpp_ml_bench.loaders.sample import Flag, Row, stored_frames
 from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
 INTERIOR_PX = 3
 """Ground-truth error is told apart at this distance from a depth edge: nearer, a pixel is a matter of definition."""
+STRONG_SHARE = 0.25
+"""Light of further bounces over direct light, under white, from which a pixel is flagged."""
 
 
 @dataclass(frozen=True)
 class TracedView:
-    """An object before the camera: what the rays meet, its light, and the name of the view's noise stream."""
+    """An object before the camera: what the rays meet, the light of the object's pixels and of the pixels that mix
+    surfaces (three arrays of `LitPixels` each as long as their rays), and the name of the view's noise stream."""
 
     traced: TracedObject
     distance_m: float
     hits: Hits
     lit: LitPixels
+    mixed: MixedPixels | None
+    mixed_lit: LitPixels | None
+    brightness: NDArray[np.float32] | np.float32
     stream: tuple[object, ...]
 
 
@@ -39,14 +48,17 @@ class Studio:
     """
 
     def __init__(self, settings: BuildSettings) -> None:
-        self.settings, rig = settings, settings.rig
-        self.lighting = Lighting(shadows=settings.shadows)
-        self.exposure = Exposure.of(rig, Noise.of_sigma(settings.noise_sigma_grey))
-        self.backdrop = Backdrop(rig, self.lighting)
-        self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
+        self.settings, self.light = settings, settings.light
+        self.rig = rig = photographing_rig(settings.rig, self.light.calibration_px, settings.seed)
+        self.exposure = Exposure.of(rig, self.light)
+        self.lighting = Lighting(rig, self.light, self.exposure.pattern)
+        camera = rig.camera
+        self._pixels = np.arange(camera.width * camera.height, dtype=np.uint32)
+        self._vignetting = vignetting(camera, self.light.camera.falloff) if self.light.camera.falloff else None
+        self._lens = gaussian_weights(self.light.camera.blur_px**2, 3.0).astype("f4") if self.light.camera.blur_px else None
         self.stored = stored_frames(rig.sequence, settings.stored)
         self.unstored = unstored_frames(rig.sequence, self.stored)
-        self._frames = np.zeros((len(rig.sequence), rig.camera.height, rig.camera.width), dtype=np.uint8)
+        self._frames = np.zeros((len(rig.sequence), camera.height, camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
         """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
@@ -56,40 +68,107 @@ class Studio:
         skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
         """
         scene = self.trace(mesh, view)
-        whole = self.light(scene)
-        self.expose(scene, whole)
+        shadow_rays = self.expose_view(mesh, view, scene)
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
-        measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": whole.shadow_rays}
-        measured |= ground_truth_error(depth_mm, exact_mm)
+        flags, cover = self.flags(scene)
+        measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": shadow_rays}
+        measured |= ground_truth_error(depth_mm, exact_mm, flags)
         frames = {index: self._frames[index] for index in self.stored}
-        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured)
+        return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured, flags, cover)
 
-    def trace(self, mesh: SolidMesh, view: str) -> TracedView:
-        """The object in its place, seen and lit."""
-        settings, rig = self.settings, self.settings.rig
-        vertices_m, distance_m = place(mesh, view, rig, settings.placement, settings.seed)
+    def trace(self, mesh: SolidMesh, view: str, moved_m: NDArray[np.float64] | None = None) -> TracedView:
+        """The object in its place, or ``moved_m`` (3,) from there, seen and lit."""
+        settings, rig, light = self.settings, self.rig, self.light
+        vertices_m, distance_m = place(mesh, view, settings.rig, settings.placement, settings.seed)
+        offset_m = np.array([0.0, 0.0, distance_m])
+        if moved_m is not None:
+            vertices_m, offset_m = vertices_m + moved_m, offset_m + moved_m
         traced = TracedObject(mesh, vertices_m)
         hits = traced.primary(PixelRays.of(rig.camera))
-        lit = lit_object(hits, rig, self.lighting, traced)
-        return TracedView(traced, distance_m, hits, lit, (settings.seed, mesh.name, view))
+        stream = (settings.seed, mesh.name, view)
+        object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
+        x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())
+        lit = object_light.at(np.column_stack([x, y, np.ones_like(x)]) * hits.depth_m[:, None], hits.normals)
+        mixed = mixed_lit = None
+        if light.camera.rays_across > 1:
+            mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across)
+            mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.on_object)
+        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self._brightness(stream), stream)
 
-    def light(self, scene: TracedView) -> LitPixels:
-        """Illumination of every pixel of the image: the object's, and the plane's behind it."""
-        return self.backdrop.behind(scene.traced, scene.hits.pixels).patched(scene.hits.pixels, scene.lit)
+    def _brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
+        """The view's exposure times the lens's vignetting, for every pixel or one for all."""
+        exposure = self.light.camera.exposure
+        if isinstance(exposure, tuple):
+            low, high = exposure
+            exposure = low / float(power(np.array([low / high]), uniform(*stream, "exposure"))[0])
+        return np.float32(exposure) if self._vignetting is None else self._vignetting * np.float32(exposure)
 
-    def expose(self, scene: TracedView, whole: LitPixels) -> None:
-        """Expose a view into the studio's frames; ``whole`` is the light of every pixel."""
-        pixels = scene.hits.pixels
-        images = self._frames.reshape(len(self._frames), -1)
-        everything = not skipping_enabled()
-        for run in _runs(tuple(range(len(images))) if everything else self.stored):
-            self.exposure.expose(run, whole, self._pixels, scene.stream, images[run.start : run.stop])
-        if self.unstored and not everything:
-            exposed = self.exposure.expose(self.unstored, scene.lit, pixels.astype(np.uint32), scene.stream)
-            for index, values in zip(self.unstored, exposed, strict=True):
+    def expose_view(self, mesh: SolidMesh, view: str, scene: TracedView) -> int:
+        """Expose a view into the studio's frames; returns how many shadow rays its background took."""
+        frames = tuple(range(len(self._frames))) if not skipping_enabled() else self.stored + self.unstored
+        if self.light.motion_mm == 0:
+            return self.expose(scene, frames)
+        height, turn = 2 * uniform(*scene.stream, "height") - 1, uniform(*scene.stream, "turn")
+        level = np.sqrt(1 - height * height)
+        step_m = np.array([level * cosine_of_turns(turn), height, level * sine_of_turns(turn)]) * self.light.motion_mm / MM_PER_M
+        return sum(self.expose(self.trace(mesh, view, step_m * frame), (frame,)) for frame in frames)
+
+    def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
+        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless the lens
+        blurs. Returns the shadow rays of the background."""
+        exposure, images = self.exposure, self._frames.reshape(len(self._frames), -1)
+        behind = self.lighting.behind(scene.traced, scene.hits.pixels)
+        parts = [(scene.hits.pixels, scene.lit)]
+        if scene.mixed is not None and scene.mixed_lit is not None:
+            parts.append((scene.mixed.pixels, scene.mixed_lit))
+        plain = np.ndim(scene.brightness) == 0 and scene.brightness == 1
+        if not plain:
+            behind = behind.brighter(scene.brightness)
+            parts = [(pixels, lit.brighter(self._of(scene.brightness, pixels, lit))) for pixels, lit in parts]
+        if self._lens is not None:
+            image, between = np.empty((2, *self._frames.shape[1:]), dtype=np.float32)
+            for frame in frames:
+                exposure.radiance((frame,), behind, scene.stream, image.reshape(1, -1))
+                for pixels, lit in parts:
+                    light = np.empty((1, pixels.size), dtype=np.float32)
+                    image.ravel()[pixels] = exposure.radiance((frame,), lit, scene.stream, light)[0]
+                blur_image(image, self._lens, between)
+                exposure.sense((frame,), image.reshape(1, -1), self._pixels, scene.stream, images[frame : frame + 1])
+            return behind.shadow_rays
+        whole = tuple(frame for frame in frames if frame not in self.unstored or not skipping_enabled())
+        for run in _runs(whole):
+            exposure.expose(run, behind, self._pixels, scene.stream, images[run.start : run.stop])
+        for pixels, lit in parts:
+            exposed = exposure.expose(frames, lit, pixels.astype(np.uint32), scene.stream)
+            for index, values in zip(frames, exposed, strict=True):
                 images[index, pixels] = values
+        return behind.shadow_rays
+
+    @staticmethod
+    def _of(
+        brightness: NDArray[np.float32] | np.float32, pixels: NDArray[np.int64], lit: LitPixels
+    ) -> NDArray[np.float32] | np.float32:
+        """Brightness at the rays of ``lit``, which has one or several for each of ``pixels``."""
+        if isinstance(brightness, np.ndarray) and brightness.ndim:
+            return np.repeat(brightness[pixels], lit.gain.size // max(pixels.size, 1))
+        return brightness
+
+    def flags(self, scene: TracedView) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """What is special about each pixel (`Flag`), and the share of it that the surface of its central ray covers,
+        in 255ths; uint8 (H, W) each."""
+        shape, pixels, lit = self._frames.shape[1:], scene.hits.pixels, scene.lit
+        flags, cover = np.zeros(self._pixels.size, dtype=np.uint8), np.full(self._pixels.size, 255, dtype=np.uint8)
+        flags[pixels[lit.gain == 0]] |= np.uint8(Flag.UNLIT)
+        bounced = np.zeros_like(lit.gain) if lit.bounced is None else lit.bounced[self.rig.sequence.white]
+        white = (lit.gain + lit.ambient + bounced) * self._of(scene.brightness, pixels, lit)
+        flags[pixels[white + self.light.camera.black_grey >= GREY_LEVELS]] |= np.uint8(Flag.SATURATED)
+        flags[pixels[(bounced > STRONG_SHARE * lit.gain) & (lit.gain > 0)]] |= np.uint8(Flag.INTERREFLECTION)
+        if scene.mixed is not None:
+            flags[scene.mixed.pixels[scene.mixed.void]] |= np.uint8(Flag.MIXED)
+            cover[scene.mixed.pixels] = np.rint(255 * scene.mixed.share).astype(np.uint8)
+        return flags.reshape(shape), cover.reshape(shape)
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
@@ -115,7 +194,9 @@ def _runs(indices: tuple[int, ...]) -> list[range]:
     return runs
 
 
-def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32]) -> dict[str, Any]:
+def ground_truth_error(
+    depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32], flags: NDArray[np.uint8]
+) -> dict[str, Any]:
     """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64.
 
     Over pixels that both have: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and the first two again

@@ -1,0 +1,126 @@
+"""The light of a scene: what the projector, its further bounces and other lamps give to the object and the plane."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels
+from fpp_ml_bench.loaders.render.illumination import (
+    LitPixels, Material, grey_of_white, light_surface, projector_centre_m, shine,
+)  # fmt: skip
+from fpp_ml_bench.loaders.render.light import Light
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.loaders.render.raycast import TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh, turned, unturned
+from fpp_ml_bench.loaders.render.surfels import Surfels
+from fpp_ml_bench.loaders.render.textures import material_of
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.skipping import skipping_enabled
+
+
+class Lighting:
+    """A light in a rig's empty scene, the background plane, ready for objects. The latest object's surfels are kept
+    for its other views."""
+
+    def __init__(self, rig: Rig, light: Light, pattern: PatternLight) -> None:
+        self.rig, self.light, self.pattern = rig, light, pattern
+        x, y = (rays.ravel() for rays in rig.camera.rays())
+        self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background_m
+        self._normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), self._points_m.shape)
+        self._empty = self._plane()
+        self._returned = PlaneLight.of(rig, light, pattern) if light.bounces.interreflection else None
+        self._surfels: tuple[SolidMesh, Surfels] | None = None
+
+    def _plane(self, occluder: TracedObject | None = None) -> LitPixels:
+        return light_surface(self._points_m, self._normals, self.rig, self.light, self.pattern, occluder=occluder)
+
+    def behind(self, traced: TracedObject, covered: NDArray[np.int64]) -> LitPixels:
+        """Light of the plane behind ``traced``, every pixel of the image. Without shadows it is the same for every view.
+
+        What lies at ``covered``, the flat pixels that see the object, is of no consequence: there it may differ with
+        skipping on and off. ``shadow_rays`` counts the rays that can meet the object, traced or not.
+        """
+        if not self.light.bounces.shadows:
+            return self._empty if skipping_enabled() else self._plane()
+        # Pixels of the plane that are lit, not hidden from the camera, and within the object's bounding box as the
+        # projector sees it.
+        centre_m = projector_centre_m(self.rig)
+        possible = self._empty.gain > 0
+        possible[covered] = False
+        possible &= traced.may_shadow(np.ascontiguousarray((self._points_m - centre_m).T), centre_m)
+        candidates = np.flatnonzero(possible)
+        if not skipping_enabled():
+            return replace(self._plane(traced), shadow_rays=candidates.size)
+        gain = self._empty.gain.copy()
+        gain[candidates[traced.shadowed(self._points_m[candidates], centre_m)]] = 0.0
+        return replace(self._empty, gain=gain, shadow_rays=candidates.size)
+
+    def upon(
+        self, mesh: SolidMesh, traced: TracedObject, degrees: float, offset_m: NDArray[np.float64]
+    ) -> "ObjectLight":
+        """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be ``traced``."""
+        surfels = bounced = None
+        if self.light.bounces.interreflection or self.light.bounces.ambient_occlusion:
+            if self._surfels is None or self._surfels[0] is not mesh:
+                self._surfels = mesh, Surfels.of(mesh)
+            surfels = self._surfels[1]
+        upon = ObjectLight(self, mesh, traced, degrees, offset_m, surfels, bounced)
+        return replace(upon, bounced=upon.between_surfels(self._returned)) if self._returned is not None else upon
+
+
+@dataclass(frozen=True)
+class ObjectLight:
+    """The light upon a placed object. ``bounced`` float64 (K, F): irradiance of its surfels by further bounces."""
+
+    lighting: Lighting
+    mesh: SolidMesh
+    traced: TracedObject
+    degrees: float
+    offset_m: NDArray[np.float64]
+    surfels: Surfels | None
+    bounced: NDArray[np.float64] | None
+
+    def at(
+        self, points_m: NDArray[np.float64], normals: NDArray[np.float64], on_object: NDArray[np.bool_] | None = None
+    ) -> LitPixels:
+        """Light of points (n, 3) with unit normals (n, 3), camera coordinates; those not ``on_object`` bool (n,) are on
+        the background plane."""
+        rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.pattern
+        own = np.arange(len(points_m)) if on_object is None else np.flatnonzero(on_object)
+        position, facing = unturned(points_m[own] - self.offset_m, self.degrees), unturned(normals[own], self.degrees)
+        material = material_of(self.mesh, position, facing, light.surface)
+        if len(own) < len(points_m):
+            albedo = np.full(len(points_m), light.surface.albedo)
+            gloss = np.full(len(points_m), light.surface.gloss)
+            albedo[own], gloss[own] = material.albedo, material.gloss
+            material = Material(albedo, gloss)
+        lit = light_surface(points_m, normals, rig, light, pattern, material, self.traced)
+        if self.surfels is None:
+            return lit
+        values = [self.surfels.open_share[:, None]] + ([] if self.bounced is None else [self.bounced])
+        arriving = at_points(self.surfels.grid, np.concatenate(values, axis=1), position, facing)
+        ambient, bounced = lit.ambient, None
+        if light.bounces.ambient_occlusion:
+            ambient = ambient.copy()
+            ambient[own] *= arriving[0]
+        if self.bounced is not None:
+            bounced = np.zeros((len(arriving) - 1, len(points_m)), dtype=np.float32)
+            bounced[:, own] = arriving[1:]
+            bounced *= np.asarray((1.0 - material.gloss) * material.albedo * grey_of_white(light), dtype=np.float32)
+        return replace(lit, ambient=ambient, bounced=bounced)
+
+    def between_surfels(self, plane: PlaneLight) -> NDArray[np.float64]:
+        """Irradiance of the surfels by further bounces in every frame, of light that ``plane`` sends back too; float64
+        (K, F)."""
+        assert self.surfels is not None
+        rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.pattern
+        points = self.surfels.points
+        placed = turned(points.position_m, self.degrees) + self.offset_m
+        arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)
+        direct = np.empty((len(pattern.table), len(placed)))
+        pattern.read(arriving.place, arriving.irradiance, direct)
+        material = material_of(self.mesh, points.position_m, points.normal, light.surface)
+        albedo = points.mean(np.broadcast_to((1.0 - material.gloss) * material.albedo, len(placed)))
+        outside = plane.upon(self.surfels, self.degrees, self.offset_m)
+        return between_surfels(self.surfels, points.mean(direct.T), outside, albedo)

@@ -1,0 +1,175 @@
+"""The projector: from 8-bit patterns to linear light at a distance, blurred by its pixels, its lens and its focus.
+
+Light is a fraction of the brightest pixel's. A pattern varies along one coordinate, so blur acts along it alone. Its
+variances add: of the transfer function in focus, of the camera pixel's footprint, and of the defocus, whose sigma grows
+with \\|1/z - 1/focus\\| as the blur circle of a thin lens does. A Gaussian of variance q px^2 takes exp(-2 pi^2 q / P^2)
+of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.loaders.render.light import ProjectorLight
+from fpp_ml_bench.machine import njit
+from fpp_ml_bench.optics import DIRECTIONS, Rig, pattern_profiles
+from fpp_ml_bench.portable import gaussian_weights, power
+
+FINE = 4
+"""Samples a projector pixel where blur depends on the distance; linear interpolation between them costs a sinusoid of
+18 px 0.06% of its modulation. Without such blur a sample a pixel, which is what the pixels say."""
+
+
+@dataclass(frozen=True)
+class PatternPlace:
+    """Where n surface points read `PatternLight`: of u and of v the sample, uint16 (n,), and the weight of the next
+    one, float32 (n,); for blur the ``level`` uint8 (n,) and the weight of the next one, empty where there is one level.
+    """
+
+    u_index: NDArray[np.uint16]
+    u_weight: NDArray[np.float32]
+    v_index: NDArray[np.uint16]
+    v_weight: NDArray[np.float32]
+    level: NDArray[np.uint8]
+    level_weight: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PatternLight:
+    """Linear light of every frame along the coordinate it varies with.
+
+    ``table`` float32 (F, S, L + 1) in [0, 1]: per frame and blur level, ``per_px`` samples a projector pixel, the last
+    one repeated. ``variance_px2`` float64 (S,), ascending: the blur of each level. ``vertical`` bool (F,): whether the
+    coordinate is the projector's u, else v; black and white vary with neither.
+    """
+
+    table: NDArray[np.float32]
+    vertical: NDArray[np.bool_]
+    variance_px2: NDArray[np.float64]
+    per_px: int
+
+    @classmethod
+    def of(cls, rig: Rig, light: ProjectorLight, pixel_area: bool = True) -> "PatternLight":
+        """The light of a rig's patterns; with ``pixel_area`` a camera pixel averages over what it sees at the standoff."""
+        still = light.pixel_blur_px**2
+        levels, per_px = np.array([0.0]), 1
+        if light.defocus_px > 0:
+            levels, per_px = _levels(defocus_variance_px2(rig, light, _distances(rig)).max()), FINE
+        response = response_table(light.response)
+        vertical = np.array([frame.direction == "vertical" for frame in rig.sequence])
+        length = max(rig.projector.width, rig.projector.height)
+        fine = np.arange((length - 1) * per_px + 1) / per_px
+        rows = []
+        footprint = {direction: rig.pitch(direction) / rig.image_px_per_period(direction) for direction in DIRECTIONS}
+        for frame, profile in zip(rig.sequence, pattern_profiles(rig), strict=True):
+            known = rig.pattern_length(frame.direction) if frame.direction else 1
+            linear = response[profile[:known]]
+            whole = np.interp(fine, np.arange(known), linear)
+            area = footprint[frame.direction] ** 2 / 12 if frame.direction and pixel_area else 0.0
+            rows.append([blurred(whole, (level + still + area) * per_px**2) for level in levels])
+        table = np.pad(np.array(rows, dtype=np.float32), ((0, 0), (0, 0), (0, 1)), mode="edge")
+        return cls(table, vertical, levels, per_px)
+
+
+    def place(
+        self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,
+        light: ProjectorLight,
+    ) -> PatternPlace:  # fmt: skip
+        """The place of projector pixels (n,) at a distance (n,) along the projector's axis; beyond the outer pixel
+        centres the outer pixel is read."""
+        level, level_weight = np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.float32)
+        if len(self.variance_px2) > 1:
+            variance = np.clip(np.nan_to_num(defocus_variance_px2(rig, light, distance_m)), 0, self.variance_px2[-1])
+            below = np.clip(np.searchsorted(self.variance_px2, variance, "right") - 1, 0, len(self.variance_px2) - 2)
+            step = self.variance_px2[below + 1] - self.variance_px2[below]
+            level, level_weight = below.astype(np.uint8), ((variance - self.variance_px2[below]) / step).astype("f4")
+        return PatternPlace(
+            *self._sample(u_px, rig.projector.width), *self._sample(v_px, rig.projector.height), level, level_weight
+        )
+
+    def read(self, place: PatternPlace, irradiance: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Irradiance in every frame at points whose irradiance under white is ``irradiance`` (n,): fills ``out``
+        float64 (F, n)."""
+        p = place
+        read_kernel(
+            out, irradiance, self.table, self.vertical, p.u_index, p.u_weight, p.v_index, p.v_weight, p.level,
+            p.level_weight,
+        )  # fmt: skip
+
+    def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
+        last = (length - 1.0) * self.per_px
+        inside = np.clip(np.nan_to_num(coordinate_px) * self.per_px, 0.0, last)
+        index = np.minimum(np.floor(inside), last - 1)
+        return index.astype(np.uint16), (inside - index).astype(np.float32)
+
+
+def response_table(response: float | tuple[float, ...]) -> NDArray[np.float64]:
+    """Linear light of each 8-bit pattern level, float64 (256,) in [0, 1]: a power of it, or a measured curve given at
+    evenly spaced levels from 0 to 255, interpolated."""
+    level = np.arange(GREY_LEVELS + 1) / GREY_LEVELS
+    if isinstance(response, tuple):
+        return np.interp(level, np.linspace(0.0, 1.0, len(response)), response)
+    return level if response == 1.0 else power(level, response)
+
+
+def defocus_variance_px2(rig: Rig, light: ProjectorLight, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Variance of the defocus in projector px^2 at distances (n,) from the projector, along its axis."""
+    far_m = rig.working_range_mm[1] / MM_PER_M
+    focus = 1.0 / light.focus_m
+    sigma = light.defocus_px * (1.0 / distance_m - focus) / (1.0 / far_m - focus)
+    return sigma * sigma
+
+
+def blurred(signal: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
+    """The signal (n,) convolved with a Gaussian of ``variance`` samples^2, its ends repeated; float64 (n,)."""
+    if variance == 0.0:
+        return signal
+    weights = gaussian_weights(variance)
+    reach = len(weights) // 2
+    padded = np.pad(signal, reach, mode="edge")
+    total = np.zeros_like(signal)
+    for shift, weight in enumerate(weights):  # in order, on every processor
+        total += weight * padded[shift : shift + len(signal)]
+    return total
+
+
+def _distances(rig: Rig) -> NDArray[np.float64]:
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    return np.array([near_m, far_m, rig.background_m])
+
+
+def _levels(most: float) -> NDArray[np.float64]:
+    """Variances from 0 to ``most`` px^2, so close that between them light is linear to 1e-4 at a pitch of 18 px."""
+    levels = [0.0, 1.0 / FINE**2]
+    while levels[-1] < most:
+        levels.append(levels[-1] * 1.06 + 0.4)
+    return np.array(levels)
+
+
+@njit
+def fill_pattern(light, profiles, index, weight, level, level_weight):  # type: ignore[no-untyped-def]
+    """Pattern light of n points in a frame: fills ``light`` (n,) from its ``profiles`` (S, L + 1)."""
+    if profiles.shape[0] == 1:
+        profile = profiles[0]
+        for k in range(light.size):
+            low = profile[index[k]]
+            light[k] = low + weight[k] * (profile[index[k] + 1] - low)
+    else:
+        for k in range(light.size):
+            sharp, soft, i = profiles[level[k]], profiles[level[k] + 1], index[k]
+            low = sharp[i] + level_weight[k] * (soft[i] - sharp[i])
+            high = sharp[i + 1] + level_weight[k] * (soft[i + 1] - sharp[i + 1])
+            light[k] = low + weight[k] * (high - low)
+
+
+@njit
+def read_kernel(  # type: ignore[no-untyped-def]
+    out, irradiance, table, vertical, u_index, u_weight, v_index, v_weight, level, level_weight
+):
+    for frame in range(table.shape[0]):
+        index, weight = (u_index, u_weight) if vertical[frame] else (v_index, v_weight)
+        fill_pattern(out[frame], table[frame], index, weight, level, level_weight)
+        for k in range(irradiance.size):
+            out[frame, k] *= irradiance[k]
