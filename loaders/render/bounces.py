@@ -62,8 +62,9 @@ class PlaneLight:
         arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
         table = np.zeros((frames, len(points)))
         pattern.read(arriving.place, arriving.irradiance, table)
+        albedo = (1.0 - light.surface.gloss) * light.surface.albedo
         cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
-        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * light.surface.albedo, corner, cell, rig.background_m)
+        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background_m)
 
     def upon(self, surfels: Surfels, degrees: float, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""

@@ -13,7 +13,7 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, PatternPlace
 from fpp_ml_bench.loaders.render.raycast import TracedObject
-from fpp_ml_bench.loaders.render.surface import facing_reflectance, reflectance
+from fpp_ml_bench.loaders.render.surface import reflectance
 from fpp_ml_bench.optics import Rig
 
 NEAREST_M = 1e-3
@@ -110,7 +110,7 @@ def light_surface(
 ) -> LitPixels:  # fmt: skip
     """Direct and ambient light of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera."""
     surface = light.surface
-    material = material or Material(surface.albedo, surface.gloss)
+    material = material or Material((1.0 - surface.gloss) * surface.albedo, 0.0)  # a matte wall
     arriving = shine(points_m, normals, rig, light, pattern, occluder)
     x, y, z = (np.ascontiguousarray(axis) for axis in points_m.T)
     nx, ny, nz = (np.ascontiguousarray(axis) for axis in normals.T)
@@ -129,9 +129,9 @@ def light_surface(
 
 
 def grey_of_white(light: Light) -> float:
-    """Grey level of a matte surface of albedo 1 that gets irradiance 1."""
-    surface = light.surface
-    return light.camera.reference_grey / facing_reflectance(surface.albedo, surface.gloss, surface.roughness)
+    """Grey level of a matte surface of albedo 1 that gets irradiance 1: the reference exposure is set on the matte part
+    of the material."""
+    return light.camera.reference_grey / ((1.0 - light.surface.gloss) * light.surface.albedo)
 
 
 def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:

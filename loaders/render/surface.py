@@ -36,8 +36,3 @@ def _unhidden(cosine: Values, squared: float) -> Values:
     tangent = (1.0 - cosine * cosine) / (cosine * cosine)
     return 2.0 / (1.0 + np.sqrt(1.0 + squared * tangent))
 
-
-def facing_reflectance(albedo: float, gloss: float, roughness: float) -> float:
-    """`reflectance` of a surface that faces both light and camera: what the reference exposure is set on."""
-    one = np.ones(1)
-    return float(reflectance(one, one, one, albedo, gloss, roughness)[0])
