@@ -116,7 +116,11 @@ _HEADER_PARTS = (6,), (5, 6), (1, 16)
 """Element types of a matrix's flags, dimensions and name."""
 _HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_CLASSES = (
+    "unknown", "cell", "struct", "object", "char", "sparse", "double", "single", "int8", "uint8", "int16", "uint16",
+    "int32", "uint32", "int64", "uint64",
+)  # fmt: skip
+_FIRST_NUMERIC = 6
 _COMPLEX = 0x0800
 _LARGEST_BYTES = 1 << 30
 _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
@@ -179,35 +183,48 @@ def _read_v5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
         kind, data, rest = _element(rest, order, padded=False)
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
-            unpacked = unpacker.decompress(data, largest_bytes)
+            unpacked = memoryview(unpacker.decompress(data, largest_bytes))
+            if unpacker.unconsumed_tail:
+                _, shape, name, _ = _matrix_header(unpacked[8:], order)
+                if name == variable:
+                    raise LayoutError(f"{variable}: {shape} is too large for a depth map")
+                names.append(name)
+                continue
             if not unpacker.eof:
                 raise LayoutError("a compressed variable is cut off or too large; the file is damaged")
-            kind, data, more = _element(memoryview(unpacked), order)
+            kind, data, more = _element(unpacked, order)
             if len(more):
                 raise LayoutError("a compressed variable holds more than its matrix; the file is damaged")
         if kind != _MATRIX:
             raise LayoutError(f"expected a matrix, got element type {kind}; the file is damaged")
-        parts = []
-        for expected in _HEADER_PARTS:
-            kind, part, data = _element(data, order)
-            if kind not in expected:
-                raise LayoutError(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
-            parts.append(part)
-        flags, dimensions, name = parts
-        if len(flags) != 8 or len(dimensions) % 4:
-            raise LayoutError("a matrix header has a wrong length; the file is damaged")
-        shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-        if any(length < 0 for length in shape):
-            raise LayoutError(f"a matrix has the shape {shape}; the file is damaged")
-        names.append(bytes(name).decode("latin-1") or "(unnamed)")
-        if bytes(name).decode("latin-1") == variable:
-            return _real_matrix(variable, struct.unpack(order + "II", flags)[0], shape, order, data)
+        flags, shape, name, data = _matrix_header(data, order)
+        if name == variable:
+            return _real_matrix(variable, flags, shape, order, data)
+        names.append(name or "(unnamed)")
     raise LayoutError(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
 
 
+def _matrix_header(content: memoryview, order: str) -> tuple[int, tuple[int, ...], str, memoryview]:
+    """Flags, shape and name of a matrix, and the content after them."""
+    parts = []
+    for expected in _HEADER_PARTS:
+        kind, part, content = _element(content, order)
+        if kind not in expected:
+            raise LayoutError(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
+        parts.append(part)
+    flags, dimensions, name = parts
+    if len(flags) != 8 or len(dimensions) % 4:
+        raise LayoutError("a matrix header has a wrong length; the file is damaged")
+    shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+    if any(length < 0 for length in shape):
+        raise LayoutError(f"a matrix has the shape {shape}; the file is damaged")
+    return struct.unpack(order + "II", flags)[0], shape, bytes(name).decode("latin-1"), content
+
+
 def _real_matrix(name: str, flags: int, shape: tuple[int, ...], order: str, content: memoryview) -> NDArray:
-    matrix_class = flags & 0xFF
-    if matrix_class not in _CLASSES or flags & _COMPLEX:
+    number = flags & 0xFF
+    matrix_class = _CLASSES[number if number < len(_CLASSES) else 0]
+    if number < _FIRST_NUMERIC or matrix_class == _CLASSES[0] or flags & _COMPLEX:
         note = ", complex" if flags & _COMPLEX else ""
         raise LayoutError(f"{name}: expected a real numeric matrix, got MATLAB class {matrix_class}{note}")
     if len(shape) != 2:
@@ -220,7 +237,7 @@ def _real_matrix(name: str, flags: int, shape: tuple[int, ...], order: str, cont
         raise LayoutError(f"{name}: {len(data)} bytes do not make {shape}; the file is damaged")
     # MATLAB stores whole numbers in the smallest type that fits; the matrix class gives their true type.
     values = np.frombuffer(data, stored).reshape(shape, order="F")
-    return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[matrix_class]))
+    return np.ascontiguousarray(values, dtype=np.dtype(matrix_class))
 
 
 def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int, memoryview, memoryview]:
