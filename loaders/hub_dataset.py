@@ -28,10 +28,8 @@ _IDENTITY, _FILES = "staged.sha256", "files"
 @contextmanager
 def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``, kept for the next run.
-
     ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are kept for the same identity and
-    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write.
-    """
+    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write."""
     if chosen is None:
         with tempfile.TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
             yield Path(folder)
@@ -98,10 +96,8 @@ def stage_dataset(
     row_done: Callable[[int], None] = lambda rows: None,
 ) -> Publication:  # fmt: skip
     """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
-
     Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
-    ``OSError`` when a file can't be written.
-    """
+    ``OSError`` when a file can't be written."""
     for name, shard in storage.data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)

@@ -71,11 +71,9 @@ def _base_style() -> str:
 
 
 def render(package: str, template: str, **values: object) -> str:
-    """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped.
-
-    A template may include or import those of this package's own ``templates`` too. Filters: ``printable``, and the
-    numbers of this module. Wrap only HTML that this package made in ``markupsafe.Markup``.
-    """
+    """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped. A template may include or
+    import those of this package's own ``templates`` too. Filters: ``printable``, and the numbers of this module. Wrap
+    only HTML that this package made in ``markupsafe.Markup``."""
     return _environment(package).get_template(template).render(values)
 
 

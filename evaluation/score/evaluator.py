@@ -152,10 +152,8 @@ def _checked_submission(
 
 
 def _scored(folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order.
-
-    Work begins with this call, in threads, before the first outcome is taken from the iterator.
-    """
+    """Problems and row of each sample that has a prediction, in order. Work begins with this call, in threads, before
+    the first outcome is taken from the iterator."""
     reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, rules.png_mm_per_level)
     dataset_lock = Lock()
 
@@ -190,10 +188,8 @@ _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
 
 def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> list[str]:
     """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
-
     Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
-    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute.
-    """
+    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute."""
     if scored.protocol_version != protocol.PROTOCOL_VERSION:
         raise SubmissionError(
             f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
@@ -244,9 +240,7 @@ def _value_text(value: object) -> str:
 
 def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
     """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
-
-    Reads the split's targets again.
-    """
+    Reads the split's targets again."""
     samples, (height, width) = dataset.samples(split), dataset.size
     boxes = {}
     for sample in samples:

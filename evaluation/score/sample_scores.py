@@ -80,9 +80,7 @@ def _stats_of_sums(
     pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]
 ) -> ErrorStats:
     """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the squares underflow.
-
-    Raises PredictionError where a sum is not finite.
-    """
+    Raises PredictionError where a sum is not finite."""
     if pixels == 0:
         return EMPTY
     try:
@@ -99,10 +97,8 @@ def _stats_of_sums(
 
 
 def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> ErrorStats:
-    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
-
-    Not overall minus object: that would leave rounding errors where the background is perfect.
-    """
+    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0. Not
+    overall minus object: that would leave rounding errors where the background is perfect."""
     pixels = prediction.size - index.size
     if pixels == 0:
         return EMPTY
@@ -149,10 +145,8 @@ def _zones(bits: int, value: int) -> property:
 @dataclass(frozen=True, slots=True)
 class SampleScores:
     """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
-
     A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones.
-    """
+    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones."""
 
     background: ErrorStats
     zones: dict[int, ErrorStats]
@@ -248,10 +242,8 @@ def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float
 
 
 def _quantiles(values: Errors, *levels: float) -> list[float]:
-    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``.
-
-    One partition per quantile: NumPy's partition is vectorised for a single position, not for several.
-    """
+    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``. One partition per quantile:
+    NumPy's partition is vectorised for a single position, not for several."""
     quantiles, first = [], 0
     for level in levels:
         position = level * (values.size - 1)

@@ -111,11 +111,9 @@ _ENCRYPTED = 0x1
 
 
 def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
-    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`.
-
-    The array may have any name. The size that the archive declares is checked before a byte is unpacked, and unpacking
-    stops at the limit even where the archive declares a wrong size.
-    """
+    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`. The array may have
+    any name. The size that the archive declares is checked before a byte is unpacked, and unpacking stops at the limit
+    even where the archive declares a wrong size."""
     largest = _largest_npy(size)
     content = read_bounded(path, largest + _ARCHIVE_BYTES)
     try:
@@ -160,11 +158,9 @@ _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
 def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> tuple[NDArray[Any], str]:
-    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`.
-
-    The header, every checksum and the unpacked length are checked before the image is decoded. A level of 65535 is
-    refused: there a depth that does not fit was cut off.
-    """
+    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`. The header, every checksum
+    and the unpacked length are checked before the image is decoded. A level of 65535 is refused: there a depth that
+    does not fit was cut off."""
     if mm_per_level is None:
         raise PredictionError("has no scale: give png_mm_per_level, the mm of one level, in submission.yaml")
     content = read_bounded(path, size[0] * size[1] * 2 + _PNG_SPARE_BYTES)

@@ -38,10 +38,8 @@ def write_tree(
     dataset: DatasetFolder, folder: Path, splits: list[str], threads: int, row_done: Callable[[], None] = lambda: None
 ) -> None:
     """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all frames are stored.
-
     ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
-    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
-    """
+    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written."""
     samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
         for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
@@ -94,11 +92,9 @@ def _write(path: Path, content: bytes) -> None:
 
 @contextmanager
 def exporting(out: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails.
-
-    Remains of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being
-    written by another process, or the disk can't be written.
-    """
+    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails. Remains
+    of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being written
+    by another process, or the disk can't be written."""
     target = out.resolve()
     if target.exists() and not target.is_dir():
         raise BuildError(f"{out}: is a file; give a new folder")
@@ -136,10 +132,8 @@ def export(
     progress: Callable[[int], None] = lambda rows: None,
 ) -> None:  # fmt: skip
     """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
-
     ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
-    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks.
-    """
+    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks."""
     if not forms or not set(forms) <= set(FORMS):
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:

@@ -52,11 +52,9 @@ def _header(start: bytes, path: Path) -> tuple[tuple[int, int], int]:
 
 
 def read_grey_png(path: Path) -> NDArray[np.uint8]:
-    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal.
-
-    Raises `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour
-    type, or its channels differ.
-    """
+    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal. Raises
+    `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour type, or
+    its channels differ."""
     content = _content(path)
     size, colour = _header(content, path)
     try:
@@ -82,10 +80,8 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
 
 
 def png_chunks(content: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Kind and data of a PNG's chunks up to its end, the signature not looked at, each with a right checksum.
-
-    Raises `LayoutError` that says, without a subject, what is wrong: "is cut off".
-    """
+    """Kind and data of a PNG's chunks up to its end, the signature not looked at, each with a right checksum. Raises
+    `LayoutError` that says, without a subject, what is wrong: "is cut off"."""
     view, position = memoryview(content), len(_SIGNATURE)
     kind = b""
     while position < len(view) and kind != b"IEND":
@@ -128,10 +124,8 @@ _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
 
 def read_matrix(path: Path, variable: str) -> NDArray:
     """Variable ``variable`` of a v5 or v7.3 file as in MATLAB: a real numeric matrix (rows, columns) of any dtype.
-
     Raises `LayoutError` naming the file when it can't be read, lacks the variable (the message lists its variables), or
-    the variable is not a real numeric matrix.
-    """
+    the variable is not a real numeric matrix."""
     try:
         return parse_matrix(path.read_bytes(), variable)
     except OSError as error:
@@ -141,10 +135,8 @@ def read_matrix(path: Path, variable: str) -> NDArray:
 
 
 def parse_matrix(content: bytes, variable: str, largest_bytes: int = _LARGEST_BYTES) -> NDArray:
-    """`read_matrix` on the content of a file; its `LayoutError` names no file.
-
-    No variable is unpacked to more than ``largest_bytes``, and other files that ``content`` refers to are not read.
-    """
+    """`read_matrix` on the content of a file; its `LayoutError` names no file. No variable is unpacked to more than
+    ``largest_bytes``, and other files that ``content`` refers to are not read."""
     if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
         return _read_hdf5(content, variable, largest_bytes)
     try:

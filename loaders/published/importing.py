@@ -239,12 +239,9 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
 
 
 def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned import into ``folder``, or resume an interrupted import.
-
-    Contents are checked as they are read. When a file is wrong, all others are checked too, so that the `LayoutError`
-    lists every wrong file. Raises `BuildError` as a build does, and when the tree changed after ``folder`` was
-    finished.
-    """
+    """Write the planned import into ``folder``, or resume an interrupted import. Contents are checked as they are read.
+    When a file is wrong, all others are checked too, so that the `LayoutError` lists every wrong file. Raises
+    `BuildError` as a build does, and when the tree changed after ``folder`` was finished."""
     _refuse_changed(folder, plan.tree)
     _drop_stale_receipts(folder, plan)
     try:
@@ -315,10 +312,8 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
 
 
 def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
-    """A file of the sample that changed after the file ``moment`` was written, or None.
-
-    Unlike the modification time alone, copying or setting times can't reset what is compared here.
-    """
+    """A file of the sample that changed after the file ``moment`` was written, or None. Unlike the modification time
+    alone, copying or setting times can't reset what is compared here."""
     written = moment.stat().st_mtime_ns
     for path in sample.files:
         status = path.stat()

@@ -46,12 +46,9 @@ _LEAST_EDGES_A_LINE = 0.5
 
 @dataclass(frozen=True)
 class FrameOrder:
-    """Which frame of the sequence each file of a raw scan is.
-
-    ``layout`` is a key of `LAYOUTS`; black and white come last. ``white_first``: white before black.
-    ``backward_steps``: the phase shifts are -2 pi n / N, so that file n is step (N - n) mod N.
-    ``least_bit_first``: Gray code from the least significant bit.
-    """
+    """Which frame of the sequence each file of a raw scan is. ``layout`` is a key of `LAYOUTS`; black and white come
+    last. ``white_first``: white before black. ``backward_steps``: the phase shifts are -2 pi n / N, so that file n is
+    step (N - n) mod N. ``least_bit_first``: Gray code from the least significant bit."""
 
     layout: str = "paper"
     white_first: bool = False
@@ -79,10 +76,8 @@ class FrameOrder:
 
 
 def parse_order(name: str) -> FrameOrder | None:
-    """The order called ``name``, e.g. ``paper`` or ``vertical-first+white-first``; None for ``auto``.
-
-    Raises `LayoutError` for an unknown name.
-    """
+    """The order called ``name``, e.g. ``paper`` or ``vertical-first+white-first``; None for ``auto``. Raises
+    `LayoutError` for an unknown name."""
     if name == AUTO:
         return None
     layout, *modifiers = name.split("+")

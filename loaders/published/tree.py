@@ -123,9 +123,7 @@ def _entries(folder: Path) -> list[Path]:
 
 def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
-
-    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself.
-    """
+    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
     training, scans_folder = _locate(root)
     scan = _Scan(training)
     variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())

@@ -34,11 +34,9 @@ def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
 
 
 def load_user_mesh(description: UserMesh) -> SolidMesh:
-    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted.
-
-    Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or
-    triangles between vertices that are not there.
-    """
+    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Raises
+    `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or triangles
+    between vertices that are not there."""
     mesh = _read_mesh(Path(description.path))
     vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
     for axis, degrees in enumerate(description.rotation_deg):

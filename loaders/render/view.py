@@ -33,10 +33,8 @@ class TracedView:
 
 
 class Studio:
-    """A rig with its light and background, ready to photograph objects.
-
-    One view's frames are held, and overwritten by the next.
-    """
+    """A rig with its light and background, ready to photograph objects. One view's frames are held, and overwritten by
+    the next."""
 
     def __init__(self, settings: BuildSettings) -> None:
         self.settings, rig = settings, settings.rig

@@ -47,11 +47,9 @@ class OtherFile:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything a reader must know before it opens a shard.
-
-    ``samples`` holds, per split, one mapping per row in row order: sample, object, view and what the builder measured
-    of it (cover, distance, ground-truth error). ``stored`` is the configuration whose frames are on disk.
-    """
+    """Everything a reader must know before it opens a shard. ``samples`` holds, per split, one mapping per row in row
+    order: sample, object, view and what the builder measured of it (cover, distance, ground-truth error). ``stored`` is
+    the configuration whose frames are on disk."""
 
     origin: str
     generator: dict[str, str]

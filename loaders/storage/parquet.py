@@ -81,11 +81,8 @@ def write_parquet(
     dataset: DatasetFolder, folder: Path, splits: list[str], threads: int = 1,
     rows_done: Callable[[int], None] = lambda rows: None,
 ) -> None:  # fmt: skip
-    """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it.
-
-    Raises ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in
-    memory.
-    """
+    """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it. Raises
+    ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in memory."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
     files = [(folder / name, shard) for name, shard in data_shards(dataset).items() if shard.split in splits]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
@@ -114,10 +111,8 @@ def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_don
 def write_shard(
     dataset: DatasetFolder, shard: ShardFile, path: Path, threads: int, row_done: Callable[[int], None]
 ) -> None:
-    """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all.
-
-    Raises `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write.
-    """
+    """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all. Raises
+    `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write."""
     parts = _parts(dataset, shard)
     for part in parts:
         if file_hash(dataset.path / part.path) != part.xxh3_128:
@@ -226,9 +221,7 @@ def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
 
 def preview(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Picture of a depth map float32 (H, W) in mm: uint8, at most `PREVIEW_PX` a side; nearest white, background black.
-
-    Scaled to the object's own range, so it is for looking only.
-    """
+    Scaled to the object's own range, so it is for looking only."""
     step = -(-max(depth_mm.shape) // PREVIEW_PX)
     small = depth_mm[::step, ::step].astype(np.float64)
     inside = object_mask(small)

@@ -39,11 +39,9 @@ ALL_SPLITS = "all"
 
 
 class DatasetFolder:
-    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
-
-    Images are read-only memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker
-    processes map the files themselves.
-    """
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder. Images are read-only
+    memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker processes map the
+    files themselves."""
 
     def __init__(self, path: str | Path, check: bool = True) -> None:
         """With ``check`` off, the folder opens even if some of its files are missing or cut."""
@@ -142,12 +140,9 @@ class DatasetFolder:
         return self._image(sample, DATA_GROUP, column)
 
     def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
-
-        The object is the same set of pixels for either column, the pixels with a decoded ``depth``: a surface that the
-        projector does not reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same
-        pixels.
-        """
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background. The object is the same
+        set of pixels for either column, the pixels with a decoded ``depth``: a surface that the projector does not
+        reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same pixels."""
         depth_mm = self.depth_mm(sample)
         if column == DEPTH:
             return depth_mm
@@ -168,10 +163,8 @@ class DatasetFolder:
         return [self.frame(sample, index) for index in indices]
 
     def release(self, sample: str) -> None:
-        """Release the memory of a sample's images that were read. Views of them stay valid.
-
-        Called after each sample of a split, it keeps the memory from growing with the number of samples.
-        """
+        """Release the memory of a sample's images that were read. Views of them stay valid. Called after each sample of
+        a split, it keeps the memory from growing with the number of samples."""
         split, row = self._find(sample)
         for shard in self.manifest.shards:
             mapped_file = self._maps.get(shard.path)
@@ -252,10 +245,8 @@ def _madvise() -> Any:
 
 def release_pages(view: NDArray[Any], address: int, size: int) -> None:
     """Release the pages of ``view``, a contiguous array in a READ-ONLY FILE map, and the pages mapped with them.
-
     ``address`` and ``size`` (bytes) are those of the whole map. No page outside is touched: on memory that is not
-    backed by a file, the same call would erase the data. Does nothing on other systems than Linux.
-    """
+    backed by a file, the same call would erase the data. Does nothing on other systems than Linux."""
     madvise = _madvise()
     start = view.ctypes.data
     stop = start + view.nbytes
