@@ -126,10 +126,9 @@ def read_matrix(path: Path, variable: str) -> NDArray:
     """Variable ``variable`` of a v5 or v7.3 file as in MATLAB: a real numeric matrix (rows, columns) of any dtype.
     Raises `LayoutError` naming the file when it can't be read, lacks the variable (the message lists its variables), or
     the variable is not a real numeric matrix."""
+    content = _content(path)
     try:
-        return parse_matrix(path.read_bytes(), variable)
-    except OSError as error:
-        raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
+        return parse_matrix(content, variable)
     except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
 

@@ -7,6 +7,7 @@ Only directory entries and PNG headers are read here; contents are checked when 
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
@@ -87,8 +88,9 @@ class PublishedTree:
     has_frames: bool
     ignored: tuple[str, ...]
 
-    def all_samples(self) -> list[PublishedSample]:
-        return [sample for samples in self.samples.values() for sample in samples]
+    @cached_property
+    def by_name(self) -> dict[str, PublishedSample]:
+        return {sample.sample: sample for samples in self.samples.values() for sample in samples}
 
 
 def _locate(root: Path) -> tuple[Path, Path | None]:

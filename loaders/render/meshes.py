@@ -15,7 +15,7 @@ import yaml
 
 from fpp_ml_bench.constants import OBJECTS, SPLITS
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import file_hash
+from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
@@ -83,9 +83,7 @@ def write_ply(mesh: SolidMesh, path: Path) -> None:
     """Write a mesh as binary PLY in metres, object coordinates."""
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
-    temporary.replace(path)
+    write_atomically(path, trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
 
 
 def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
