@@ -76,17 +76,8 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
         "task_categories": ["depth-estimation"],
         "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
-        "configs": [
-            {
-                "config_name": config,
-                **({"default": True} if config == dataset.configs[0] else {}),
-                "version": storage.data_version(dataset.fingerprint),
-                # Files by name, not by pattern: a stray file can never join the data.
-                "data_files": [{"split": split, "path": list(paths)} for split, paths in files.items()],
-                "columns": storage.columns(dataset, config),
-            }
-            for config in dataset.configs
-        ],
+        # Files by name, not by pattern: a stray file can never join the data.
+        "configs": storage.card_configs(dataset, dataset.fingerprint, files, preview=True),
     }
     return f"---\n{yaml_text(head)}---\n"
 

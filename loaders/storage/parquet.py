@@ -9,7 +9,7 @@ of a file is in memory at a time.
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
@@ -63,6 +63,20 @@ def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
     names = _all_columns(dataset) if config is None else config_columns(dataset.sequence, config, dataset.has_exact)
     place = names.index(DEPTH)
     return [*names[:place], PREVIEW, *names[place:]]
+
+
+def card_configs(dataset: DatasetFolder, identity: str, files: Mapping[str, object], preview: bool) -> list[Any]:
+    """The configurations as a card lists them; ``files`` are a pattern or names for each split."""
+    return [
+        {
+            "config_name": config,
+            **({"default": True} if config == dataset.configs[0] else {}),
+            "version": data_version(identity),
+            "data_files": [{"split": split, "path": paths} for split, paths in files.items()],
+            "columns": [name for name in columns(dataset, config) if preview or name != PREVIEW],
+        }
+        for config in dataset.configs
+    ]
 
 
 def _all_columns(dataset: DatasetFolder) -> list[str]:
@@ -236,16 +250,7 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     manifest = dataset.manifest
     # Exports of the same dataset with different splits must not share a cache entry.
     identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
-    configs = [
-        {
-            "config_name": config,
-            **({"default": True} if config == dataset.configs[0] else {}),
-            "version": data_version(identity),
-            "data_files": [{"split": split, "path": f"data/{split}-*.parquet"} for split in splits],
-            "columns": config_columns(dataset.sequence, config, dataset.has_exact),
-        }
-        for config in dataset.configs
-    ]
+    configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
     return CARD_HEAD + _CARD.format(
         configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(), origin=manifest.origin,
         rows=sum(len(dataset.samples(split)) for split in splits), height=dataset.size[0], width=dataset.size[1],
