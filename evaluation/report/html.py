@@ -1,8 +1,6 @@
-"""Writing HTML pages in which text from a submission stays text, and which load nothing; how numbers are written.
-
-A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
-the given hashes: the page sends no request, and an injected script can't run.
-"""
+"""Writing HTML pages in which text from a submission stays text, and which load nothing; how numbers are written. A
+page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with the
+given hashes: the page sends no request, and an injected script can't run."""
 
 import hashlib
 import html

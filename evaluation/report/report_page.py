@@ -53,14 +53,10 @@ _TITLES = {
 
 
 def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str | Path, out: str | Path) -> Path:
-    """Write ``out/index.html`` for a result and the predictions it was made from, and return its path.
-
-    The page is self-contained and loads nothing. Pixels of at most five samples are read, so memory does not grow with
-    the number of samples.
-
-    Raises DatasetError when ``dataset`` is not the dataset that was scored, PredictionError for a prediction that can't
-    be read any more, and SubmissionError where the page can't be written.
-    """
+    """Write ``out/index.html`` for a result and the predictions it was made from, and return its path. The page is
+    self-contained and loads nothing. Pixels of at most five samples are read, so memory does not grow with the number
+    of samples. Raises DatasetError when ``dataset`` is not the dataset that was scored, PredictionError for a
+    prediction that can't be read any more, and SubmissionError where the page can't be written."""
     errors = [row.object_mae_mm for row in result.per_sample if row.object_mae_mm is not None]
     body = render(
         __package__,

@@ -1,8 +1,6 @@
-"""``result.json``: the scores of a submission on a split, as a strict model that checks itself.
-
-A result that was edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample
-scores whenever a file is read, and overall is checked against object and background in every sample.
-"""
+"""``result.json``: the scores of a submission on a split, as a strict model that checks itself. A result that was
+edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample scores whenever a
+file is read, and overall is checked against object and background in every sample."""
 
 import math
 import statistics

@@ -75,8 +75,7 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and subtracting
     1.7 m. Only for normalised values.
 
-    Raises DatasetError where the target has no range to normalise by.
-    """
+    Raises DatasetError where the target has no range to normalise by."""
     if units == "mm":
         return values, target_mm
     if units == "m":

@@ -118,23 +118,20 @@ def reader_for(
 
         maps = depth_maps(folder / form, samples, size)
         return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
-    memory = local()
-    read = _mat_reader(size) if form == ".mat" else {
+    memory, largest_mat = local(), size[0] * size[1] * 8 + _MAT_SPARE_BYTES
+    if form == ".mat":
+        from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
+
+        matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest_mat)
+
+    def read_mat(path: Path) -> MapAndHash:
+        content = read_bounded(path, largest_mat)
+        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
+
+    read = {
         ".npy": lambda path: read_npy(path, size, memory),
         ".npz": lambda path: read_npz(path, size),
         ".png": lambda path: read_png(path, size, png_mm_per_level),
-    }[form]  # fmt: skip
+        ".mat": read_mat,
+    }[form]
     return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
-
-
-def _mat_reader(size: tuple[int, int]) -> Callable[[Path], MapAndHash]:
-    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
-
-    largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
-    matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest)
-
-    def read_mat(path: Path) -> MapAndHash:
-        content = read_bounded(path, largest)
-        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
-
-    return read_mat

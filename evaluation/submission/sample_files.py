@@ -28,12 +28,10 @@ _Layout = tuple[np.dtype[Any], bool, int]
 
 
 def read_npy(path: Path, size: tuple[int, int], memory: local) -> tuple[NDArray[Any], str]:
-    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored.
-
-    ``size`` is the expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until
-    its next read. Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a
-    real float dtype.
-    """
+    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored. ``size`` is the
+    expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until its next read.
+    Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a real float
+    dtype."""
     if not hasattr(memory, "buffer"):
         memory.buffer = bytearray(_largest_npy(size))
     view = memoryview(memory.buffer)

@@ -1,8 +1,6 @@
 """Exporting a dataset: as Parquet, as the published tree (PNG fringes, .mat depth, raw scans), its meshes and patterns.
-
 In the tree, depth in mm is written as float32, the same bits as in the dataset. The normalised representations are
-written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm.
-"""
+written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm."""
 
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
-"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build.
-
-`SampleReader` reads a sample, fringe, depth in mm and raw frames, with every check on their contents.
-"""
+"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build. `SampleReader`
+reads a sample, fringe, depth in mm and raw frames, with every check on their contents."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -191,12 +189,10 @@ class ImportPlan(NamedTuple):
 
 
 def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
-    """Scan the tree at ``root`` and determine how it is read.
-
-    ``rig``: the rig that took the images; None assumes the paper's rig, scaled to the image size. ``frame_order``: see
-    `FrameOrder`; ``auto`` determines it from the first sample's images, and checks all others against it. Raises
-    `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size.
-    """
+    """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
+    paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
+    sample's images, and checks all others against it. Raises `LayoutError` listing all files that break the layout,
+    `RigError` for a rig of another image size."""
     order = parse_order(frame_order)
     tree = published_tree.scan_tree(root, len((rig or paper_rig()).sequence))
     rig_used = _rig_for(tree, rig)

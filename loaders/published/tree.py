@@ -1,8 +1,6 @@
 """The published tree: its names, and a scan that lists its samples and every error in the layout that names alone show.
-
 Only directory entries and PNG headers are read here; contents are checked when a sample is read
-(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored.
-"""
+(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored."""
 
 from collections import Counter
 from collections.abc import Collection

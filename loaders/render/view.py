@@ -14,7 +14,6 @@ from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, Lighting, SolidMesh, place
 from fpp_ml_bench.loaders.render.sensor import Exposure, Noise
 from fpp_ml_bench.loaders.sample import Row, stored_frames
-from fpp_ml_bench.optics import Sequence
 from fpp_ml_bench.skipping import skipping_enabled
 
 INTERIOR_PX = 3
@@ -43,16 +42,16 @@ class Studio:
         self.backdrop = Backdrop(rig, self.lighting)
         self._pixels = np.arange(rig.camera.width * rig.camera.height, dtype=np.uint32)
         self.stored = stored_frames(rig.sequence, settings.stored)
-        self.unstored = unstored_frames(rig.sequence, self.stored)
+        # Frames that the ground truth is decoded from and that are not stored: all others but black and white.
+        unneeded = {*self.stored, rig.sequence.black, rig.sequence.white}
+        self.unstored = tuple(i for i in range(len(rig.sequence)) if i not in unneeded)
         self._frames = np.zeros((len(rig.sequence), rig.camera.height, rig.camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
-        """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
-
-        Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
-        pixels alone, and decoded there alone: the bytes there, and so the decoded depth, are the same either way. With
-        skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
-        """
+        """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites. Frames that are
+        stored are exposed whole. Those that only the ground truth needs are exposed at the object's pixels alone, and
+        decoded there alone: the bytes there, and so the decoded depth, are the same either way. With skipping off
+        (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole."""
         scene = self.trace(mesh, view)
         whole = self.light(scene)
         self.expose(scene, whole)
@@ -97,11 +96,6 @@ class Studio:
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
 
 
-def unstored_frames(sequence: Sequence, stored: tuple[int, ...]) -> tuple[int, ...]:
-    """Frames that the ground truth is decoded from and that are not ``stored``: all others but black and white."""
-    return tuple(i for i in range(len(sequence)) if i not in stored and i not in (sequence.black, sequence.white))
-
-
 def _runs(indices: tuple[int, ...]) -> list[range]:
     """Ascending indices as runs of neighbours."""
     runs: list[range] = []
@@ -114,12 +108,10 @@ def _runs(indices: tuple[int, ...]) -> list[range]:
 
 
 def ground_truth_error(depth_mm: NDArray[np.float32], exact_mm: NDArray[np.float32]) -> dict[str, Any]:
-    """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64.
-
-    Over pixels that both have: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and the first two again
-    for pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object pixels without a
-    decoded depth: they are background in ``depth``.
-    """
+    """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64. Over
+    pixels that both have: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and the first two again for
+    pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object pixels without a decoded
+    depth: they are background in ``depth``."""
     seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
     both = seen & decoded
     error = depth_mm[both].astype(np.float64) - exact_mm[both]

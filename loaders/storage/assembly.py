@@ -1,8 +1,6 @@
 """From planned shards to a finished folder: skip finished shards, write the rest, then card, rig and manifest.
-
 Generated and imported datasets are written alike; only the source of their rows differs. Each finished shard leaves a
-receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states.
-"""
+receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states."""
 
 import json
 import os

@@ -1,8 +1,6 @@
 """What describes a dataset: the files by which Hugging Face tools open its folder, the rig file, and its statistics.
-
 ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
-``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place.
-"""
+``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place."""
 
 import json
 from pathlib import Path

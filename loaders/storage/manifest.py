@@ -1,8 +1,6 @@
-"""``manifest.json``: what a finished dataset folder holds, with a checksum for every file.
-
-It is written last, so a folder without one is a build that was interrupted. It holds nothing that differs between two
-builds of the same settings: no date, no path, no machine.
-"""
+"""``manifest.json``: what a finished dataset folder holds, with a checksum for every file. It is written last, so a
+folder without one is a build that was interrupted. It holds nothing that differs between two builds of the same
+settings: no date, no path, no machine."""
 
 import json
 from dataclasses import asdict, dataclass, field

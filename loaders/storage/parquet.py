@@ -155,7 +155,12 @@ def write_shard(
     def groups(pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
         for first in range(0, len(samples), rows):
             group = samples[first : first + rows]
-            encoded = {name: _encoded(dataset, group, schema.field(name), pool) for name in pictures}
+            encoded = {}
+            for name in pictures:
+                index = None if name == PREVIEW else int(name.removeprefix("frame_"))
+                contents = pool.map(lambda sample, index=index: _png(dataset, sample, index), group)
+                cells = [{"bytes": content, "path": None} for content in contents]
+                encoded[name] = pa.array(cells, schema.field(name).type)
             plain = {name: column.slice(first, len(group)) for name, column in stored.items()}
             yield pa.Table.from_arrays([(plain | encoded)[name] for name in names], schema=schema)
 
@@ -214,12 +219,6 @@ def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]
     fields = [pa.field(name, image) if name in pictures else schema.field(name) for name in names]
     content = {"info": {"features": {name: described[name] for name in names}}}
     return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
-
-
-def _encoded(dataset: DatasetFolder, samples: list[str], field: pa.Field, pool: ThreadPoolExecutor) -> pa.Array:
-    index = None if field.name == PREVIEW else int(field.name.removeprefix("frame_"))
-    encoded = pool.map(lambda sample: _png(dataset, sample, index), samples)
-    return pa.array([{"bytes": content, "path": None} for content in encoded], field.type)
 
 
 def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
