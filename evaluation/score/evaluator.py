@@ -67,7 +67,7 @@ def evaluate(
     description = None
     if content is not None:
         try:
-            description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
+            description = _checked(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
             description_error = error
         result.environment  # noqa: B018  imported while the threads score
@@ -118,9 +118,7 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     return samples
 
 
-def _checked_submission(
-    folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str
-) -> submission.Submission:
+def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> submission.Submission:
     """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
     description = submission.check_submission(folder, content)
     outside = [index for index in description.frames_used if index >= frames]

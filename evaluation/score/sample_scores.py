@@ -66,7 +66,7 @@ def stats_of(errors: Errors) -> ErrorStats:
     blocks = [errors[start : start + BLOCK] for start in range(0, errors.size, BLOCK)]
     squares = [float(block.dot(block)) for block in blocks]
     absolute = [float(np.abs(block).sum()) for block in blocks]
-    return _stats_of_sums(errors.size, absolute, squares, lambda: errors)
+    return _from_sums(errors.size, absolute, squares, lambda: errors)
 
 
 def mean_of(errors: Errors) -> float | None:
@@ -76,9 +76,7 @@ def mean_of(errors: Errors) -> float | None:
     return math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK)) / errors.size
 
 
-def _stats_of_sums(
-    pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]
-) -> ErrorStats:
+def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]) -> ErrorStats:
     """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the squares underflow.
     Raises PredictionError where a sum is not finite."""
     if pixels == 0:
@@ -127,7 +125,7 @@ def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> 
         outside = ~object_mask(target)
         return prediction[outside].astype(np.float64) - target[outside]
 
-    return _stats_of_sums(pixels, absolute, squares, errors_outside)
+    return _from_sums(pixels, absolute, squares, errors_outside)
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
@@ -187,7 +185,7 @@ def _share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: `_stats_of_sums` refuses it
+@np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
 def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BAND_PX) -> SampleScores:
     """Score one depth map against its target.
 

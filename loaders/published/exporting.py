@@ -57,12 +57,10 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
         if name != "raw":
             represented = normalise(depth_mm.astype(np.float64), name, low_mm, high_mm, out=np.empty(depth_mm.shape))
         depth = matrix_bytes({variable: represented})
-        for variant, image in (
-            (tree.VARIANT_FOLDERS[name], fringe),
-            (tree.BACKGROUND_REMOVED_FOLDERS[name], background_removed),
-        ):
-            _write(training / variant / published_split / tree.FRINGE / f"{sample}.png", image)
-            _write(training / variant / published_split / tree.DEPTH / f"{sample}.mat", depth)
+        for variants, image in ((tree.VARIANT_FOLDERS, fringe), (tree.BACKGROUND_REMOVED_FOLDERS, background_removed)):
+            part = training / variants[name] / published_split
+            _write(part / tree.FRINGE / f"{sample}.png", image)
+            _write(part / tree.DEPTH / f"{sample}.mat", depth)
     limits = matrix_bytes(dict(zip(tree.INFO_VARIABLES, (low_mm, high_mm), strict=True)))
     _write(training / tree.INFO / published_split / tree.DEPTH / f"{sample}.mat", limits)
     if "all" in dataset.configs:
@@ -77,10 +75,9 @@ def _write_scan(dataset: DatasetFolder, sample: str, folder: Path) -> None:
         _write(folder / tree.frame_file(index), png_bytes(image))
     measured = decode_stack(frames, dataset.rig, _PHASE_DIRECTION, details=True).details[_PHASE_DIRECTION]
     absolute_rad = measured.coordinate_px * (2 * np.pi / dataset.rig.pitch(_PHASE_DIRECTION))
-    _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: measured.phase.astype(np.float32)}))
-    _write(
-        folder / tree.UNWRAPPED_PHASE, matrix_bytes({tree.UNWRAPPED_PHASE_VARIABLE: absolute_rad.astype(np.float32)})
-    )
+    wrapped, unwrapped = measured.phase.astype(np.float32), absolute_rad.astype(np.float32)
+    _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: wrapped}))
+    _write(folder / tree.UNWRAPPED_PHASE, matrix_bytes({tree.UNWRAPPED_PHASE_VARIABLE: unwrapped}))
 
 
 def _write(path: Path, content: bytes) -> None:

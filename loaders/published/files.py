@@ -19,7 +19,7 @@ from fpp_ml_bench.errors import LayoutError
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB = 0, 2
-_COLOURS = {_GREY: "grey", _RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
+_KINDS = {_GREY: "grey", _RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
 _HEADER_BYTES = 33
 COMPRESSION_LEVEL = 1  # twice as fast as 3 on noisy fringes, and 6% larger (measured)
 
@@ -45,9 +45,7 @@ def _header(start: bytes, path: Path) -> tuple[tuple[int, int], int]:
     if bits != 8:
         raise LayoutError(f"{path}: expected an 8-bit PNG, got {bits} bits per channel; convert it to 8 bits")
     if colour not in (_GREY, _RGB):
-        raise LayoutError(
-            f"{path}: expected a grey PNG, or RGB with equal channels, got {_COLOURS.get(colour, colour)}"
-        )
+        raise LayoutError(f"{path}: expected a grey PNG, or RGB with equal channels, got {_KINDS.get(colour, colour)}")
     return (height, width), colour
 
 
@@ -70,7 +68,7 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     channels = (3,) if colour == _RGB else ()
     if image is None or image.dtype != np.uint8 or image.shape != (*size, *channels):
-        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_COLOURS[colour]} PNG")
+        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_KINDS[colour]} PNG")
     if not channels:
         return np.asarray(image, dtype=np.uint8)
     blue, green, red = image[..., 0], image[..., 1], image[..., 2]
@@ -235,18 +233,16 @@ def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int,
     """First data element: its type, its bytes, and the content after it. Elements in a matrix are padded to 8 bytes."""
     if len(content) < 8:
         raise LayoutError("a data element is cut off; the file is damaged")
-    kind, length = struct.unpack(order + "II", content[:8])
+    kind, size = struct.unpack(order + "II", content[:8])
     if kind >> 16:  # up to four bytes, packed into the tag itself
-        kind, length = kind & 0xFFFF, kind >> 16
-        if length > 4:
+        kind, size = kind & 0xFFFF, kind >> 16
+        if size > 4:
             raise LayoutError("a small data element is too long; the file is damaged")
-        return kind, content[4 : 4 + length], content[8:]
-    if length > len(content) - 8:
-        raise LayoutError(
-            f"a data element of {length} bytes has only {len(content) - 8}; the file is cut off or damaged"
-        )
-    stop = 8 + (length + 7 & ~7 if padded else length)
-    return kind, content[8 : 8 + length], content[stop:]
+        return kind, content[4 : 4 + size], content[8:]
+    if size > len(content) - 8:
+        raise LayoutError(f"a data element of {size} bytes has only {len(content) - 8}; the file is cut off or damaged")
+    stop = 8 + (size + 7 & ~7 if padded else size)
+    return kind, content[8 : 8 + size], content[stop:]
 
 
 def _read_hdf5(content: bytes, variable: str, largest_bytes: int) -> NDArray:

@@ -122,9 +122,7 @@ def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_don
     _write_groups(path, schema, settings, groups, rows_done)
 
 
-def write_shard(
-    dataset: DatasetFolder, shard: ShardFile, path: Path, threads: int, row_done: Callable[[int], None]
-) -> None:
+def write_shard(dataset: DatasetFolder, shard: ShardFile, out: Path, threads: int, done: Callable[[int], None]) -> None:
     """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all. Raises
     `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write."""
     parts = _parts(dataset, shard)
@@ -164,14 +162,14 @@ def write_shard(
             plain = {name: column.slice(first, len(group)) for name, column in stored.items()}
             yield pa.Table.from_arrays([(plain | encoded)[name] for name in names], schema=schema)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         with ThreadPoolExecutor(threads) as pool:
-            _write_groups(temporary, schema, settings, groups(pool), row_done)
+            _write_groups(temporary, schema, settings, groups(pool), done)
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        temporary.replace(path)
+        temporary.replace(out)
     finally:
         temporary.unlink(missing_ok=True)
         for part in parts:

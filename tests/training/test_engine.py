@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe,
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.evaluation.result import mean_over_samples
+from fpp_ml_bench.evaluation.result import over_samples
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 
@@ -110,7 +110,7 @@ def validation_of(weights, dataset, recipe):
             prediction = denormalise(values, recipe.normalisation, low, high)
         rows.append(score_sample(prediction, target).metrics())
         losses.append(math.sqrt(float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8))
-    return np.mean(losses), mean_over_samples(rows)
+    return np.mean(losses), over_samples(rows)
 
 
 SCORES = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
