@@ -8,7 +8,7 @@ sinusoids. The check uses a few image rows and columns and takes a few ms per fo
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations, compress, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,31 +49,28 @@ _LEAST_EDGES_A_LINE = 0.5
 @dataclass(frozen=True)
 class FrameOrder:
     """Which frame of the sequence each file of a raw scan is. ``layout`` is a key of `LAYOUTS`; black and white come
-    last. ``white_first``: white before black. ``backward_steps``: the phase shifts are -2 pi n / N, so that file n is
-    step (N - n) mod N. ``least_bit_first``: Gray code from the least significant bit."""
+    last. Of `MODIFIERS`, ``white-first``: white before black. ``backward-steps``: the phase shifts are -2 pi n / N, so
+    that file n is step (N - n) mod N. ``least-bit-first``: Gray code from the least significant bit."""
 
     layout: str = "paper"
-    white_first: bool = False
-    backward_steps: bool = False
-    least_bit_first: bool = False
+    modifiers: frozenset[str] = frozenset()
 
     @property
     def name(self) -> str:
-        chosen = zip(MODIFIERS, (self.white_first, self.backward_steps, self.least_bit_first), strict=True)
-        return "+".join([self.layout, *(name for name, used in chosen if used)])
+        return "+".join([self.layout, *(name for name in MODIFIERS if name in self.modifiers)])
 
     def frames(self, sequence: Sequence) -> tuple[Frame, ...]:
         """The frames in file order."""
         frames: list[Frame] = []
         for kind, direction in LAYOUTS[self.layout]:
             indices = list(sequence.sinusoids(direction) if kind == "sinusoid" else sequence.gray(direction))
-            if kind == "sinusoid" and self.backward_steps:
+            if kind == "sinusoid" and BACKWARD_STEPS in self.modifiers:
                 indices = [indices[-n % len(indices)] for n in range(len(indices))]
-            if kind == "gray" and self.least_bit_first:
+            if kind == "gray" and LEAST_BIT_FIRST in self.modifiers:
                 indices.reverse()
             frames += [sequence.frames[i] for i in indices]
         ends = [sequence.black, sequence.white]
-        frames += [sequence.frames[i] for i in (reversed(ends) if self.white_first else ends)]
+        frames += [sequence.frames[i] for i in (reversed(ends) if WHITE_FIRST in self.modifiers else ends)]
         return tuple(frames)
 
 
@@ -88,13 +85,13 @@ def parse_order(name: str) -> FrameOrder | None:
             f"frame order {name!r}: expected {AUTO}, or one of {', '.join(LAYOUTS)}, followed by any of "
             + ", ".join(f"+{modifier}" for modifier in MODIFIERS)
         )
-    return FrameOrder(layout, *(modifier in modifiers for modifier in MODIFIERS))
+    return FrameOrder(layout, frozenset(modifiers))
 
 
 def all_orders() -> Iterator[FrameOrder]:
     """All named orders, the paper's first."""
-    for *modifiers, layout in product((False, True), (False, True), (False, True), LAYOUTS):
-        yield FrameOrder(layout, *modifiers)
+    for *used, layout in product((False, True), (False, True), (False, True), LAYOUTS):
+        yield FrameOrder(layout, frozenset(compress(MODIFIERS, used)))
 
 
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
