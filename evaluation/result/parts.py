@@ -92,9 +92,6 @@ class Intervals(StrictModel):
     background_mae_mm: Interval
     background_rmse_mm: Interval
 
-    def __getitem__(self, key: str) -> list[float | None]:
-        return getattr(self, key)  # type: ignore[no-any-return]
-
     def of(self, key: str) -> tuple[float, float] | None:
         """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
         return ends(getattr(self, key, (None, None)))
