@@ -91,9 +91,8 @@ def plane_stack(
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     for direction, coordinate_px in zip(optics.AXES, exact, strict=True):
         levels = grey(direction_levels(rig, coordinate_px.ravel(), direction, mean, modulation))
-        for index, level in zip(
-            [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)], levels, strict=True
-        ):
+        indices = [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)]
+        for index, level in zip(indices, levels, strict=True):
             frames[index] = level.reshape(x.shape)
     sides = rig.projector.width, rig.projector.height
     return frames, np.logical_and(*((w > 3) & (w < side - 4) for w, side in zip(exact, sides, strict=True)))

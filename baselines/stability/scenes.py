@@ -198,12 +198,10 @@ def misplaced(name: str) -> None:
     render.place(mesh, "A0", RIG, "fixed", 0)
 
 
-SCENES.family(
-    "behind the camera",
-    "m",
-    expects="refusal",
-    about="pixels of a wall behind the camera; against none; bound: must see nothing",
-)(lambda: worst(0, flagged=not seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).pixels.size))
+@SCENES.family("behind the camera", "m", expects="refusal")
+def behind_camera() -> Outcome:
+    """pixels of a wall behind the camera; against none; bound: must see nothing"""
+    return worst(0, flagged=not seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).pixels.size)
 
 
 @SCENES.family("light at distance 0", "grey")

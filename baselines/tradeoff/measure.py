@@ -10,7 +10,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -19,7 +19,7 @@ from platform import python_version
 from statistics import median
 from textwrap import shorten
 from time import perf_counter, process_time
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -66,11 +66,6 @@ class Rules:
     limit_s: float = 3.0
     warm_up: int = 2
 
-    @classmethod
-    def of(cls, settings: TradeoffSettings) -> Self:
-        rules = cls(settings.clock, settings.threads)
-        return replace(rules, runs=5, limit_s=1.0) if settings.quick else rules
-
     def timed(self, call: Callable[[], T]) -> tuple[float, T]:
         """Seconds of a single run of ``call``, and what it returned."""
         clock = perf_counter if self.clock == "wall" else process_time
@@ -90,10 +85,8 @@ def measured(setting: Setting, rules: Rules) -> Point:
     """The point of ``setting``. An error of the package (a frame is not stored, a package is missing) becomes its
     ``failed``, and the run goes on."""
     about: dict[str, Any] = {name: getattr(setting, name) for name in ("key", "group", "title", "note")}
-    try:
+    with suppress(OSError):  # where the system does not provide it
         about["load"] = round(os.getloadavg()[0], 2)
-    except OSError:
-        about["load"] = None  # the system does not provide it
     pace_before = pace_ms(rules)
     try:
         figures = _figures(setting, rules)
@@ -117,11 +110,9 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         run_s, depth = rules.timed(predict)
         seconds.append(run_s)
         if setting.scored:
-            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name)
-            of_sample = score_sample(*pair)
-            pixels = of_sample.object.pixels
-            missing_share = of_sample.missing / pixels if pixels else 0.0
-            scores.append((of_sample.object.mae_mm, of_sample.valid.mae_mm, missing_share))
+            sample = score_sample(*scored_pair(depth, views.target_mm(name), method.units, method.mode, name))
+            missing_share = sample.missing / max(sample.object.pixels, 1)
+            scores.append((sample.object.mae_mm, sample.valid.mae_mm, missing_share))
     # A run longer than the limit is not repeated.
     while len(seconds) < rules.runs and (len(seconds) < rules.least or sum(seconds) < rules.limit_s):
         if min(seconds) > rules.limit_s:
@@ -130,9 +121,8 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
     low, middle, high = (float(f"{float(np.percentile(seconds, q)):.4g}") for q in (5, 50, 95))
     given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
     figures: dict[str, Any] = {
-        "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds),
-        "seconds": middle, "seconds_p5": low, "seconds_p95": high,
-        "parameters": method.parameters, "given": " and ".join(given) or None,
+        "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds), "seconds": middle,
+        "seconds_p5": low, "seconds_p95": high, "parameters": method.parameters, "given": " and ".join(given) or None,
     }  # fmt: skip
     if scores:
         object_mae, valid_mae, missing = zip(*scores, strict=True)
@@ -176,8 +166,8 @@ def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
             if number + 1 >= LEAST_ROUNDS and total_s > LIMIT_S * rules.limit_s / Rules.limit_s:
                 break
     amounts = [rung.amount for rung in rungs]
-    stages_of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
-    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in stages_of_all]
+    of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
+    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in of_all]
     return sorted(growths, key=lambda stage_growth: -stage_growth.seconds[-1])
 
 
@@ -212,7 +202,9 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
     Raises BuildError when another process works in the same folder, SubmissionError for a folder with a run of other
     rules or of another machine.
     """
-    rules, hardware, views = Rules.of(settings), describe_hardware(), list(plan.views.names)
+    fewer: dict[str, Any] = {"runs": 5, "limit_s": 1.0} if settings.quick else {}
+    rules = Rules(settings.clock, settings.threads, **fewer)
+    hardware, views = describe_hardware(), list(plan.views.names)
     # What two sittings of a run must share. Their groups may differ: a later sitting can add a group.
     about = {
         "tradeoff": 1, "package": __version__, "dataset": plan.opened.fingerprint, "views": views,
@@ -234,21 +226,17 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
                 journal.growth[ladder.key] = time_ladder(ladder, rules)
                 journal.write(path)
     per_object = max(Counter(split_sample_name(name)[0] for name in views).values())
+    versions = {}
+    for package in ("numpy", "numba", "torch", "onnxruntime"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
     return Tradeoff(
         created=datetime.now(UTC).isoformat(timespec="seconds"), dataset=plan.opened.path.resolve().name,
         fingerprint=plan.opened.fingerprint, image_size=list(plan.opened.size), target=plan.views.target, views=views,
         settings={**asdict(rules), "quick": settings.quick, "views_an_object": per_object},
         hardware=HardwareInfo.model_validate(hardware.to_dict()),
-        software={"fpp_ml_bench": __version__, "python": python_version(), **_versions()}, sittings=journal.sittings,
+        software={"fpp_ml_bench": __version__, "python": python_version(), **versions}, sittings=journal.sittings,
         # Everything in this folder, so that a group measured on its own adds to the earlier ones.
         points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
         growth=[growth for growths in journal.growth.values() for growth in growths],
     )  # fmt: skip
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for package in ("numpy", "numba", "torch", "onnxruntime"):
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    return versions
