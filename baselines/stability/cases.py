@@ -51,12 +51,10 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The measurement of a case at its worst element, which has the largest error / bound.
-
-    ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
-    that were refused; ``may_flag``: largest share that theory allows (default: none where a number is expected, else
-    all). ``condition``: the condition number behind the bound, if any.
-    """
+    """The measurement of a case at its worst element, which has the largest error / bound. ``error`` is None where the
+    code refused to compute; ``note`` then holds its message. ``flagged``: share of elements that were refused;
+    ``may_flag``: largest share that theory allows (default: none where a number is expected, else all). ``condition``:
+    the condition number behind the bound, if any."""
 
     error: float | None
     bound: float = 0.0
@@ -80,12 +78,10 @@ def wrong(note: str = "") -> Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned or extreme case.
-
-    ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts`` describe in a line each what is
-    computed, its reference, and how the bound is derived. ``expects``: a number, a refusal, or either; ``refuses``: the
-    exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and are left out of a quick run.
-    """
+    """An ill-conditioned or extreme case. ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts``
+    describe in a line each what is computed, its reference, and how the bound is derived. ``expects``: a number, a
+    refusal, or either; ``refuses``: the exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and
+    are left out of a quick run."""
 
     group: str
     family: str

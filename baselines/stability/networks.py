@@ -19,9 +19,10 @@ from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcom
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
 from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.evaluation.score import DepthScores
-from fpp_ml_bench.optics import Direction, paper_rig
+from fpp_ml_bench.optics import DIRECTIONS, Direction, paper_rig
 
-NETWORKS = Group("networks")
+NETWORKS = Group("networks", "Richardson's extrapolated differences", "difference of two extrapolations (the next "
+                 "order) + 64 u |f| sqrt(n) / h of rounding")  # fmt: skip
 ALPHA = 0.7
 SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
@@ -204,33 +205,27 @@ def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1
     return worst(slope - first, abs(first - second) + abs(one - two) * 1e-3 + rounding)
 
 
-_RICHARDSON = (
-    "; against Richardson's extrapolated differences; bound: difference of two extrapolations (the next order) + 64 u "
-    "|f| sqrt(n) / h of rounding"
-)
-
-
-@NETWORKS.family("loss gradient", "1", about=f"directional derivative in float64{_RICHARDSON}", name=LOSSES)
+@NETWORKS.family("loss gradient", "1", name=LOSSES)
 def loss_gradient(name: str) -> Outcome:
+    """directional derivative in float64"""
     prediction, target = _scene(1.0, torch.float64)
     prediction = target + torch.sign(prediction - target) * (0.05 + (prediction - target).abs())  # away from |.|'s kink
     return directional(lambda x: _loss(name)(x, target), prediction)
 
 
-@NETWORKS.family("calibration layer gradient", "mm/rad", direction=("horizontal", "vertical"),
-                 about=f"directional derivative of depth by phase{_RICHARDSON}")  # fmt: skip
+@NETWORKS.family("calibration layer gradient", "mm/rad", direction=DIRECTIONS)
 def layer_gradient(direction: Direction) -> Outcome:
-    rig = paper_rig(16)
-    exact = CalibrationLayer.of(rig, direction)  # type: ignore[arg-type]
+    """directional derivative of depth by phase"""
+    exact = CalibrationLayer.of(paper_rig(16), direction)
     layer, total = exact.tensors(torch.float64), torch.from_numpy(exact.absolute_phase(1800.0))
     order = torch.floor(total / (2 * math.pi) + 0.5)
     return directional(lambda phase: layer.depth_mm(phase, order).sum(), total - 2 * math.pi * order)
 
 
-@NETWORKS.family("network gradient", "1", name=NAMES,
-                 about=f"directional derivative of the whole network, float64{_RICHARDSON}")  # fmt: skip
+@NETWORKS.family("network gradient", "1", name=NAMES)
 @torch_threads(1)
 def network_gradient(name: str) -> Outcome:
+    """directional derivative of the whole network, float64"""
     network, seed = small_network(name).double().eval(), normal((1, 1, 64, 64), 10)
     return directional(lambda image: (network(image) * seed).sum(), uniform((1, 1, 64, 64), 9), step=1e-7)
 

@@ -82,9 +82,8 @@ def direction_levels(rig: optics.Rig, coordinate_px: NDArray, direction: optics.
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
 
-def plane_stack(
-    rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
-) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
+def plane_stack(rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN,
+                modulation: float = MODULATION) -> tuple[list[NDArray[np.uint8] | None], NDArray]:  # fmt: skip
     """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
     x, y = rig.camera.rays()
     exact = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
@@ -111,9 +110,8 @@ def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: f
     return worst(error_px, _rounding_px(rig) + rounding_px, flagged)
 
 
-def _decoded_phase(
-    mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
-) -> tuple[Floats, NDArray]:
+def _decoded_phase(mean: float = MEAN, modulation: float = MODULATION, count: int = 2000,
+                   noise_grey: float = 0.0) -> tuple[Floats, NDArray]:  # fmt: skip
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
     rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, count)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)

@@ -206,10 +206,8 @@ def distribution(scale_mm: float) -> Outcome:
     measured = score.score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
     size, last = np.sort(np.abs(exact)), exact.size - 1
-    median, middle, p95 = (
-        float(np.interp(level * last, np.arange(last + 1), values))
-        for values, level in ((exact, 0.5), (size, 0.5), (size, 0.95))
-    )
+    parts = (exact, 0.5), (size, 0.5), (size, 0.95)
+    median, middle, p95 = (float(np.interp(share * last, np.arange(last + 1), part)) for part, share in parts)
     means = (math.fsum(values.tolist()) / exact.size for values in (exact, np.abs(exact - median)))
     expected = np.array([middle, p95, size[-1], *means])
     computed = [measured[f"object_{name}_mm"] for name in ("median", "p95", "max", "bias", "shift_free_mae")]

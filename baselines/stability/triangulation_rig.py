@@ -83,10 +83,8 @@ def depth_of(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> Floats:
 
 def conditioning(coordinate: NDArray, rig: optics.Rig, axis: int = 0, rays: optics.Maps = RAYS) -> tuple[Floats, ...]:
     """Bound of the closed form's relative error, and its condition number: sum of magnitudes over |a - x_p a_2|.
-
     Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of magnitudes; the difference and the top
-    cancel; 4 more for the last quotient and the change to mm.
-    """
+    cancel; 4 more for the last quotient and the change to mm."""
     (x, y), (focal, centre), t = rays, _device(rig), rig.t
     ideal = (coordinate - centre[axis]) / focal[axis]
     size = [np.abs(row[0]) * np.abs(x) + np.abs(row[1]) * np.abs(y) + np.abs(row[2]) for row in rig.R]

@@ -54,10 +54,8 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 @dataclass(frozen=True)
 class Rules:
     """Timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used up, after ``warm_up`` runs.
-
     ``clock``: wall-clock time, or the time that processors worked for this process. For one thread that waits for
-    nothing both agree on an idle machine; on a shared machine only processor time stays the same.
-    """
+    nothing both agree on an idle machine; on a shared machine only processor time stays the same."""
 
     clock: Literal["wall", "processor"] = "wall"
     threads: int = 1
@@ -140,11 +138,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
-    """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first.
-
-    Runs time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage
-    counts where every rung has it, with a time that a clock can tell from 0.
-    """
+    """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first. Runs
+    time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage counts
+    where every rung has it, with a time that a clock can tell from 0."""
     least: list[dict[str, float]] = [{} for _ in ladder.steps]
     with tempfile.TemporaryDirectory(prefix="fpp-bench-costs-") as folder:
         rungs = []
@@ -174,10 +170,8 @@ def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
 def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[float]) -> Growth:
     """The power p of seconds = c amount^p by least squares of the logarithms, its 95% interval by Student's t over the
     residuals, and the power over the largest amounts alone (``tail``), where a fixed cost no longer hides a steep term.
-
     A power above `LINEAR_LIMIT` is flagged, over all amounts or over the largest. Where the interval includes the
-    limit, the flag says that the times do not prove it.
-    """
+    limit, the flag says that the times do not prove it."""
     x, y = np.log(amounts), np.log(seconds)
     (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
     half = stdtrit(len(x) - 2, 0.5 + CONFIDENCE / 2) * np.sqrt(covariance[0, 0])
@@ -197,11 +191,8 @@ def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[fl
 
 def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], object] = lambda key: None) -> Tradeoff:
     """Measure what ``settings.out`` lacks of ``plan``, calling ``progress`` with the key of each setting and ladder
-    before it is measured.
-
-    Raises BuildError when another process works in the same folder, SubmissionError for a folder with a run of other
-    rules or of another machine.
-    """
+    before it is measured. Raises BuildError when another process works in the same folder, SubmissionError for a folder
+    with a run of other rules or of another machine."""
     fewer: dict[str, Any] = {"runs": 5, "limit_s": 1.0} if settings.quick else {}
     rules = Rules(settings.clock, settings.threads, **fewer)
     hardware, views = describe_hardware(), list(plan.views.names)

@@ -147,10 +147,8 @@ def calibration(views: StoredViews, frame: int, count: int = 8) -> NDArray[np.fl
 
 def set_precision(network: FringeNetwork, precision: str, examples_of: Callable[[], NDArray], threads: int) -> None:
     """Run ``network`` in ``precision`` (of `PRECISIONS`) from now on; what is around it stays as it is, in float32.
-
     Examples, float32 (n, 1, H, W), give the size for onnxruntime, and int8 is calibrated on them. Raises
-    `FppBenchError` where onnx or onnxruntime is not installed.
-    """
+    `FppBenchError` where onnx or onnxruntime is not installed."""
     if precision == "bf16":
         network.forward = torch.autocast("cpu", dtype=torch.bfloat16)(network.forward)  # type: ignore[method-assign]
     if not precision.startswith("onnx"):

@@ -203,13 +203,11 @@ def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
 
 
 class DecodeInType(ClassicalMethod):
-    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``.
-
-    The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from
-    one projector coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous
-    code, or lies outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is
-    iterated in float64.
-    """
+    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``. The package decodes
+    in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from one projector
+    coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous code, or lies
+    outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is iterated in
+    float64."""
 
     def __init__(self, rig: Rig, direction: Direction, steps: int, dtype: str) -> None:
         super().__init__(rig, direction, steps)
@@ -266,11 +264,8 @@ class Plan:
 
 
 def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
-    """The plan of a run; ``more_ladders`` are measured with this room's own. Nothing is measured yet.
-
-    Raises DatasetError for a folder that is no dataset or has no test split, WeightsError for a ``runs`` that is no
-    folder.
-    """
+    """The plan of a run; ``more_ladders`` are measured with this room's own. Nothing is measured yet. Raises
+    DatasetError for a folder that is no dataset or has no test split, WeightsError for a ``runs`` that is no folder."""
     opened = DatasetFolder(run.dataset)
     views = choose_views(opened, run.views or (QUICK_VIEWS if run.quick else VIEWS_AN_OBJECT))
     makers: dict[Group, Callable[[StoredViews, TradeoffSettings], Iterator[Setting]]] = {
