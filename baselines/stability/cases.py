@@ -130,12 +130,11 @@ class Group:
         def declare(run: Run) -> Run:
             of, _, bound = " ".join((about or run.__doc__ or "").split()).partition("; bound: ")
             of, _, against = of.partition("; against ")
-            texts = of, against or self.reference, bound or self.predicts
+            texts = of, against or self.reference, bound or self.predicts, unit
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
-                expected = expects(**given) if callable(expects) else expects
-                rest = unit, partial(run, **given), expected, refuses, heavy(**given)
-                self.cases.append(Case(self.name, name, given, *texts, *rest))
+                expected, call = expects(**given) if callable(expects) else expects, partial(run, **given)
+                self.cases.append(Case(self.name, name, given, *texts, call, expected, refuses, heavy(**given)))
             return run
 
         return declare

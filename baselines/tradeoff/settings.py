@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.method import Frames, Method, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
-from fpp_ml_bench.constants import MM_PER_M, TEST_OBJECTS, sample_name, split_sample_name
+from fpp_ml_bench.constants import MM_PER_M, sample_name, split_sample_name
 from fpp_ml_bench.decoding import MIN_MODULATION, Directions, Limits, plan_direction
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
@@ -79,14 +79,10 @@ def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") ->
 
 @dataclass
 class PhotographedViews:
-    """Objects of the benchmark in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
+    """`SIZE_OBJECTS` in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
 
     rig: Rig
-    objects: tuple[str, ...]
-
-    @property
-    def names(self) -> list[str]:
-        return [sample_name(name, SIZE_VIEW) for name in self.objects]
+    names = tuple(sample_name(name, SIZE_VIEW) for name in SIZE_OBJECTS)
 
     def frames(self, method: Method, name: str) -> Frames:
         frames = self._rows[name].frames
@@ -99,9 +95,9 @@ class PhotographedViews:
     @cached_property
     def _rows(self) -> dict[str, Row]:
         rows = {}
-        for name in self.objects:
+        for name in SIZE_OBJECTS:
             # A studio of its own for each view: the frames are its memory, which the next view would overwrite.
-            row = Studio(BuildSettings(self.rig, self.objects)).photograph(solid_mesh(name), SIZE_VIEW)
+            row = Studio(BuildSettings(self.rig, SIZE_OBJECTS)).photograph(solid_mesh(name), SIZE_VIEW)
             rows[row.sample] = row
         return rows
 
@@ -193,7 +189,7 @@ def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
             scaled.check_sampling()
         except FppBenchError:
             continue  # coarser than the fringes allow: no dataset of this rig has such a size
-        photographed = PhotographedViews(scaled, tuple(name for name in SIZE_OBJECTS if name in TEST_OBJECTS))
+        photographed = PhotographedViews(scaled)
         for direction, steps in choices:
             make = partial(ClassicalMethod, scaled, direction, steps, run.threads)
             title = f"classical N={steps}, {direction}"
@@ -238,10 +234,8 @@ class DecodeInType(ClassicalMethod):
         phase = -np.arctan2(sine, cosine)
         centre = plan.centres_rad.astype(dtype)[np.minimum(cells, len(plan.centres_rad) - 1)]
         absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
-        return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
-
-    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        number, axis, device, t_m = self.number, self.axis, self.rig.projector, self.rig.t
+        coordinate_px, valid = absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION)
+        axis, device, t_m = self.axis, self.rig.projector, self.rig.t
         ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
         across, forward = self.rays
         near, far = self.rig.working_range_mm
@@ -258,9 +252,6 @@ class Plan:
     views: StoredViews
     settings: list[Setting]
     ladders: list[Ladder]
-
-    def __len__(self) -> int:
-        return len(self.settings) + len(self.ladders)
 
 
 def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         show(tradeoff.plan_table(plan))
         print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
         return 0
-    with progress_bar("measuring", len(plan), "settings") as advance:
+    with progress_bar("measuring", len(plan.settings) + len(plan.ladders), "settings") as advance:
         measurements = tradeoff.tradeoff(settings, plan, lambda key: advance(1))
     written = tradeoff.write_report(measurements, args.out)
     if measurements.points:
