@@ -69,12 +69,10 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
         part = [row for row in rows if group in (row.case.group, "all")]
-        groups[group] = {
-            "cases": len(part),
-            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
-            "largest_ratio": number(largest_ratio(part)),
-            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
-        }
+        verdicts = {verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict}
+        cpu_s = round(sum(row.cpu_seconds for row in part), 2)
+        ratio = number(largest_ratio(part))
+        groups[group] = {"cases": len(part), **verdicts, "largest_ratio": ratio, "cpu_seconds": cpu_s}
     return groups
 
 
@@ -92,12 +90,9 @@ def row_content(row: Row) -> dict[str, Any]:
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """The whole run as JSON values."""
     return {
-        "schema_version": "1.0.0",
-        "summary": summary(rows),
-        "compiled_decoder": numba_enabled(),
-        "environment": environment().model_dump(mode="json"),
-        "cases": [row_content(row) for row in rows],
-    }
+        "schema_version": "1.0.0", "summary": summary(rows), "compiled_decoder": numba_enabled(),
+        "environment": environment().model_dump(mode="json"), "cases": [row_content(row) for row in rows],
+    }  # fmt: skip
 
 
 def square_of(row: Row) -> tuple[str, str]:

@@ -246,11 +246,9 @@ def front_table(tradeoff: Tradeoff) -> Table:
     for cost in COST_KEYS:
         for point in tradeoff.front(cost):
             ms, low, high = point.ms
-            table.add_row(
-                cost, point.title, f"{ms:.3g}", f"{low:.3g}-{high:.3g}", str(point.frames),
-                *("-" if mae is None else f"{mae:.3g}" for mae in (point.object_mae_mm, point.measured_mae_mm)),
-                "-" if point.missing_share is None else f"{100 * point.missing_share:.3g}%",
-            )  # fmt: skip
+            maes = ("-" if mae is None else f"{mae:.3g}" for mae in (point.object_mae_mm, point.measured_mae_mm))
+            missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.3g}%"
+            table.add_row(cost, point.title, f"{ms:.3g}", f"{low:.3g}-{high:.3g}", str(point.frames), *maes, missing)
         table.add_section()
     return table
 
@@ -261,11 +259,10 @@ def growth_table(growths: Sequence[Growth]) -> Table:
     table = _table("Costs that grow: seconds = c amount^power", ("Stage", "Over"), numbers)
     table.add_column("Flag", overflow="fold")
     for growth in growths:
-        table.add_row(
-            growth.stage, growth.over, f"{growth.amounts[0]:,.0f}", f"{growth.amounts[-1]:,.0f}",
-            f"{1000 * growth.seconds[-1]:.3g}", f"{growth.exponent:.2f}",
-            f"{growth.low:.2f} to {growth.high:.2f}", f"{growth.tail:.2f}", growth.flag or "",
-        )  # fmt: skip
+        amounts = f"{growth.amounts[0]:,.0f}", f"{growth.amounts[-1]:,.0f}"
+        powers = f"{growth.exponent:.2f}", f"{growth.low:.2f} to {growth.high:.2f}", f"{growth.tail:.2f}"
+        ms = f"{1000 * growth.seconds[-1]:.3g}"
+        table.add_row(growth.stage, growth.over, *amounts, ms, *powers, growth.flag or "")
     return table
 
 
