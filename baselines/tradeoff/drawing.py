@@ -103,8 +103,7 @@ class Scatter:
         px = axes.figure.dpi / 72
         size = matplotlib.rcParams["font.size"] * px
         at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
-        radii = [mark.radius * px for mark in self.marks]
-        taken = [Bbox([place - radius, place + radius]) for place, radius in zip(at, radii, strict=True)]
+        taken = [Bbox([xy - mark.radius * px, xy + mark.radius * px]) for mark, xy in zip(self.marks, at, strict=True)]
         places = {mark.number: place for mark, place in zip(self.marks, at, strict=True)}
         numbered = []
         for mark in self.labelled:
