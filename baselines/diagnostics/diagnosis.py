@@ -44,25 +44,15 @@ class ProbeResult:
     reused: bool
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """All findings about a subject in the report's order, and the files ``report`` and ``values``."""
-
-    results: tuple[ProbeResult, ...]
-    report: Path
-    values: Path
-
-
 def diagnose(
     subject: Subject, dataset: DatasetFolder, probe_names: Sequence[str], settings: ProbeSettings, out: Path,
     progress: Callable[[Probe], Progress], command: str = "",
-) -> Diagnosis:  # fmt: skip
-    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``.
-
-    A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the same; those of other
-    probes join the report. ``progress`` is called with a probe before it runs. ``command`` is quoted in the report.
-    Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes; earlier findings stay.
-    """
+) -> list[ProbeResult]:  # fmt: skip
+    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
+    in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
+    same; those of other probes join the report. ``progress`` is called with a probe before it runs. ``command`` is
+    quoted in the report. Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes;
+    earlier findings stay."""
     _prepare(out)
     selected = checked_names(probe_names)
     results = []
@@ -84,18 +74,15 @@ def diagnose(
             save_finding(out, key, finding, seconds)
             results.append(ProbeResult(probe, finding, seconds, reused=False))
     context = _context(subject, dataset, settings, command)
-    findings = {
-        one.finding.probe: {
-            "title": one.finding.title, "summary": one.finding.summary, "skipped": one.finding.skipped,
-            "seconds": one.seconds, "values": one.finding.values,
-        }
-        for one in results
-    }  # fmt: skip
+    findings = {}
+    for one in results:
+        told = {key: getattr(one.finding, key) for key in ("title", "summary", "skipped")}
+        findings[one.finding.probe] = {**told, "seconds": one.seconds, "values": one.finding.values}
     content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
     _write_json(out / JSON_FILE, content)
     html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
     write_atomically(out / REPORT_FILE, html.encode("utf-8"))
-    return Diagnosis(tuple(results), out / REPORT_FILE, out / JSON_FILE)
+    return results
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ are ours. Both learn from the network's batches as they come, so no activations 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -94,45 +93,24 @@ def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor
     return values[:, :, 0].transpose(1, 2)
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth of a sample, each map (H, W).
+def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]:
+    """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``. Raises
+    ``ValueError`` for a map without an object.
 
     ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range,
     background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object.
     ``order``: the fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order
-    follows from the pixel's position alone.
-    """
-
-    inside: NDArray[np.bool_]
-    edges: Image
-    depth: Image
-    depth_mm: Image
-    sine: Image
-    cosine: Image
-    order: Image
-
-
-def truth(depth_mm: Image, rig: Rig, direction: Direction) -> Truth:
-    """`Truth` of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``.
-
-    Raises ``ValueError`` for a map without an object.
-    """
+    follows from the pixel's position alone. All but ``inside`` are float32."""
     inside = object_mask(depth_mm)
     if not inside.any():
         raise ValueError("expected a depth map with an object, got background throughout")
     periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
     phase = TAU * (periods - np.floor(periods))
     order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
-    return Truth(
-        inside,
-        edge_map(depth_mm),
-        normalised_depth(depth_mm),
-        np.asarray(depth_mm, dtype=np.float32),
-        np.where(inside, np.sin(phase), 0.0).astype(np.float32),
-        np.where(inside, np.cos(phase), 0.0).astype(np.float32),
-        order.astype(np.float32),
-    )
+    sine, cosine = (np.where(inside, of(phase), 0.0) for of in (np.sin, np.cos))
+    maps = {"edges": edge_map(depth_mm), "depth": normalised_depth(depth_mm), "depth_mm": depth_mm, "sine": sine,
+            "cosine": cosine, "order": order}  # fmt: skip
+    return {"inside": inside, **{name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}}
 
 
 def normalised_depth(depth_mm: Image) -> Image:
@@ -213,13 +191,12 @@ def grid_step(size: tuple[int, int]) -> int:
     return max(SHARE, -(-max(size) // LONGEST))
 
 
-@dataclass
 class Moments:
     """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
 
-    count: int = 0
-    total: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
-    square: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = self.square = torch.zeros((), dtype=torch.float64)
 
     def add(self, features: Tensor) -> None:
         """Add a batch (B, C, h, w)."""

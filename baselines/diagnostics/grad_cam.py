@@ -16,8 +16,9 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fpp_ml_bench.baselines.diagnostics import probe
 from fpp_ml_bench.baselines.diagnostics.fits import edge_map
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Progress, Sheet, Table, mean_of
 from fpp_ml_bench.baselines.diagnostics.probe import with_interval as text_of
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
@@ -40,7 +41,7 @@ _EXAMPLES = 3
 _BAR = 0.2
 
 
-class GradCam(Probe):
+class GradCam(probe.Probe):
     """Heatmaps of the test split against edges and fringes, for the network and for random weights."""
 
     name = "grad-cam"
@@ -165,7 +166,7 @@ class Correlations:
         """Mean over layers, as in the paper's bottom row, with an interval over samples."""
         means = [self.mean(layer, reference, trained).r for layer in self.layers]
         interval = self._over_samples(self._sample_means(self.layers, reference, trained)).interval
-        return Mean(_mean_of(means), interval, sum(r is not None for r in means))
+        return Mean(mean_of(means), interval, sum(r is not None for r in means))
 
     @property
     def references(self) -> Mean:
@@ -177,10 +178,10 @@ class Correlations:
             values for (weights, layer, target), values in self.values.items()
             if layer in layers and target == reference and (weights == "trained") == trained
         ]  # fmt: skip
-        return [_mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
+        return [mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
 
     def _over_samples(self, values: Sequence[float | None]) -> Mean:
-        return Mean(_mean_of(values), object_interval(values, self.objects), sum(r is not None for r in values))
+        return Mean(mean_of(values), object_interval(values, self.objects), sum(r is not None for r in values))
 
     def to_dict(self) -> dict[str, Any]:
         """For ``diagnose.json``."""
@@ -203,11 +204,6 @@ def _with_ratio(means: dict[str, Mean]) -> dict[str, Any]:
 def ratio(edges: float | None, fringes: float | None) -> float | None:
     """The paper's ratio: correlation with edges over correlation with fringes; None where undefined."""
     return None if edges is None or not fringes else edges / fringes
-
-
-def _mean_of(values: Sequence[float | None]) -> float | None:
-    defined = [value for value in values if value is not None]
-    return float(np.mean(defined)) if defined else None
 
 
 def measure(

@@ -31,7 +31,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "edges": ("edges",), "depth": ("depth",), "distance": ("depth_mm",), "phase": ("sine", "cosine"),
     "order": ("order",),
 }  # fmt: skip
-"""Targets of the linear probe, by the names in `Truth`; the phase is an angle and so has two."""
+"""Targets of the linear probe, by the names in `fits.truth`; the phase is an angle and so has two."""
 INSIDE = ("distance", "phase", "order")
 """Targets on object pixels only."""
 FRINGE = ("phase", "order")
@@ -113,12 +113,12 @@ class Pixels:
             rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
             direction = "horizontal" if self.direction == "both" else self.direction
             truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
-            inside, size = np.flatnonzero(truth.inside), truth.inside.size
+            inside, size = np.flatnonzero(truth["inside"]), truth["inside"].size
             pixels = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
             self._drawn[sample] = {
                 key: (
                     torch.from_numpy(pixels[key]),
-                    torch.from_numpy(np.stack([getattr(truth, name).ravel()[pixels[key]] for name in fields], axis=1)),
+                    torch.from_numpy(np.stack([truth[name].ravel()[pixels[key]] for name in fields], axis=1)),
                 )
                 for key, fields in self.fields.items()
             }

@@ -8,13 +8,13 @@ errors of whole periods.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfactuals, Move, SceneSet
-from fpp_ml_bench.baselines.diagnostics.probe import Progress, silent
+from fpp_ml_bench.baselines.diagnostics.probe import Progress, mean_of, silent
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
@@ -22,6 +22,10 @@ from fpp_ml_bench.evaluation.result import RELIANCE_VERSION, Reliance, RelianceP
 from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+    from fpp_ml_bench.baselines.method import Method
 
 Map = NDArray[np.floating]
 
@@ -100,18 +104,6 @@ def sample_score(follow: float | None, change: float | None) -> float | None:
     return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
 
 
-class DepthMethod(Protocol):
-    """The part of a method, or of the subject of a diagnosis, that is needed here."""
-
-    @property
-    def frames_used(self) -> tuple[int, ...]: ...
-    @property
-    def units(self) -> str: ...
-    @property
-    def uses_ground_truth_mask(self) -> bool: ...
-    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]: ...
-
-
 @dataclass(frozen=True)
 class SampleReliance:
     """A sample's score, order-free score, and ``parts`` by the names of `RelianceParts`."""
@@ -126,7 +118,7 @@ class SampleReliance:
 class ScenePredictor:
     """Runs ``method`` on scenes and gives the true depth in the units of its predictions."""
 
-    def __init__(self, method: DepthMethod, renderer: SceneRenderer) -> None:
+    def __init__(self, method: "Method | Subject", renderer: SceneRenderer) -> None:
         self.method, self.renderer, self.in_mm = method, renderer, method.units == "mm"
         if method.units not in ("mm", "normalised"):
             raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
@@ -205,7 +197,7 @@ def _phase_change(scenes: Counterfactuals, before: Map, after: Map, depth_mm: Ma
 
 
 def measure(
-    method: DepthMethod, scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
+    method: "Method | Subject", scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
 ) -> tuple[Reliance, list[SampleReliance]]:
     """The reliance block of a method, and the values of every sample. Raises `DiagnosisError` for a method of other
     units, and where no sample has a score."""
@@ -221,11 +213,11 @@ def measure(
     interval = object_interval([sample.score for sample in scored], [sample.object for sample in scored])
     reliance = Reliance(
         version=RELIANCE_VERSION,
-        score=_mean(sample.score for sample in scored) or 0.0,
+        score=mean_of(sample.score for sample in scored) or 0.0,
         interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
-        order_free_score=_mean(sample.order_free_score for sample in scored),
-        parts=RelianceParts.model_validate(
-            {key: _mean(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
+        order_free_score=mean_of(sample.order_free_score for sample in scored),
+        parts=RelianceParts(
+            **{key: mean_of(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
         ),
         units="mm" if predictor.in_mm else "normalised",
         direction=direction,
@@ -236,11 +228,6 @@ def measure(
         weights_sha256=weights_sha256,
     )
     return reliance, samples
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    defined = [value for value in values if value is not None]
-    return float(np.mean(defined)) if defined else None
 
 
 def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> Direction:

@@ -6,7 +6,8 @@ Importing this module imports neither numpy nor matplotlib, so that the command 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -60,6 +61,14 @@ def spread(names: Sequence[str], limit: int | None) -> list[str]:
     return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
 
 
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Mean of ``values`` other than None; None where there are none."""
+    import numpy as np
+
+    defined = [value for value in values if value is not None]
+    return float(np.mean(defined)) if defined else None
+
+
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
     """A mean with its interval as a table's cell; a dash for None."""
     span = "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"
@@ -105,7 +114,7 @@ class Finding:
     skipped: str | None = None
 
 
-class Probe:
+class Probe(ABC):
     """A test of a model. ``version`` goes up when its result for the same model changes. ``without_network``: what a
     method without a network lacks for this probe, or None."""
 
@@ -121,11 +130,11 @@ class Probe:
             return None
         return f"{subject.name} is a method without a network: {self.without_network}."
 
+    @abstractmethod
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         """Measure ``subject``; pictures are written into ``folder``, which exists."""
-        raise NotImplementedError
 
     def finding(self, summary: str, values: Mapping[str, Any], tables: Sequence[Table], *figures: Figure) -> Finding:
         """The result of this probe."""
