@@ -51,7 +51,7 @@ def sample_of(image: NDArray[np.uint8], depth_mm: Image, name: str, geometry: Ge
     places = np.argwhere(depth_edges(crop_depth_mm)).astype(np.int32)
     sampled = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
     direction, half = geometry.route.settings.direction, np.nan_to_num(missing).astype(np.float16)
-    return Sample(name, direction, scene.half(), half, target, places[sampled])
+    return Sample(name, direction, scene.single(np.float16, np.int16), half, target, places[sampled])
 
 
 def samples_of(
