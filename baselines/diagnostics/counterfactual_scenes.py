@@ -60,10 +60,8 @@ def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Or
 @dataclass(frozen=True)
 class Move:
     """The surface moved to ``depth_mm``, so that its phase changes by ``amplitude_rad`` times the field ``name``.
-
     ``phase``: the phase of the moved surface with the brightness of the original. ``light``: the brightness of the
-    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed.
-    """
+    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed."""
 
     name: str
     amplitude_rad: float
@@ -243,10 +241,8 @@ def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple
 
 
 class SceneSet:
-    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods.
-
-    Raises `DiagnosisError` for a split without an object.
-    """
+    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods. Raises
+    `DiagnosisError` for a split without an object."""
 
     def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
         self.dataset, self.renderer = dataset, SceneRenderer.of(dataset)

@@ -43,11 +43,9 @@ def activations_of(
     network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor, reduce: Callable[[Tensor], Tensor], name: str
 ) -> dict[str, Tensor]:
     """``reduce(activations)`` of every layer by its name, of one forward pass of the network called ``name``.
-
     ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
     output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or that the pass does not reach, and
-    for an output that is not a depth map.
-    """
+    for an output that is not a depth map."""
     activations: dict[str, Tensor] = {}
 
     def hook(name: str) -> Any:
@@ -95,12 +93,10 @@ def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor
 
 def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]:
     """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``. Raises
-    ``ValueError`` for a map without an object.
-
-    ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range,
-    background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object.
-    ``order``: the fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order
-    follows from the pixel's position alone. All but ``inside`` are float32."""
+    ``ValueError`` for a map without an object. ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``:
+    normalised to the sample's own range, background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the
+    wrapped phase, 0 outside the object. ``order``: the fringe order minus that of a plane at the rig's standoff, 0
+    outside the object; the plane's order follows from the pixel's position alone. All but ``inside`` are float32."""
     inside = object_mask(depth_mm)
     if not inside.any():
         raise ValueError("expected a depth map with an object, got background throughout")
@@ -214,10 +210,8 @@ class Moments:
 
 class ConvolutionProbe(nn.Module):
     """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
-
     The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
-    5 x 5 grid points.
-    """
+    5 x 5 grid points."""
 
     def __init__(self, moments: Moments, target_mean: float) -> None:
         super().__init__()

@@ -79,9 +79,7 @@ def cam_layers(subject: Subject) -> tuple[str, ...]:
 
 def heatmaps(network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor) -> dict[str, Tensor]:
     """Grad-CAM of the mean prediction before its ReLU, by layer: (B, H, W) at the size of ``fringe`` (B, 1, H, W).
-
-    Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction.
-    """
+    Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction."""
     heatmaps_by_layer = {}
     for name, layer in layers.items():
         cam = LayerGradCam(lambda x: network(x).mean(dim=(1, 2, 3)), layer)
@@ -118,10 +116,8 @@ def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[st
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
-    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32.
-
-    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored.
-    """
+    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32. The
+    window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored."""
     side = max(3, 2 * int(np.ceil((period_px - 1) / 2)) + 1)
     image = np.asarray(grey, dtype=np.float64)
     mean, square = (cv2.blur(of, (side, side), borderType=cv2.BORDER_REFLECT_101) for of in (image, image * image))

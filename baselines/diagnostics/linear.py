@@ -91,10 +91,8 @@ def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
 
 
 class Pixels:
-    """Pixels drawn from each sample, the same for every network, and cached.
-
-    ``columns``: for each target its set (over the image or within the object) and its columns in that set's targets.
-    """
+    """Pixels drawn from each sample, the same for every network, and cached. ``columns``: for each target its set (over
+    the image or within the object) and its columns in that set's targets."""
 
     def __init__(self, subject: Subject, dataset: DatasetFolder) -> None:
         self.dataset, self.direction = dataset, subject.direction
@@ -132,10 +130,8 @@ class Pixels:
 
 
 class Experiment:
-    """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``.
-
-    ``tick`` is called with the number of samples just processed and the activity.
-    """
+    """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``. ``tick`` is
+    called with the number of samples just processed and the activity."""
 
     def __init__(
         self, subject: Subject, dataset: DatasetFolder, train: Sequence[str], validation: Sequence[str],
@@ -160,10 +156,8 @@ class Experiment:
         return scores
 
     def linear_errors(self, network: nn.Module, controls: bool = False) -> tuple[Errors, dict[str, list[float]]]:
-        """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target.
-
-        With ``controls`` the raw input and the position are probed like layers.
-        """
+        """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target. With
+        ``controls`` the raw input and the position are probed like layers."""
         equations: dict[tuple[str, bool], fits.NormalEquations] = {}
         for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
             if (layer, key) not in equations:
@@ -224,10 +218,8 @@ class Experiment:
         self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
     ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
         """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed; and
-        those of predicting the mean, by target.
-
-        The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input.
-        """
+        those of predicting the mean, by target. The raw input has `INPUT` as network and layer; ``seeds``: number of
+        seeds of each network and the input."""
         moments: dict[fits.Source, fits.Moments] = {}
         sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
         for features, targets in self._map_batches(networks, self.train, "spread of the activations"):

@@ -32,11 +32,8 @@ Map = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the prediction in a counterfactual scene, at the pixels that are compared.
-
-    ``expected`` and ``actual`` change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists
-    before and after.
-    """
+    """Change of the prediction in a counterfactual scene, at the pixels that are compared. ``expected`` and ``actual``
+    change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists before and after."""
 
     expected: NDArray[np.float64]
     actual: NDArray[np.float64]

@@ -33,11 +33,9 @@ def silent(*progress: object) -> None:
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much a probe measures; None means the probe's default.
-
-    ``samples``: most samples of each split, taken evenly over it (`spread`). ``seeds``: repeats of what depends on
-    random numbers. ``quick``: a short run for a first look. Raises `DiagnosisError` for a number below 1.
-    """
+    """How much a probe measures; None means the probe's default. ``samples``: most samples of each split, taken evenly
+    over it (`spread`). ``seeds``: repeats of what depends on random numbers. ``quick``: a short run for a first look.
+    Raises `DiagnosisError` for a number below 1."""
 
     samples: int | None = None
     seeds: int | None = None
@@ -101,9 +99,7 @@ class Figure:
 @dataclass(frozen=True)
 class Finding:
     """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None instead of NaN.
-
-    ``skipped``: why the probe does not apply to this subject; then the other fields are empty.
-    """
+    ``skipped``: why the probe does not apply to this subject; then the other fields are empty."""
 
     probe: str
     title: str

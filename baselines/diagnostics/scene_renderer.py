@@ -161,11 +161,9 @@ Frames = list[NDArray[np.uint8] | None]
 
 @dataclass(frozen=True)
 class Scene:
-    """Lit pixels in front of the empty scene, and the pattern that is projected on them.
-
-    ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
-    it. ``stream``: key of the noise. With ``no fringe`` the mean light of the sequence is projected.
-    """
+    """Lit pixels in front of the empty scene, and the pattern that is projected on them. ``pixels`` uint32 (n,), with
+    ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use it. ``stream``: key of the
+    noise. With ``no fringe`` the mean light of the sequence is projected."""
 
     pixels: NDArray[np.uint32]
     lit: render.LitPixels

@@ -37,16 +37,12 @@ PIXELS_AT_ONCE = BATCH * 224 * 224
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A model under diagnosis; ``sha256`` identifies it and its settings.
-
-    ``units`` of `predict`: mm, or normalised to the sample's own depth range. ``direction``: that of the fringes in
-    ``frames_used``. With ``uses_ground_truth_mask`` it expects frames that are 0 outside the object (`captured`).
-
-    ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and outputs depth in the
-    representation ``normalisation``. Without a network, it and the following fields are None or empty. ``layer_names``:
-    the layers to probe, in forward order. ``untrained(seed)``: the same architecture with random weights.
-    ``find_layers``: the layers of any network of that architecture by name.
-    """
+    """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
+    the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
+    it expects frames that are 0 outside the object (`captured`). ``network`` takes the single frame in ``frames_used``
+    as (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
+    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
+    same architecture with random weights. ``find_layers``: the layers of any network of that architecture by name."""
 
     name: str
     title: str
@@ -142,16 +138,13 @@ def subject(
     name: str, dataset: DatasetFolder, layers: Sequence[str] | None = None, units: OutputUnits | None = None,
     frame: int | None = None, threads: int = 1,
 ) -> Subject:  # fmt: skip
-    """The model called ``name``, ready to be diagnosed on ``dataset``.
-
-    ``name``: a method of `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or
-    ``file.py:factory``, where ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth
-    (B, 1, H, W) in ``units`` (default: normalised). ``layers``: names of the layers to probe, by default the network's
-    ``probe_layers``, or every child of a module without them. ``frame``: number of the network's input frame, by
-    default the first that it was trained on. ``threads``: torch threads of the process.
-
-    Raises `DiagnosisError` for a name, layer or module that can't be used, and other `FppBenchError` of the model.
-    """
+    """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
+    `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
+    ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
+    (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
+    child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
+    trained on. ``threads``: torch threads of the process. Raises `DiagnosisError` for a name, layer or module that
+    can't be used, and other `FppBenchError` of the model."""
     if FACTORY_MARK in name:
         return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:

@@ -99,14 +99,11 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Scene:
-    """The part ``crop`` of an image, maps (h, w) in the image's own orientation.
-
-    ``light``: captured light without the ambient light, and ``plane_light``: the empty scene's prediction of it, both
-    as multiples of a white plane at the standoff; ``noise`` in the same unit; ``inside``: mask of the measured route;
-    ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in units of light;
-    ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median
-    residual phase of the object.
-    """
+    """The part ``crop`` of an image, maps (h, w) in the image's own orientation. ``light``: captured light without the
+    ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a white plane at the
+    standoff; ``noise`` in the same unit; ``inside``: mask of the measured route; ``phase_rad`` in [-pi, pi] and
+    ``order``: the base order; ``bright``: half the modulation, in units of light; ``weight``: of the fit's window;
+    ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median residual phase of the object."""
 
     crop: phase_route.Crop
     light: Image

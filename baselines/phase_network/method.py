@@ -64,11 +64,9 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile
 
 class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
-
     ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
     Raises `WeightsError` for weights that can't be used, and `PredictionError` for an invalid option and for a rig
-    whose fringe period in the image is far from that of the training data.
-    """
+    whose fringe period in the image is far from that of the training data."""
 
     name = "phase-net"
     target = "depth"

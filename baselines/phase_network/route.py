@@ -66,12 +66,10 @@ def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
 
 @dataclass(frozen=True)
 class Levers:
-    """Which of the network's answers are used; False: the measured route's own value stays.
-
-    ``order``, ``mask``, ``phase``; ``shading``: whether network and base order use brightness; ``graph``: weight of
-    smoothness between neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order
-    of each pixel alone; ``bound_rad``: corrections are clipped there, None: the network's own bound.
-    """
+    """Which of the network's answers are used; False: the measured route's own value stays. ``order``, ``mask``,
+    ``phase``; ``shading``: whether network and base order use brightness; ``graph``: weight of smoothness between
+    neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order of each pixel alone;
+    ``bound_rad``: corrections are clipped there, None: the network's own bound."""
 
     order: bool = True
     mask: bool = True

@@ -52,12 +52,10 @@ _TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
 @dataclass(frozen=True)
 class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
-
     ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
     ``unions``: images that join several objects, made from each sample (see `unions`); ``weight_*``: of the losses;
-    ``averaged``: decay of the weights' moving average, which is what the weights file holds.
-    Raises `RecipeError` for values that train nothing.
-    """
+    ``averaged``: decay of the weights' moving average, which is what the weights file holds. Raises `RecipeError` for
+    values that train nothing."""
 
     name: str = "phase-net"
     steps: int = 5000
@@ -264,11 +262,10 @@ def mean_scores(
 
 
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
-    """Scores of one whole image with ``threshold`` on the mask's logit.
-
-    ``object_mae_mm`` counts a missed pixel with its whole depth; ``right_mae_mm`` is the MAE of the pixels with the
-    right order; ``wrong_percent`` and ``missed_percent`` are shares of the object's pixels; ``invented_kpx``:
-    background pixels with a depth, in thousands."""
+    """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
+    its whole depth; ``right_mae_mm`` is the MAE of the pixels with the right order; ``wrong_percent`` and
+    ``missed_percent`` are shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in
+    thousands."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)

@@ -81,9 +81,8 @@ def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray
 def reasons(
     observation: Observation, margin: Image, confidence: Image, depth_mm: NDArray, settings: Settings
 ) -> NDArray[np.uint8]:
-    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
-
-    A chooser that corrects the phase can leave the range that its orders were chosen for."""
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted. A chooser
+    that corrects the phase can leave the range that its orders were chosen for."""
     near, far = observation.rig.working_range_mm
     outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
     slopes, period_px = observation.slopes, observation.period_px

@@ -46,9 +46,7 @@ class PhaseRoute:
 
     def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
         """Depth and the maps behind it, from one captured fringe, uint8 (H, W), or from the frames of ``steps``.
-
-        ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
-        """
+        ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape."""
         observation = self.observe(image, mask)
         return self.conclude(observation, *self.choose(observation))
 
@@ -97,7 +95,6 @@ class PhaseRoute:
     def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
         ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
-
         Raises `DecodeError` for shapes that are not the crop's."""
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
