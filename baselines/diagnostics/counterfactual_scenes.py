@@ -93,9 +93,9 @@ class Counterfactuals:
     outline_changes: tuple[OutlineChange, ...]
     reprojected: dict[str, Scene]
 
-    def moves_within(self) -> tuple[Move, ...]:
+    def moves_within(self) -> list[Move]:
         """Moves that vary over the object, so all but the constant."""
-        return tuple(move for move in self.moves if move.name != "constant")
+        return [move for move in self.moves if move.name != "constant"]
 
 
 def counterfactuals(
@@ -104,14 +104,10 @@ def counterfactuals(
     """Every scene of ``sample``, which shows an object and may be cut to the outlines of ``outline_samples``."""
     sample_scene = original(dataset, renderer, sample)
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
-    return Counterfactuals(
-        original=sample_scene,
-        direction=direction,
-        layer=CalibrationLayer.of(renderer.rig, direction),
-        moves=tuple(_moves(sample_scene, renderer, direction)),
-        outline_changes=tuple(outline_changes(sample_scene, renderer, outlines)),
-        reprojected={name: replace(sample_scene.scene, projected=name) for name in REPROJECTED},
-    )
+    moves, changes = _moves(sample_scene, renderer, direction), outline_changes(sample_scene, renderer, outlines)
+    reprojected = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
+    layer = CalibrationLayer.of(renderer.rig, direction)
+    return Counterfactuals(sample_scene, direction, layer, tuple(moves), tuple(changes), reprojected)
 
 
 def fields(surface: Surface) -> dict[str, Field]:

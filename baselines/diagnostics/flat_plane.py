@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
-from fpp_ml_bench.baselines.diagnostics.subjects import Frames, Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.method import Frames
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder

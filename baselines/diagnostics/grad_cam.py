@@ -7,6 +7,7 @@ with the edges of the true depth and with the local standard deviation of the fr
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -210,25 +211,21 @@ def measure(
     network, untrained = subject.networks()
     correlations = Correlations(layers, [split_sample_name(name)[0] for name in samples])
     total, done = len(samples) * (1 + seeds), 0
-    random_networks = [untrained(seed) for seed in range(seeds)]
+    networks = {"trained": network} | {f"untrained {seed}": untrained(seed) for seed in range(seeds)}
     for start in range(0, len(samples), subject.batch_size):
         batch_samples = samples[start : start + subject.batch_size]
-        trained_maps = dict(maps(subject, network, dataset, batch_samples, layers))
         reference_maps = {sample: references(subject, dataset, sample) for sample in batch_samples}
-        for sample in batch_samples:
-            correlations.edges_with_fringes.append(correlation(*reference_maps[sample].values()))
-            for layer, heat in trained_maps[sample].items():
-                for target, reference in reference_maps[sample].items():
-                    correlations.add("trained", layer, target, correlation(heat, reference))
-        done += len(batch_samples)
-        progress(done, total, "Grad-CAM")
-        for number, random_network in enumerate(random_networks):
-            for sample, heat_of in maps(subject, random_network, dataset, batch_samples, layers):
-                for layer, heat in heat_of.items():
-                    for target, reference in (*reference_maps[sample].items(), (OWN, trained_maps[sample][layer])):
-                        correlations.add(f"untrained {number}", layer, target, correlation(heat, reference))
+        correlations.edges_with_fringes += [correlation(*of_sample.values()) for of_sample in reference_maps.values()]
+        trained_maps: dict[str, dict[str, Image]] = {}
+        for weights, one_network in networks.items():
+            heatmaps_of = dict(maps(subject, one_network, dataset, batch_samples, layers))
+            for sample, layer in product(batch_samples, layers):
+                own = {OWN: trained_maps[sample][layer]} if trained_maps else {}
+                for target, reference in {**reference_maps[sample], **own}.items():
+                    correlations.add(weights, layer, target, correlation(heatmaps_of[sample][layer], reference))
+            trained_maps = trained_maps or heatmaps_of
             done += len(batch_samples)
-            progress(done, total, "Grad-CAM of random weights")
+            progress(done, total, "Grad-CAM" if weights == "trained" else "Grad-CAM of random weights")
     return correlations
 
 

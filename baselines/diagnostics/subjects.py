@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.method import METHODS, Frames, Method, load_method
 from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
@@ -25,8 +25,6 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
-Frames = Sequence[NDArray[np.uint8] | None]
-"""A captured sequence by frame number, with None for frames that are not needed."""
 OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
 FACTORY_MARK = ".py:"
@@ -160,18 +158,13 @@ def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: A
     """A method as a subject; ``network``: the fields of a `Subject` with one."""
     # A network's settings hold the hash of its weights; those of the machine don't matter.
     settings = {key: value for key, value in depth_method.settings.items() if key not in ("threads", "device")}
+    same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
     return Subject(
-        name=depth_method.name,
-        title=depth_method.title,
+        **{key: getattr(depth_method, key) for key in same},
         sha256=hashlib.sha256(json.dumps([depth_method.name, settings], sort_keys=True).encode()).hexdigest(),
-        units=depth_method.units,
-        image_size=dataset.size,
-        frames_used=depth_method.frames_used,
-        direction=_direction_of(dataset, depth_method.frames_used),
-        predict_frames=depth_method.predict,
-        uses_ground_truth_mask=depth_method.uses_ground_truth_mask,
-        **network,
-    )
+        image_size=dataset.size, direction=_direction_of(dataset, depth_method.frames_used),
+        predict_frames=depth_method.predict, **network,
+    )  # fmt: skip
 
 
 def _subject_of_weights(
@@ -201,15 +194,11 @@ def _subject_of_weights(
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     return subject_of_method(
-        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence),
-        dataset,
-        normalisation=config.normalisation,
-        network=model.network,
+        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence), dataset,
+        normalisation=config.normalisation, network=model.network, weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network.probe_layers, config.name),
-        find_layers=lambda network: network.probe_layers,
-        untrained=untrained,
-        weights_sha256=model.sha256,
-    )
+        find_layers=lambda network: network.probe_layers, untrained=untrained,
+    )  # fmt: skip
 
 
 def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
@@ -254,20 +243,14 @@ def _subject_of_factory(
         return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
 
     user_subject = Subject(
-        name=path.stem,
-        title=f"{path.name}:{name.rpartition(':')[2]}",
-        sha256=_digest(path, network, f"{units} {frame}"),
-        units="normalised" if units == "normalised" else "mm",
-        image_size=dataset.size,
-        frames_used=(frame,),
-        direction=_direction_of(dataset, (frame,)),
-        predict_frames=predict,
-        normalisation=normalisation,
-        network=network,
+        name=path.stem, title=f"{path.name}:{name.rpartition(':')[2]}",
+        sha256=_digest(path, network, f"{units} {frame}"), units="normalised" if units == "normalised" else "mm",
+        image_size=dataset.size, frames_used=(frame,), direction=_direction_of(dataset, (frame,)),
+        predict_frames=predict, normalisation=normalisation, network=network,
         layer_names=_select_layers(layers, _layers(network, bool(layers)), name),
         find_layers=lambda model: _layers(model, bool(layers)),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
-    )
+    )  # fmt: skip
     first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
     if first is None:
         raise DiagnosisError(f"{dataset.path}: holds no sample")

@@ -94,11 +94,9 @@ class Theory(Probe):
         progress(1, 2, "one period, many distances")
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
-        values = {
-            "twins": twins.to_dict(),
-            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": [{key: getattr(curve, key) for key in keys} for curve in curves],
-        }
+        shown = [{key: getattr(curve, key) for key in keys} for curve in curves]
+        kappa = kappa_per_m(dataset.rig, twins.direction)
+        values = {"twins": twins.to_dict(), "kappa_per_m": kappa, "curves": shown}
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 

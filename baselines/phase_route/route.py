@@ -121,18 +121,14 @@ class PhaseRoute:
         counts = np.bincount(reasons.ravel(), minlength=len(Reason))
         measurement = Measurement(
             wrapped_phase_rad=paste(observation.phase_rad, np.float32, np.nan),
-            modulation_grey=paste(observation.fit.brightness, np.float32, 0),
-            order=paste(order, np.int32, 0),
+            modulation_grey=paste(observation.fit.brightness, np.float32, 0), order=paste(order, np.int32, 0),
             candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
-            confidence=paste(sureness, np.float32, 0),
-            expected_error_mm=paste(error_mm, np.float32, 0),
+            confidence=paste(sureness, np.float32, 0), expected_error_mm=paste(error_mm, np.float32, 0),
             order_doubt_mm=paste(doubt_mm, np.float32, 0),
             depth_mm=paste(depth_mm if least == 0 else depth_mm * (sureness >= least), np.float32, 0),
-            reason=reasons,
-            counts={code.name.lower(): int(counts[code]) for code in Reason},
-            background_share=observation.background.share,
-            seconds=watch.seconds,
-        )
+            reason=reasons, counts={code.name.lower(): int(counts[code]) for code in Reason},
+            background_share=observation.background.share, seconds=watch.seconds,
+        )  # fmt: skip
         watch.done("depth")
         return measurement
 
