@@ -20,8 +20,7 @@ from fpp_ml_bench.evaluation.score import caution
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 MOST_VIEWS = 6
-_WIDE, _GAP = 11.5, 2
-"""Width of the figure of scenes in inches, and gap between two scenes in px."""
+_WIDE, _GAP = 11.5, 2  # width of the figure of scenes in inches, and gap between two scenes in px
 _FOLLOWS = {
     "follows_phase": "phase alone", "follows_light": "brightness alone", "follows_both": "both, as in\na photograph",
     "follows_constant": "phase, by\na constant", "order_free_follows_phase": "phase, whole\nperiods aside",

@@ -23,14 +23,11 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
-SMALLEST_SHIFT_RAD = 0.05 * TAU
-"""Where the working range allows only smaller shifts, the move is left out."""
+SMALLEST_SHIFT_RAD = 0.05 * TAU  # where the working range allows only smaller shifts, the move is left out
 REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "other direction", "other pitch")
 VIEWS_PER_OBJECT = 2
-_STORED_PX = 300
-"""Scenes of images up to this width are kept in memory; larger ones are made again for each method."""
-GROWTH = 0.1
-"""How far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area."""
+_STORED_PX = 300  # scenes of images up to this width are kept in memory; larger ones are made again for each method
+GROWTH = 0.1  # how far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area
 KEPT_SHARE = 0.5
 """Share of the object that an ellipse leaves; of the other objects' outlines the nearest to this share is used."""
 

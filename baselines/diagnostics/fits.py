@@ -24,10 +24,8 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.optics import Direction, Rig
 
 Image = NDArray[np.float32]
-Source = tuple[str, str]
-"""A network, or `INPUT`, and a layer."""
-INPUT = "input"
-"""Name of the raw input, which is probed like a layer as a control."""
+Source = tuple[str, str]  # a network, or `INPUT`, and a layer
+INPUT = "input"  # name of the raw input, which is probed like a layer as a control
 RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
 WIDTH = 16

@@ -26,8 +26,7 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
-RECTANGLE_SIDE = 0.5
-"""Side of the rectangle, as a share of the image's side."""
+RECTANGLE_SIDE = 0.5  # side of the rectangle, as a share of the image's side
 NORMALISED_BACKGROUND = 0.1
 OUTLINES, QUICK_OUTLINES = 5, 2
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"

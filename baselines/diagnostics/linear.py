@@ -23,24 +23,18 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 """Training samples of the probes, and training samples and epochs of a quick run."""
 SEEDS = 2
-POSITION = "position"
-"""The pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image."""
-PIXELS = 1024
-"""Pixels drawn with replacement from each sample: so many over the image, and as many within the object."""
+POSITION = "position"  # the pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image
+PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
 TARGETS: dict[str, tuple[str, ...]] = {
     "edges": ("edges",), "depth": ("depth",), "distance": ("depth_mm",), "phase": ("sine", "cosine"),
     "order": ("order",),
 }  # fmt: skip
 """Targets of the linear probe, by the names in `fits.truth`; the phase is an angle and so has two."""
-INSIDE = ("distance", "phase", "order")
-"""Targets on object pixels only."""
-FRINGE = ("phase", "order")
-"""Targets that need fringes of a single direction."""
-SPATIAL = ("edges", "depth")
-"""Targets of the four-convolution probes, as in the paper."""
+INSIDE = ("distance", "phase", "order")  # targets on object pixels only
+FRINGE = ("phase", "order")  # targets that need fringes of a single direction
+SPATIAL = ("edges", "depth")  # targets of the four-convolution probes, as in the paper
 
-Errors = dict[tuple[str, str], list[float]]
-"""Squared error of each sample, by layer and target."""
+Errors = dict[tuple[str, str], list[float]]  # squared error of each sample, by layer and target
 Drawn = dict[bool, tuple[Tensor, Tensor]]
 """Pixels of a sample (P,) and their target values (P, T), over the image (False) and within the object (True)."""
 

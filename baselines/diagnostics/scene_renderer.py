@@ -25,10 +25,8 @@ Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
 
 
-_STEP = 1e-6
-"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
-_SAME_SURFACE_M = 1e-3
-"""A traced depth that differs from the stored depth by more belongs to another triangle."""
+_STEP = 1e-6  # step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding
+_SAME_SURFACE_M = 1e-3  # a traced depth that differs from the stored depth by more belongs to another triangle
 _GRAZING = 0.02
 """Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
 
@@ -154,8 +152,7 @@ def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) ->
 
 
 Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
-PITCH_FACTOR = 4 / 3
-"""Factor of the changed pitch: 18 px become 24."""
+PITCH_FACTOR = 4 / 3  # factor of the changed pitch: 18 px become 24
 Frames = list[NDArray[np.uint8] | None]
 
 

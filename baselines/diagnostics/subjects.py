@@ -29,8 +29,7 @@ OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
 FACTORY_MARK = ".py:"
 BATCH = 8
-PIXELS_AT_ONCE = BATCH * 224 * 224
-"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
+PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
 
 
 @dataclass(frozen=True, eq=False)

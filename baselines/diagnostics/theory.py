@@ -25,14 +25,11 @@ from fpp_ml_bench.optics import Direction, Rig
 
 DISTANCES_M = (0.3, 10.0)
 POINTS = 400
-SMALL_PERIODS = 1 / 64
-"""An error so small that the linear model holds over all distances."""
-WITHIN = 0.01
-"""Relative difference from exponent 2 that still counts as quadratic."""
+SMALL_PERIODS = 1 / 64  # an error so small that the linear model holds over all distances
+WITHIN = 0.01  # relative difference from exponent 2 that still counts as quadratic
 STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own position."""
-SET_BACK_M = 0.1
-"""Distance of the projector behind the camera in the rig that shows the limit of the thin baseline."""
+SET_BACK_M = 0.1  # distance of the projector behind the camera in the rig that shows the limit of the thin baseline
 _SHOWN_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
 
 

@@ -17,11 +17,9 @@ from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError, Weig
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.optics import Direction, Rig
 
-SHIPPED = Path(__file__).resolve().parent / "weights"
-"""Folder of the weights that come with the package."""
+SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "phase-net"
-PERIOD_TOLERANCE = 2.2
-"""Factor by which an image's fringe period in px may differ from that of the training images."""
+PERIOD_TOLERANCE = 2.2  # factor by which an image's fringe period in px may differ from that of the training images
 
 
 @dataclass(frozen=True)

@@ -34,13 +34,10 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction
 
 WEIGHTS = "phase-net.safetensors"
-SMALL_RAD = 0.05
-"""Error of the phase below which its loss is quadratic."""
-IMPOSSIBLE = -1e4
-"""Logit of an order that puts its pixel out of the working range: finite, for gradients to stay so."""
+SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
+IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
 LARGEST_GRADIENT = 50.0
-VALIDATED_SHARE = 5
-"""Every so many-th validation image is scored during training."""
+VALIDATED_SHARE = 5  # every so many-th validation image is scored during training
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
 LEADS = tuple(float(value) for value in range(8))
@@ -105,8 +102,7 @@ class Recipe:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
-Batch = dict[str, Tensor]
-"""The fields of `Window` with a leading axis B."""
+Batch = dict[str, Tensor]  # the fields of `Window` with a leading axis B
 
 
 def batch_of(windows: list[Window]) -> Batch:
