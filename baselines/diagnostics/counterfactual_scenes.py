@@ -70,12 +70,10 @@ class Move:
 
 @dataclass(frozen=True)
 class OutlineChange:
-    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
-    after."""
+    """The same phase under another outline; target pixels within the scene's mask show the object before and after."""
 
     name: str
     scene: Scene
-    unchanged: NDArray[np.bool_]
     depth_mm: NDArray[np.float64]
 
 
@@ -126,9 +124,8 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
             amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
-            moved_surface = rendering.moved(surface, renderer.rig, direction, rendering.times(amplitude, field))
-            lit = renderer.light(moved_surface)
-            before = sample.scene.lit
+            moved_surface = rendering.moved(surface, renderer.rig, direction, field, amplitude)
+            lit, before = renderer.light(moved_surface), sample.scene.lit
             phase, light, both = (
                 replace(sample.scene, lit=replace(one, gain=brightness.gain, ambient=brightness.ambient))
                 for one, brightness in ((lit, before), (before, lit), (lit, lit))
@@ -164,9 +161,9 @@ def outline_changes(
         cuts["another object's outline"] = moved[int(np.argmin(np.abs(np.array(shares) - KEPT_SHARE)))]
     for name, cut in cuts.items():
         inside_cut = cut.ravel()[sample.surface.pixels]
-        kept, pixels = sample.target & cut, sample.scene.pixels[inside_cut]
-        scene = replace(sample.scene, pixels=pixels, lit=_part(sample.scene.lit, inside_cut), mask=kept)
-        yield OutlineChange(name, scene, kept, sample.depth_mm * (inside & cut))
+        lit, pixels = _part(sample.scene.lit, inside_cut), sample.scene.pixels[inside_cut]
+        scene = replace(sample.scene, pixels=pixels, lit=lit, mask=sample.target & cut)
+        yield OutlineChange(name, scene, sample.depth_mm * (inside & cut))
     yield _grown(sample, renderer, inside)
 
 
@@ -183,7 +180,7 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
     gain = np.concatenate([sample.scene.lit.gain, sample.scene.lit.gain[source]])
     lit = replace(renderer.light(both), gain=gain)
     scene = replace(sample.scene, pixels=both.pixels.astype(np.uint32), lit=lit, mask=sample.target | ring)
-    return OutlineChange("grown", scene, sample.target, both.depth_mm(renderer.shape))
+    return OutlineChange("grown", scene, both.depth_mm(renderer.shape))
 
 
 def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:

@@ -117,8 +117,7 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, (text + "\n").encode("utf-8"))
+    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode("utf-8"))
 
 
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:

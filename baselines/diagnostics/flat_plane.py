@@ -19,7 +19,6 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.method import Frames
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -118,10 +117,14 @@ def kind_of(outline: str) -> str:
     return outline if outline in (FRAME, RECTANGLE) else SILHOUETTE
 
 
-def prediction_of(subject: Subject, frames: Frames) -> NDArray[np.float32]:
-    """The subject's prediction (H, W) in mm, or the network's own output where it is normalised. Range heads, which
-    would convert it to mm, are not part of the paper's probe."""
-    return subject.represent(frames) if subject.normalisation == "individual" else subject.predict(frames)
+def shown_to(
+    subject: Subject, renderer: SceneRenderer, scene: Scene
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
+    """The first frame of ``scene`` that the subject uses, and its prediction (H, W) in mm, or the network's own output
+    where it is normalised. Range heads, which would convert it to mm, are not part of the paper's probe."""
+    frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
+    predict = subject.represent if subject.normalisation == "individual" else subject.predict
+    return frames[subject.frames_used[0]], predict(frames)
 
 
 def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
@@ -149,10 +152,9 @@ def predict_planes(
                 lit, seen = renderer.light(surface), mask.copy()
                 seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
                 scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
-                frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
-                frame, prediction = frames[subject.frames_used[0]], prediction_of(subject, frames)
+                frame, answer = shown_to(subject, renderer, scene)
                 depth_mm = surface.depth_mm(renderer.shape)
-                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), prediction)
+                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), answer)
 
 
 def control_of(
@@ -162,8 +164,7 @@ def control_of(
     shares = []
     for sample in samples:
         unchanged = original(dataset, renderer, sample)
-        frames = renderer.frames(unchanged.scene, subject.frames_used, subject.uses_ground_truth_mask)
-        predicted = prediction_of(subject, frames)[unchanged.target].astype(np.float64)
+        predicted = shown_to(subject, renderer, unchanged.scene)[1][unchanged.target].astype(np.float64)
         true = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
         if scale.normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)

@@ -150,7 +150,7 @@ def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> Sample
     moved = [(predictor.predict(move.phase), move.depth_mm) for move in within]
     phase_changes = [change(after, depth_mm, target, target) for after, depth_mm in moved]
     unit, follow = rms_expected(phase_changes), follows(phase_changes)
-    outlined = [(predictor.predict(other.scene), other, other.unchanged & target) for other in scenes.outline_changes]
+    outlined = [(predictor.predict(other.scene), other, other.scene.mask & target) for other in scenes.outline_changes]
     outline_changes = [
         change(after, other.depth_mm, other.scene.mask & (other.depth_mm > 0), where)
         for after, other, where in outlined

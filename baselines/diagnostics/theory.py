@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved, times
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
@@ -92,8 +92,7 @@ class Theory(Probe):
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
         shown = [{key: getattr(curve, key) for key in keys} for curve in curves]
-        kappa = kappa_per_m(dataset.rig, twins.direction)
-        values = {"twins": twins.to_dict(), "kappa_per_m": kappa, "curves": shown}
+        values = {"twins": twins.to_dict(), "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "curves": shown}
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 
@@ -105,8 +104,8 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
     for sample in dataset.samples("test"):
         first = original(dataset, renderer, sample)
         for start in STARTS_PERIODS if first.target.any() else ():
-            shifts = (times(TAU * turns, constant) for turns in (start, start + 1))
-            pair = [moved(first.surface, renderer.rig, direction, shift) for shift in shifts]
+            shifts_rad = (TAU * turns for turns in (start, start + 1))
+            pair = [moved(first.surface, renderer.rig, direction, constant, shift) for shift in shifts_rad]
             if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
                 return _photographed(renderer, first, pair, direction)
     raise DiagnosisError(

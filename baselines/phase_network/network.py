@@ -22,8 +22,7 @@ FIRST_BIAS = 2.5  # start value of the biases of the base order and of no correc
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
     parts: list[nn.Module] = []
     for width in (inputs, outputs):
-        convolution = nn.Conv2d(width, outputs, 3, padding=1, bias=False)
-        parts += [convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
+        parts += [nn.Conv2d(width, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*parts)
 
 
