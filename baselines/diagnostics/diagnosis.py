@@ -148,12 +148,9 @@ def _prepare(out: Path) -> None:
 
 
 def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
+    told = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
     return {
-        "subject": {
-            "name": subject.name, "title": subject.title, "sha256": subject.sha256, "units": subject.units,
-            "normalisation": subject.normalisation, "frames_used": list(subject.frames_used),
-            "direction": subject.direction, "layers": list(subject.layer_names),
-        },
+        "subject": {**{key: getattr(subject, key) for key in told}, "layers": subject.layer_names},
         "dataset": {
             "name": dataset.path.resolve().name, "fingerprint": dataset.fingerprint, "size": list(dataset.size),
             "samples": {split: len(names) for split, names in dataset.splits.items()},
@@ -168,14 +165,11 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
 def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
     """The report: a section for each finding with its question and its pictures from ``folder``; ``context`` is what
     ``diagnose.json`` says about subject, dataset, settings and machine."""
-    sections = [
-        (
-            question, finding,
-            [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
-            [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables],
-        )
-        for question, finding in findings
-    ]  # fmt: skip
+    sections = []
+    for question, finding in findings:
+        figures = [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures]
+        tables = [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables]
+        sections.append((question, finding, figures, tables))
     body = render("fpp_ml_bench.baselines.diagnostics", "diagnosis.html", sections=sections, **context)
     name = context["subject"]["name"]
     return page(f"{name}: diagnosis", body, _STYLE, description=f"What {name} read")

@@ -213,19 +213,12 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
         )
         pose = f"{distance_m:g} m", f"{across:g}, {down:g}"
         lines.append((name, *pose, mean, std, f"{least:.4g} to {most:.4g}", *others))
-    return [
-        Table(
-            "Predictions for planes" + (", mm by the mean range of the test split" if normalised else ""),
-            ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
-             "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm"),
-            lines,
-        ),
-        Table(
-            "Share of background: the control", ("Pixels of", "Share"),
-            (("real objects, predicted", control["collapsed_share"]),
-             ("real objects, in truth", control["collapsed_share_true"])),
-        ),
-    ]  # fmt: skip
+    title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
+    header = ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
+              "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm")  # fmt: skip
+    keys = {"real objects, predicted": "collapsed_share", "real objects, in truth": "collapsed_share_true"}
+    shares = [(pixels, control[key]) for pixels, key in keys.items()]
+    return [Table(title, header, lines), Table("Share of background: the control", ("Pixels of", "Share"), shares)]
 
 
 def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> Figure:

@@ -63,13 +63,9 @@ class GradCam(probe.Probe):
             "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
             "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
         }  # fmt: skip
-        return self.finding(
-            summary(correlations),
-            {"protocol": protocol, **correlations.to_dict()},
-            tables(correlations),
-            _draw_bars(correlations, folder),
-            _draw_heatmaps(subject, dataset, samples, layers, folder),
-        )
+        values = {"protocol": protocol, **correlations.to_dict()}
+        drawn = _draw_bars(correlations, folder), _draw_heatmaps(subject, dataset, samples, layers, folder)
+        return self.finding(summary(correlations), values, tables(correlations), *drawn)
 
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
@@ -262,22 +258,18 @@ def tables(correlations: Correlations) -> list[Table]:
         pairs[name] = [correlations.mean(layer, target) for target in (EDGES, FRINGES)]
     for name, trained in (("Average", True), ("Average, random weights", False)):
         pairs[name] = [correlations.average(target, trained) for target in (EDGES, FRINGES)]
-    rows = [(name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()]
-    random = {layer: [correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN)]
-              for layer in correlations.layers}  # fmt: skip
-    return [
-        Table(
-            f"Correlation of Grad-CAM with edges and fringes, {len(correlations.objects)} test samples (the paper's "
-            "table)",
-            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "Ratio"),
-            [*rows, ("Edges with fringes", text_of(*correlations.references[:2]), None, None)],
-        ),
-        Table(
-            "Sanity check: the same with random weights",
-            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "r(CAM, trained CAM)"),
-            [(layer, *(text_of(*mean[:2]) for mean in means)) for layer, means in random.items()],
-        ),
+    rows: list[tuple[probe.Cell, ...]] = [
+        (name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()
     ]
+    rows.append(("Edges with fringes", text_of(*correlations.references[:2]), None, None))
+    random = []
+    for layer in correlations.layers:
+        means = (correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN))
+        random.append((layer, *(text_of(*mean[:2]) for mean in means)))
+    count, header = len(correlations.objects), ("Layer", "r(CAM, edges)", "r(CAM, fringes)")
+    title = f"Correlation of Grad-CAM with edges and fringes, {count} test samples (the paper's table)"
+    sanity = "Sanity check: the same with random weights"
+    return [Table(title, (*header, "Ratio"), rows), Table(sanity, (*header, "r(CAM, trained CAM)"), random)]
 
 
 def _draw_bars(correlations: Correlations, folder: Path) -> Figure:

@@ -68,13 +68,10 @@ class LinearProbing(Probe):
             "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
             "image_px_a_grid_step": fits.grid_step(subject.image_size),
         }  # fmt: skip
-        return self.finding(
-            linear_report.summary(linear, spatial),
-            {"protocol": protocol, **linear_report.values(linear, spatial)},
-            linear_report.tables(linear, spatial),
-            linear_report.draw_four_convolutions(spatial, folder),
-            linear_report.draw_one_by_one(linear, folder),
-        )
+        summary, tables = linear_report.summary(linear, spatial), linear_report.tables(linear, spatial)
+        values = {"protocol": protocol, **linear_report.values(linear, spatial)}
+        drawn = linear_report.draw_four_convolutions(spatial, folder), linear_report.draw_one_by_one(linear, folder)
+        return self.finding(summary, values, tables, *drawn)
 
 
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
@@ -107,13 +104,10 @@ class Pixels:
             truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
             inside, size = np.flatnonzero(truth["inside"]), truth["inside"].size
             pixels = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
-            self._drawn[sample] = {
-                key: (
-                    torch.from_numpy(pixels[key]),
-                    torch.from_numpy(np.stack([truth[name].ravel()[pixels[key]] for name in fields], axis=1)),
-                )
-                for key, fields in self.fields.items()
-            }
+            self._drawn[sample] = {}
+            for key, fields in self.fields.items():
+                values = np.stack([truth[name].ravel()[pixels[key]] for name in fields], axis=1)
+                self._drawn[sample][key] = torch.from_numpy(pixels[key]), torch.from_numpy(values)
         return self._drawn[sample]
 
     def errors_of(self, layer: str, inside: bool, errors: Tensor) -> Iterator[tuple[tuple[str, str], float]]:

@@ -99,7 +99,7 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
     keys = ("edges", "depth")
     errors = [(name, *(mean_over(row, key) for key in keys), mean_ratio(row)) for name, row in rows.items()]
-    of_mean = ("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw))
+    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw)))
 
     def r2(one: Score) -> str:
         return with_interval(one["r2"], one["r2_interval"])
@@ -113,21 +113,15 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     for layer, scores in linear[CONTROLS].items():
         cells = ((f"{scores[target]['r2']:.3f}", None) for target in targets)
         one_by_one.append([_CONTROLS[layer], *(cell for pair in cells for cell in pair)])
+    paper = ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges")
+    both = ("Layer", "Edges R2", "random weights", "Depth R2", "random weights")
+    each = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
+    of_raw = ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)
     return [
-        Table(
-            "Four-convolution probes, validation MSE (the paper's table; lower is easier to read)",
-            ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"), [*errors, of_mean],
-        ),
-        Table(
-            "The same probes, share of variance explained (R2)",
-            ("Layer", "Edges R2", "random weights", "Depth R2", "random weights"),
-            [*shares, ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)],
-        ),
-        Table(
-            "Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)",
-            ["Layer", *(title for target in targets for title in (TITLES[target], "random"))], one_by_one,
-        ),
-    ]  # fmt: skip
+        Table("Four-convolution probes, validation MSE (the paper's table; lower is easier to read)", paper, errors),
+        Table("The same probes, share of variance explained (R2)", both, [*shares, of_raw]),
+        Table("Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)", each, one_by_one),
+    ]
 
 
 def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
