@@ -200,8 +200,7 @@ def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray
 
 
 def _ellipse(sample: Original) -> NDArray[np.bool_]:
-    """An ellipse at the target's centre, with axes in proportion to its standard deviations, that holds `KEPT_SHARE` of
-    its pixels."""
+    """An ellipse that holds `KEPT_SHARE` of the target's pixels, with its centre and shape (standard deviations)."""
     points = np.argwhere(sample.target).astype(np.float64)
     spread = np.maximum(points.std(axis=0), 1.0)
     rows, columns = np.indices(sample.target.shape)

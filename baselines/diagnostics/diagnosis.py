@@ -50,9 +50,8 @@ def diagnose(
 ) -> list[ProbeResult]:  # fmt: skip
     """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
     in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
-    same; those of other probes join the report. ``progress`` is called with a probe before it runs. ``command`` is
-    quoted in the report. Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes;
-    earlier findings stay."""
+    same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
+    ``command``. Raises `DiagnosisError` if ``out`` holds other files, and errors of probes; earlier findings stay."""
     _prepare(out)
     selected = checked_names(probe_names)
     results = []
@@ -86,8 +85,7 @@ def diagnose(
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """``names`` without repeats, in the order of the report; all probes if empty. Raises `DiagnosisError` for an
-    unknown name."""
+    """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
     for name in names:
         if name not in PROBES:
             hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))

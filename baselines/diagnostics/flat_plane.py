@@ -174,8 +174,7 @@ def control_of(
 
 
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
-    """The share that collapsed in each outline, the mean prediction at the paper's distance, and for mm the means at
-    all distances."""
+    """The share that collapsed in each outline, the mean at the paper's distance, and for mm those at all distances."""
     shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
               for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]

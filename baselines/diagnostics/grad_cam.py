@@ -139,8 +139,7 @@ class Mean(NamedTuple):
 
 
 class Correlations:
-    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference map; one value per sample, whose
-    objects are ``objects``."""
+    """By weights (``trained``, ``untrained 0``, ...), layer and reference; each one a sample of ``objects``."""
 
     def __init__(self, layers: Sequence[str], objects: list[str]) -> None:
         self.layers, self.objects = tuple(layers), objects

@@ -203,8 +203,7 @@ class SceneRenderer:
         return render.light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
-        """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
-        0 outside ``scene.mask``."""
+        """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
         usual = self._other_pitch if scene.projected == "other pitch" else self.exposure
         inside = self._uniform if scene.projected == "no fringe inside" else usual
         outside = self._uniform if scene.projected == "no fringe outside" else usual

@@ -86,8 +86,7 @@ class Subject:
         return depth.astype(np.float32, copy=False)
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
-        """The input of ``network`` for several samples: float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without
-        its frame."""
+        """Input of ``network``, float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without its frame."""
         return _input_batch(stacks, self.frames_used[0], self.image_size, self.name)
 
     @property

@@ -259,9 +259,8 @@ def mean_scores(
 
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
     """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
-    its whole depth; ``right_mae_mm`` is the MAE of the pixels with the right order; ``wrong_percent`` and
-    ``missed_percent`` are shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in
-    thousands."""
+    its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
+    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)

@@ -64,8 +64,7 @@ def clipped_share(capture: Capture, fit: FringeFit, inside: Mask, window: Window
 
 
 def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
-    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and its part that comes from the order; 0 outside
-    the mask."""
+    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and the order's part of it; 0 outside the mask."""
     layer = observation.layer
     z = np.maximum(depth_mm, 1.0) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
