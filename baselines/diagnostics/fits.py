@@ -134,8 +134,7 @@ def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.
 
 @lru_cache(maxsize=2)
 def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    plane = np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M)
-    return periods_at(plane, rig, direction)
+    return periods_at(np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M), rig, direction)
 
 
 class NormalEquations:

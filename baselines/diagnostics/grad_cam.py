@@ -139,7 +139,7 @@ class Mean(NamedTuple):
 
 
 class Correlations:
-    """By weights (``trained``, ``untrained 0``, ...), layer and reference; each one a sample of ``objects``."""
+    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference, of samples of ``objects``."""
 
     def __init__(self, layers: Sequence[str], objects: list[str]) -> None:
         self.layers, self.objects = tuple(layers), objects

@@ -220,8 +220,7 @@ class Experiment:
         steps = epochs * -(-len(self.train) // fits.BATCH)
         probes = fits.ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
         for epoch in range(epochs):
-            order = np.random.default_rng([1, epoch]).permutation(len(self.train))
-            shuffled = [self.train[index] for index in order]
+            shuffled = [self.train[index] for index in np.random.default_rng([1, epoch]).permutation(len(self.train))]
             for features, targets in self._map_batches(networks, shuffled, "training four-convolution probes"):
                 probes.step(features, targets)
         errors: dict[tuple[fits.Source, str, int], list[float]] = {}

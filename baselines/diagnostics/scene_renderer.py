@@ -24,7 +24,6 @@ from fpp_ml_bench.optics import Direction, Rig
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
 
-
 _STEP = 1e-6  # step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding
 _SAME_SURFACE_M = 1e-3  # a traced depth that differs from the stored depth by more belongs to another triangle
 _GRAZING = 0.02
