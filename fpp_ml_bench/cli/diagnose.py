@@ -81,31 +81,25 @@ def run(args: argparse.Namespace) -> int:
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        diagnosis = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
-    show(_table(model.title, diagnosis))
-    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
-    return 0
-
-
-def _table(title: str, diagnosis: "diagnostics.Diagnosis") -> Table:
-    table = Table(title=Text(title), title_justify="left")
+        results = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+    table = Table(title=Text(model.title), title_justify="left")
     table.add_column("Probe")
     table.add_column("Summary", overflow="fold")
     table.add_column("Seconds", justify="right")
-    for result in diagnosis.results:
+    for result in results:
         text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
         table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
-    return table
+    show(table)
+    print(f"Written: {args.out / diagnostics.REPORT_FILE}\nWritten: {args.out / diagnostics.JSON_FILE}")
+    return 0
 
 
 def _command(args: argparse.Namespace) -> str:
     """The command that makes the same report, without the machine's settings."""
     words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
-    for name in args.probe:
-        words += ["--probe", name]
-    for option in ("samples", "seeds", "frame", "units"):
-        value = getattr(args, option)
-        words += [] if value is None else [f"--{option}", str(value)]
+    options = [("probe", name) for name in args.probe]
+    options += [(name, getattr(args, name)) for name in ("samples", "seeds", "frame", "units")]
+    words += [word for name, value in options if value is not None for word in (f"--{name}", str(value))]
     words += ["--quick"] if args.quick else []
     words += ["--layers", *args.layers] if args.layers else []
     return shlex.join(words)
