@@ -7,7 +7,7 @@ Only the module of the command that runs is imported, and such a module imports 
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType, SimpleNamespace
 
@@ -55,6 +55,17 @@ examples:
 
 fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped.
 """
+
+
+def count(most: int = 100_000) -> Callable[[str], int]:
+    """Type of an option: a whole number from 1 to ``most``."""
+
+    def parsed(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {most}, got {text!r}")
+        return int(text)
+
+    return parsed
 
 
 def _formatter(prog: str) -> argparse.HelpFormatter:

@@ -27,55 +27,37 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
-    classical = parser.add_argument_group("classical")
-    classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
-    classical.add_argument(
-        "--direction", choices=("horizontal", "vertical", "both"),
-        help="fringes to use: one direction is enough for a depth (default: both)",
-    )  # fmt: skip
-    classical.add_argument(
-        "--fewest", action="store_const", const=True,
-        help="capture only the Gray frames that the rig's range needs: with both directions usually none",
-    )  # fmt: skip
-    classical.add_argument(
-        "--depth-noise", type=float, metavar="MM",
+    add = parser.add_argument_group("classical").add_argument
+    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    add("--direction", choices=("horizontal", "vertical", "both"),
+        help="fringes to use: one direction is enough for a depth (default: both)")  # fmt: skip
+    add("--fewest", action="store_const", const=True,
+        help="capture only the Gray frames that the rig's range needs: with both directions usually none")  # fmt: skip
+    add("--depth-noise", type=float, metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
     )  # fmt: skip
-    phase = parser.add_argument_group("phase and phase-net")
-    phase.add_argument(
-        "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
-    )
-    phase.add_argument(
-        "--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)"
-    )
-    phase.add_argument(
-        "--error-mm", type=float, metavar="MM",
+    add = parser.add_argument_group("phase and phase-net").add_argument
+    add("--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)")
+    add("--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)")
+    add("--error-mm", type=float, metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
-        "with a single fringe; may need the Gray code",
-    )  # fmt: skip
-    phase.add_argument(
-        "--prior", choices=("none", "standoff"),
+             "with a single fringe; may need the Gray code")  # fmt: skip
+    add("--prior", choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )  # fmt: skip
-    phase.add_argument(
-        "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
-    )
-    phase.add_argument(
-        "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
-    )
-    phase.add_argument(
-        "--weights", metavar="FILE",
+    add("--no-shading", action="store_const", const=True, help="choose the fringe order without brightness")
+    add("--min-confidence", type=float, metavar="C",
+        help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
+    add("--weights", metavar="FILE",
         help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
-        "phase-net-fresh, trained on additional objects)",
-    )  # fmt: skip
-    network = parser.add_argument_group("trained networks")
-    network.add_argument(
-        "--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
+             "phase-net-fresh, trained on additional objects)")  # fmt: skip
+    add = parser.add_argument_group("trained networks").add_argument
+    add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
-        "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
+             "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
     )  # fmt: skip
-    network.add_argument("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
-    network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
+    add("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
+    add("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
 def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":

@@ -24,14 +24,15 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
+    add = parser.add_argument
+    add("method", metavar="METHOD", help=METHOD_HELP)
     text = "dataset folder; scenes are made from its test objects"
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help=text)
+    add("dataset", type=Path, metavar="DATASET", help=text)
     text = "samples of each test object, 1 to 6 (default: 2)"
-    parser.add_argument("--views", type=int, default=2, metavar="N", help=text)
+    add("--views", type=int, default=2, metavar="N", help=text)
     text = "write the score into this result or leaderboard row of the same method (.json)"
-    parser.add_argument("--into", type=Path, metavar="FILE", help=text)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
+    add("--into", type=Path, metavar="FILE", help=text)
+    add("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
     add_method_options(parser)
 
 

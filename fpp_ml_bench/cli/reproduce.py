@@ -24,33 +24,22 @@ ALL = "all"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
-    parser.add_argument(
-        "table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}"
-    )
-    parser.add_argument(
-        "--preset", choices=PRESETS, default="cpu",
-        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)"
-    )
-    parser.add_argument(
-        "--runs", type=Path, default=Path("runs"), metavar="DIR",
-        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
-    )  # fmt: skip
-    parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
-    parser.add_argument(
-        "--only-missing", action="store_true",
+    add = parser.add_argument
+    add("table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}")
+    add("--preset", choices=PRESETS, default="cpu",
+        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU")  # fmt: skip
+    add("--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)")
+    add("--runs", type=Path, default=Path("runs"), metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)")  # fmt: skip
+    add("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
+    add("--only-missing", action="store_true",
         help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
-        "again. Finished trainings are always kept",
-    )  # fmt: skip
-    parser.add_argument(
-        "--minutes", type=_minutes, metavar="M",
+             "again. Finished trainings are always kept")  # fmt: skip
+    add("--minutes", type=_minutes, metavar="M",
         help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-        "continues",
-    )  # fmt: skip
-    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
-    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
+             "continues")  # fmt: skip
+    add("--anyway", action="store_true", help="train preset paper even without a GPU")
+    add("--list", action="store_true", help="show rows, recipes and their state, and stop")
 
 
 def _minutes(text: str) -> float:
