@@ -160,14 +160,16 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
             pixels * (len(method.frames_used) // 2), saved_s * scale,
             f"{how} predicted again now with skipping off and on, and scaled up",
         ))  # fmt: skip
-    elif method.crops:
+    else:
         for frames in stacks:
-            rows, columns = method.crop(frames)
+            if (crop := method.crop(frames)) is None:
+                break
+            rows, columns = crop
             done += (rows.stop - rows.start) * (columns.stop - columns.start)
-        lines.append(LeftOut(
-            "local fits and orders far from the object", "pixels", round(done * scale),
-            round((count * height * width - done) * scale), None, None,
-            f"pixels counted on {how}; the crop is part of the method, so there is no run without it to measure "
-            "against",
-        ))  # fmt: skip
+        else:
+            rule = "the crop is part of the method, so there is no run without it to measure against"
+            lines.append(LeftOut(
+                "local fits and orders far from the object", "pixels", round(done * scale),
+                round((count * height * width - done) * scale), None, None, f"pixels counted on {how}; {rule}",
+            ))  # fmt: skip
     return explained("predict", f"{method.title}; {len(samples)} samples of {width}x{height} px", lines)

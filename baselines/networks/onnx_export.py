@@ -36,12 +36,10 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
         raise NetworkError(f"expected a network or a model that holds one; it was given {type(model).__name__}")
     height, width = (size, size) if isinstance(size, int) else size
     network.check_size(height, width)
-
     target = Path(path)
     if not target.parent.is_dir():
         raise FppBenchError(f"can't write {target}: there is no folder {target.parent}; make it first")
-    first = next(network.parameters())
-    example = torch.zeros(1, 1, height, width, dtype=torch.float32, device=first.device)
+    example = torch.zeros(1, 1, height, width, dtype=torch.float32, device=next(network.parameters()).device)
     try:
         # A file that appears under its name only when whole.
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:

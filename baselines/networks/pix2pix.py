@@ -70,7 +70,7 @@ class Pix2Pix(FringeNetwork):
         width = base.whole(self.name, "width", width)
         super().__init__(width=width)
         self.generator = Generator(width)
-        base.initialise_normal(self)
+        base.initialise(self, "gan")
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
@@ -98,7 +98,7 @@ class Discriminator(nn.Module):
         super().__init__()
         self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
         self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))
-        base.initialise_normal(self)
+        base.initialise(self, "gan")
 
     def forward(self, pair: Tensor) -> list[list[Tensor]]:
         features = []

@@ -54,7 +54,7 @@ def fit_heads(
                 split: _Pairs(network, probe, config, dataset_folder, split, cap, progress)
                 for split, cap in (("train", TRAIN_PAIRS), ("validation", VALIDATION_PAIRS))
             }
-            return _fit(runs["train"], runs["validation"]).to_tensors()
+            return vars(_fit(runs["train"], runs["validation"]))
     finally:
         network.train(was_training)
 
@@ -92,8 +92,7 @@ class _Pairs:
         places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
         self.order = [usable[place] for place in places]
         self.network, self.probe, self.name, self.progress = network, probe, config.name, progress
-        self.device = next(network.parameters()).device
-        self.size = source.size
+        self.device, self.size = next(network.parameters()).device, source.size
         self.batch = max(1, min(4, _PIXELS_AT_ONCE // (self.size[0] * self.size[1])))
 
     def run(self) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
@@ -134,9 +133,8 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     )
     validation_features = [(validation.probe.pooled().numpy(), range_mm) for _, _, range_mm in validation.run()]
     validation_pooled, validation_ranges = (np.concatenate(part) for part in zip(*validation_features, strict=True))
-    strength, weight, bias, error_mm = _ridge(
-        np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges
-    )
+    fitted = _ridge(np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges)
+    strength, weight, bias, error_mm = fitted
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
         mean_range_mm=torch.from_numpy(mean), range_weight=torch.from_numpy(weight), range_bias=torch.from_numpy(bias),
@@ -152,15 +150,11 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
             tally.add(logits, depth.cpu().numpy()[:, 0], depth_mm)
     best = {twin: tally.best() for twin, tally in tallies.items()}
     heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
+    mean_error_mm = _range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges)
     report = HeadReport(
-        mean_range_error_mm=_range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges),
-        predicted_range_error_mm=error_mm,
-        mask_iou=best["predicted"][2],
-        mean_overall_mae_mm=best["mean"][1],
-        predicted_overall_mae_mm=best["predicted"][1],
-        ridge_strength=strength,
+        mean_error_mm, error_mm, best["predicted"][2], best["mean"][1], best["predicted"][1], ridge_strength=strength
     )
-    heads.report.copy_(report.to_tensor())
+    heads.report.copy_(torch.tensor(report, dtype=torch.float64))
     return heads
 
 
@@ -243,7 +237,6 @@ class _Tally:
         equal = np.flatnonzero(above == above.min())
         run = equal[: np.flatnonzero(np.diff(equal, append=-1) != 1)[0] + 1]
         best_bin = int(run[len(run) // 2])
-        pixels = self.inside.sum() + self.outside.sum()
-        hit, false = self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
-        iou = float(hit / (self.inside.sum() + false))
-        return best_bin * LOGIT_STEP - LOGIT_LIMIT, float((self.without + above[best_bin]) / pixels), iou
+        inside, hit, false = self.inside.sum(), self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
+        mae_mm = float((self.without + above[best_bin]) / (inside + self.outside.sum()))
+        return best_bin * LOGIT_STEP - LOGIT_LIMIT, mae_mm, float(hit / (inside + false))

@@ -31,8 +31,7 @@ def discriminator(**options: int | float) -> "networks.Discriminator":
 
 def _constructed(label: str, cls: type, options: dict[str, Any]) -> Any:
     parameters = inspect.signature(cls).parameters
-    unknown = sorted(set(options) - set(parameters))
-    if unknown:
+    if unknown := sorted(set(options) - set(parameters)):
         available = ", ".join(f"{p.name} (default {p.default})" for p in parameters.values())
         raise NetworkError(f"{label} has no option {', '.join(map(repr, unknown))}; there are: {available}")
     return cls(**options)

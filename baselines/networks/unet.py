@@ -7,14 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import base
-from fpp_ml_bench.baselines.networks.base import (
-    DoubleConvolution,
-    FringeNetwork,
-    Join,
-    ResidualBlock,
-    TransformerLayer,
-    in_full_precision,
-)
+from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwork, Join, ResidualBlock
 from fpp_ml_bench.errors import NetworkError
 
 
@@ -35,7 +28,7 @@ class UShape(FringeNetwork):
             Join(2 * c_out, c_out, DoubleConvolution(2 * c_out, c_out)) for c_out in reversed(widths[:4])
         )
         self.head = nn.Conv2d(width, 1, 1)
-        base.initialise_convolutions(self)
+        base.initialise(self, "convolutions")
         self.bottleneck = bottleneck
 
     @property
@@ -53,7 +46,7 @@ class UShape(FringeNetwork):
         x = self.bottleneck(x)
         for block in self.decoder:
             x = block(x, skips.pop())
-        return in_full_precision(self.head, x)
+        return base.in_full_precision(self.head, x)
 
 
 class UNet(UShape):
@@ -70,7 +63,7 @@ class UNet(UShape):
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
         bottleneck = DoubleConvolution(8 * width, 16 * width)
-        base.initialise_convolutions(bottleneck)
+        base.initialise(bottleneck, "convolutions")
         super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout)
 
 
@@ -92,10 +85,10 @@ class TokenBottleneck(nn.Module):
         self.patch = patch
         self.embed = nn.Conv2d(c_in, channels, patch, patch)
         self.position = nn.Parameter(torch.empty(1, self.grid**2, channels))
-        self.layers = nn.Sequential(*(TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
+        self.layers = nn.Sequential(*(base.TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
         self.norm = nn.LayerNorm(channels)
         self.unembed = nn.Linear(channels, c_out * patch**2)
-        base.initialise_tokens(self)
+        base.initialise(self, "tokens")
         for weight in (self.position, self.embed.weight):
             nn.init.trunc_normal_(weight, std=0.02)
         if self.embed.bias is not None:
@@ -160,7 +153,7 @@ class ResUNet(FringeNetwork):
             for c in reversed(widths[:3])
         )
         self.head = nn.Conv2d(width, 1, 1)
-        base.initialise_convolutions(self)
+        base.initialise(self, "convolutions")
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
@@ -176,4 +169,4 @@ class ResUNet(FringeNetwork):
         x = self.bottleneck(skips.pop())
         for block in self.decoder:
             x = block(x, skips.pop())
-        return in_full_precision(self.head, x)
+        return base.in_full_precision(self.head, x)

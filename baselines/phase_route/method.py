@@ -33,7 +33,6 @@ class PhaseMethod(Method):
     """
 
     name = "phase"
-    crops = True
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         try:

@@ -141,9 +141,9 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
             f"{height}; give another --data, or none to have it built, or build it: {command}"
         )
     for job in jobs:
-        if job.recipe.data_config not in opened.configs:
+        if job.recipe.frames not in opened.configs:
             raise DatasetError(
-                f"{folder}: {job.rows[0]} needs the frames of {job.recipe.data_config}, stored are those of "
+                f"{folder}: {job.rows[0]} needs the frames of {job.recipe.frames}, stored are those of "
                 f"{', '.join(opened.configs)}; build it with all frames: {command}"
             )
     _check_same_dataset(opened, folders)

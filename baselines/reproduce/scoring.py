@@ -90,12 +90,9 @@ class AllFrames(StrictModel):
 
 
 def score_all_frames(
-    opened: DatasetFolder,
-    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
-    frames: Sequence[int],
-    scoring: tuple[Units, Mode],
-    about: Mapping[str, str],
-) -> AllFrames:
+    opened: DatasetFolder, predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]], frames: Sequence[int],
+    scoring: tuple[Units, Mode], about: Mapping[str, str],
+) -> AllFrames:  # fmt: skip
     """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out) on every test sample and
     frame. ``about``: ``recipe`` and ``weights_sha256`` of the network.
 

@@ -147,7 +147,7 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     path = settings.folders.all_frames(recipe)
     if settings.only_missing and scoring.all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    frames, about = opened.sequence.config(recipe.data_config), {"recipe": recipe.name, "weights_sha256": model.sha256}
+    frames, about = opened.sequence.config(recipe.frames), {"recipe": recipe.name, "weights_sha256": model.sha256}
     scores = scoring.score_all_frames(
         opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
     )

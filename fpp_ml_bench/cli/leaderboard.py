@@ -8,6 +8,7 @@ from typing import Any
 from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.evaluation.protocol import METRICS
 from fpp_ml_bench.leaderboard import page
 
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     groups, papers = leaderboard.rank(entries, args.sort), leaderboard.chosen_tables(args.paper)
     for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
         if path is not None:
-            leaderboard.write_text(path, text(groups, papers, args.sort))
+            result.write_file(text(groups, papers, args.sort).encode("utf-8"), path)
     if args.page is not None:
         shipped = None if args.results else tradeoff.shipped_tradeoff()
         settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)
