@@ -90,15 +90,11 @@ def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -
     pitch, length = rig.pitch(direction), rig.pattern_length(direction)
     allowed = limits.max_clipped_steps
     return DirectionPlan(
-        direction=direction,
-        sinusoids=tuple(available[i] for i in chosen),
-        gray=tuple(rig.sequence.gray(direction)),
+        direction, sinusoids=tuple(available[i] for i in chosen), gray=tuple(rig.sequence.gray(direction)),
         weights=phase_weights(2 * np.pi * np.array(chosen) / rig.sequence.steps),
-        centres_rad=optics.cell_centres_rad(length, pitch),
-        pitch_px=pitch,
-        length_px=length,
+        centres_rad=optics.cell_centres_rad(length, pitch), pitch_px=pitch, length_px=length,
         max_clipped_steps=steps // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,8 +109,7 @@ class Coordinates:
 
     def at(self, indices: NDArray[np.intp]) -> "Coordinates":
         """The coordinates of the pixels at ``indices`` only."""
-        u, modulation, phase, reason = self.coordinate_px, self.modulation, self.phase, self.reason
-        return Coordinates(u[indices], modulation[indices], phase[indices], reason[indices])
+        return Coordinates(*(values[indices] for values in vars(self).values()))
 
 
 def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:

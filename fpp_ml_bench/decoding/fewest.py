@@ -195,8 +195,7 @@ def nearest_pair(
 
 def with_order(coordinates: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
     """Coordinates of a direction from its wrapped phase and its fringe orders (n,), as with Gray code."""
-    absolute = coordinates.phase + 2 * np.pi * order
-    coordinate = absolute * (rig.pitch(direction) / (2 * np.pi))
+    coordinate = (coordinates.phase + 2 * np.pi * order) * (rig.pitch(direction) / (2 * np.pi))
     reason = coordinates.reason.copy()
     outside = (coordinate < -0.5) | (coordinate > rig.pattern_length(direction) - 0.5)
     reason[(reason == 0) & outside] = Reason.OUTSIDE_PATTERN

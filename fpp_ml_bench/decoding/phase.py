@@ -48,8 +48,7 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
     shifts = np.asarray(shifts_rad, dtype=np.float64)
     if shifts.ndim != 1 or len(shifts) < 3 or not np.all(np.isfinite(shifts)):
         raise DecodeError(f"shifts_rad: expected at least 3 finite phase shifts in rad, got {shifts_rad!r}")
-    count = len(shifts)
-    turns = shifts / (2 * np.pi)
+    count, turns = len(shifts), shifts / (2 * np.pi)
     model = np.stack([np.ones(count), cosine_of_turns(turns), sine_of_turns(turns)], axis=1)
     weights = model.T * np.array([[1.0], [2.0], [2.0]]) / count
     if np.abs(weights @ model - np.eye(3)).max() < 1e-12:
