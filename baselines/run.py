@@ -41,11 +41,8 @@ def predict_split(
     `REPORTS_FILE`, and its summary of them into the submission's settings.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
-    the median over the split.
-
-    Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same samples, and
-    `DatasetError` when the dataset lacks a frame that the method needs.
-    """
+    the median over the split. Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the
+    same samples, and `DatasetError` when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)
     _prepare(out, samples)
     seconds: list[float] = []

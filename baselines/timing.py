@@ -29,11 +29,9 @@ def time_method(
     opened: DatasetFolder, method: Method, split: str = "test", batch: int = 4, repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Timing:  # fmt: skip
-    """Time ``method`` on images of ``split``: see `Timing` for what each figure means.
-
-    Frames are in memory before the clock starts, at most ``batch`` sequences of them: no reading or writing counts.
-    Raises `DatasetError` for an empty split, or when the dataset lacks a frame that the method needs.
-    """
+    """Time ``method`` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before the
+    clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an empty
+    split, or when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)
     if not samples:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to time")
@@ -116,10 +114,8 @@ def _status_mib(key: str) -> float:
 
 
 def check_target(path: Path, method: Method) -> None:
-    """Refuse, before any work, a file that is no submission or result, or that describes another method.
-
-    Raises SubmissionError, which says what differs.
-    """
+    """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
+    SubmissionError, which says what differs."""
     submission = read_result(path).submission if path.suffix == ".json" else _described(path)
     for key, in_file, timed in (
         ("method", submission.method, method.name),

@@ -132,10 +132,8 @@ def assumption_sentences(result: Result) -> str:
 
 
 def short_names(submissions: Sequence[Submission]) -> list[str]:
-    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name.
-
-    Where two would get the same, the later by its own name has a number behind it.
-    """
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name. Where
+    two would get the same, the later by its own name has a number behind it."""
     derived = {submission.name: _from_settings(submission) for submission in submissions}
     chosen: dict[str, str] = {}
     taken: set[str] = set()

@@ -141,10 +141,8 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
 
 
 def write_page_of(results: Sequence[Path], folder: Path) -> None:
-    """Write the page of result and row files, or of the rows shipped with the package where none are named.
-
-    Nothing is looked for in the current folder. Raises SubmissionError for a file that is no sound result.
-    """
+    """Write the page of result and row files, or of the rows shipped with the package where none are named. Nothing is
+    looked for in the current folder. Raises SubmissionError for a file that is no sound result."""
     rows = expand(results) if results else shipped_rows()
     settings = None if results else shipped_tradeoff()
     write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
@@ -152,10 +150,8 @@ def write_page_of(results: Sequence[Path], folder: Path) -> None:
 
 def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
     """Copy the page in folder ``page`` to ``folder`` and add the Space's README; ``dataset_repo`` is linked from it.
-
-    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space
-    publishes every file.
-    """
+    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space publishes
+    every file."""
     if not (page / INDEX).is_file():
         raise PublishError(f"{page}: expected a page with {INDEX}; write one with: fpp-bench leaderboard --page {page}")
     files = staged_files(page)
@@ -199,11 +195,9 @@ class ScoredOn:
 
 
 def stage_results(paths: Sequence[Path], repo: str, scored_on: ScoredOn, folder: Path) -> Publication:
-    """Write a file for each result into ``folder``; it replaces an earlier result of the same task.
-
-    Only numbers and fixed words of a result are published, no text that its author wrote. A result scored on other data
-    is refused, as is a result of another split or target, or without an object score (`PublishError`).
-    """
+    """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
+    fixed words of a result are published, no text that its author wrote. A result scored on other data is refused, as
+    is a result of another split or target, or without an object score (`PublishError`)."""
     source_url, fingerprint = scored_on.source_url, scored_on.about.get("fingerprint")
     if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
         raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")

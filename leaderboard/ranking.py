@@ -48,11 +48,9 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last.
-
-    Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group
-    holds a name twice.
-    """
+    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last. Equal
+    values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group holds a
+    name twice."""
     if sort not in SORT_KEYS:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}

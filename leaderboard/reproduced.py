@@ -81,11 +81,9 @@ class Line:
 
 
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty.
-
-    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
-    the leaderboard: the first frame only, without a number of the paper.
-    """
+    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty. Where the paper
+    scores every frame (multi-frame), a training's first line does too, and a second line is its row in the leaderboard:
+    the first frame only, without a number of the paper."""
     reported = {row.row: row for row in paper_tables()[table].rows}
     recipes = {name: job.recipe for job in jobs for name in job.rows}
     lines = []

@@ -117,10 +117,8 @@ def write_row(entry: Entry, provenance: str, path: Path) -> None:
 
 
 def picture_of(entry: Entry) -> bytes | None:
-    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size.
-
-    Its pixels are not decoded here; a browser shows it as a PNG or not at all.
-    """
+    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size. Its
+    pixels are not decoded here; a browser shows it as a PNG or not at all."""
     path = entry.path.with_suffix(".png")
     if path.is_symlink() or not path.is_file():
         return None

@@ -151,10 +151,8 @@ def paper_note(paper: PaperTable) -> str:
 
 
 def group_tables(groups: Sequence[Group], sort: str, width: int) -> list[Table | Text]:
-    """A table for each group, for a terminal of ``width`` characters; without groups, how to begin.
-
-    Submitted text goes in as `Text`: it is never markup.
-    """
+    """A table for each group, for a terminal of ``width`` characters; without groups, how to begin. Submitted text goes
+    in as `Text`: it is never markup."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
@@ -188,9 +186,7 @@ def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
 
 def markdown_text(text: str) -> str:
     """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
-
-    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins.
-    """
+    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
     safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
     return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
 

@@ -119,11 +119,9 @@ TWINS: tuple[Twin, ...] = get_args(Twin)
 
 
 class HeadReport(NamedTuple):
-    """How the heads do on the validation split, on which ridge strength and thresholds were chosen.
-
-    Range errors are means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is that of
-    predicted and true object, all pixels pooled, at the threshold of ``predicted``.
-    """
+    """How the heads do on the validation split, on which ridge strength and thresholds were chosen. Range errors are
+    means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is that of predicted and true
+    object, all pixels pooled, at the threshold of ``predicted``."""
 
     mean_range_error_mm: float
     predicted_range_error_mm: float
@@ -234,10 +232,8 @@ class Model:
 
         Under raw or global normalisation the output as it is, negative values and all; under individual normalisation
         the range heads make it, with a range ``predicted`` from the image or the training set's ``mean``. A network
-        trained with the background removed expects ``fringe`` to be 0 outside the object.
-
-        Raises `PredictionError` for another image or an output that is not finite, `WeightsError` without range heads.
-        """
+        trained with the background removed expects ``fringe`` to be 0 outside the object. Raises `PredictionError` for
+        another image or an output that is not finite, `WeightsError` without range heads."""
         return self.predict_batch([fringe], depth_range)[0]
 
     def predict_batch(self, fringes: Sequence[Fringe], depth_range: Twin = "predicted") -> NDArray[np.float32]:

@@ -55,12 +55,10 @@ class Generator(nn.Sequential):
 
 
 class Pix2Pix(FringeNetwork):
-    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back.
-
-    Output can't leave [0, 1], so the network suits representations in that range. width: channels of the first layer.
-    Convolutions start from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width
-    channels, 1/16 of the image), up4..up1 (up1 at full resolution, ``width`` channels).
-    """
+    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back. Output can't leave
+    [0, 1], so the network suits representations in that range. width: channels of the first layer. Convolutions start
+    from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width channels, 1/16 of the
+    image), up4..up1 (up1 at full resolution, ``width`` channels)."""
 
     name = "pix2pix"
     stride = 2**DOWNSAMPLINGS
@@ -84,12 +82,10 @@ class Pix2Pix(FringeNetwork):
 
 
 class Discriminator(nn.Module):
-    """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64.
-
-    ``forward`` takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1]. It gives, for each scale (full
-    resolution first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the
-    judgement, (B, 1, h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer.
-    """
+    """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64. ``forward``
+    takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1]. It gives, for each scale (full resolution
+    first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the judgement, (B, 1,
+    h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer."""
 
     def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
         width = base.whole("discriminator", "width", width)

@@ -39,11 +39,9 @@ def fit_heads(
 
     Mean range, ridge regression and mask come from the training split; the ridge's strength and the masks' thresholds
     (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. ``progress`` is given the
-    number of pairs done.
-
-    Raises `WeightsError` for a network of another normalisation, a dataset of another size or fingerprint than
-    ``config`` says, or without an object in either split; `PredictionError` where the network's output is not finite.
-    """
+    number of pairs done. Raises `WeightsError` for a network of another normalisation, a dataset of another size or
+    fingerprint than ``config`` says, or without an object in either split; `PredictionError` where the network's output
+    is not finite."""
     if config.normalisation != "individual":
         raise WeightsError(f"{config.name}: its output is metric ({config.normalisation}); it needs no range heads")
     was_training = network.training
@@ -60,10 +58,8 @@ def fit_heads(
 
 
 def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str | Path) -> None:
-    """Write the network of the file ``weights``, with heads fitted on its training data, as the file ``target``.
-
-    Raises as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written.
-    """
+    """Write the network of the file ``weights``, with heads fitted on its training data, as the file ``target``. Raises
+    as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written."""
     model = load(weights)
     save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
 

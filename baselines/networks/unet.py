@@ -73,11 +73,9 @@ MLP_RATIO = 4
 
 
 class TokenBottleneck(nn.Module):
-    """Patches of a map through a transformer and back, (B, c_in, m, m) -> (B, c_out, m, m).
-
-    Each p x p patch of all ``c_in`` channels becomes one token of ``channels`` numbers, a learned position is added,
-    pre-norm layers and a last layer norm follow, and one linear layer turns a token into its p x p x ``c_out`` patch.
-    """
+    """Patches of a map through a transformer and back, (B, c_in, m, m) -> (B, c_out, m, m). Each p x p patch of all
+    ``c_in`` channels becomes one token of ``channels`` numbers, a learned position is added, pre-norm layers and a last
+    layer norm follow, and one linear layer turns a token into its p x p x ``c_out`` patch."""
 
     def __init__(self, c_in: int, c_out: int, channels: int, map_size: int, patch: int) -> None:
         super().__init__()
@@ -129,11 +127,9 @@ class TransUNet(UShape):
 
 
 class ResUNet(FringeNetwork):
-    """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120.
-
-    The paper's four levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but
-    the first starts with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1.
-    """
+    """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120. The paper's four
+    levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but the first starts
+    with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1."""
 
     name = "resunet"
     stride = 8

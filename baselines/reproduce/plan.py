@@ -89,10 +89,8 @@ class Folders:
 
 
 def planned(tables: Sequence[str], preset: str) -> list[Job]:
-    """The trainings of ``tables``, each once, in the order of their first row.
-
-    Raises RecipeError for an unknown table, an unsound recipe, or two recipes that differ under one name.
-    """
+    """The trainings of ``tables``, each once, in the order of their first row. Raises RecipeError for an unknown table,
+    an unsound recipe, or two recipes that differ under one name."""
     jobs: dict[str, Job] = {}
     for name in (f"{table}/{row}" for table in tables for row in table_rows(table)):
         recipe = load_recipe(name, preset)
@@ -119,11 +117,9 @@ def default_folder(preset: str, size: int) -> Path:
 
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
     """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none: all 50 objects
-    and 52 frames, which every table shares.
-
-    Raises DatasetError for a dataset of another image size than the preset's, without a frame that a row needs, or
-    another dataset than the trainings in the runs folder; BuildError where it can't be built.
-    """
+    and 52 frames, which every table shares. Raises DatasetError for a dataset of another image size than the preset's,
+    without a frame that a row needs, or another dataset than the trainings in the runs folder; BuildError where it
+    can't be built."""
     sizes = {job.recipe.size: job.recipe.name for job in jobs}
     if len(sizes) != 1:
         raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")

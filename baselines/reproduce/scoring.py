@@ -39,8 +39,7 @@ Scores = dict[str, float | None]
 def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), draw the picture
     beside the row. Files of an earlier run are replaced at the end: an interrupted run leaves nothing that is taken for
-    finished. Raises what predicting, timing and scoring raise.
-    """
+    finished. Raises what predicting, timing and scoring raise."""
     name = row.stem
     predictions = folders.predictions(name)
     making = predictions.with_name(f"{name}.making")
@@ -94,10 +93,8 @@ def score_all_frames(
     scoring: tuple[Units, Mode], about: Mapping[str, str],
 ) -> AllFrames:  # fmt: skip
     """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out) on every test sample and
-    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network.
-
-    Raises PredictionError for a prediction that is not finite, and what `scored_pair` raises.
-    """
+    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network. Raises PredictionError for a prediction that is
+    not finite, and what `scored_pair` raises."""
     samples = opened.samples(SPLIT)
     scores: dict[tuple[str, int], Scores] = {}
     for sample in samples:

@@ -61,11 +61,9 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     """Do what the tables lack, and write them. After an interruption the same call continues.
 
     A training that diverges, or whose predictions can't be scored, does not keep the others from running
-    (`Outcome.failed`).
-    Raises TrainingError for a training folder of another recipe, or the paper's preset without a GPU; DatasetError for
-    a dataset of another size or fingerprint; BuildError when another process works in the same folder; and what
-    predicting and scoring raise.
-    """
+    (`Outcome.failed`). Raises TrainingError for a training folder of another recipe, or the paper's preset without a
+    GPU; DatasetError for a dataset of another size or fingerprint; BuildError when another process works in the same
+    folder; and what predicting and scoring raise."""
     folders = settings.folders
     jobs = plan.planned(settings.tables, folders.preset)
     check_run_folders(jobs, folders)

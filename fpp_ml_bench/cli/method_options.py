@@ -61,11 +61,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
-    """The method that ``args`` name, for the rig of ``opened``.
-
-    Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
-    FppBenchError for an unknown method, and for an option that belongs to another one.
-    """
+    """The method that ``args`` name, for the rig of ``opened``. Warns on standard error about weights that were trained
+    on another version of the dataset's benchmark. Raises FppBenchError for an unknown method, and for an option that
+    belongs to another one."""
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     maker = _MAKERS.get(args.method)

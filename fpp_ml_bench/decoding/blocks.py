@@ -194,10 +194,8 @@ def within_reach(
     coordinate_px: NDArray[np.float64], rays: Maps, direction: Direction, rig: Rig, limits: Limits
 ) -> NDArray[np.bool_]:
     """Pixels that may still get a depth from both directions; bool (n,). For projectors without distortion only.
-
     ``coordinate_px`` (n,) of ``direction``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that can't be
-    ruled out are True, those with NaN rays too.
-    """
+    ruled out are True, those with NaN rays too."""
     axis = AXES.index(direction)
     if kernels := compiled_kernels():
         reached = np.empty(len(coordinate_px), dtype=np.bool_)

@@ -78,10 +78,8 @@ def mask_indices(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.int
 def check_frames(
     flat: Mapping[int, NDArray[np.uint8]], plan: DirectionPlan, indices: NDArray[np.intp] | None, rig: Rig
 ) -> None:
-    """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others.
-
-    ``flat`` frames by index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested.
-    """
+    """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others. ``flat`` frames by
+    index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested."""
     pixel_count = len(flat[plan.sinusoids[0]]) if indices is None else len(indices)
     if pixel_count < LEAST_PX or len(plan.sinusoids) < 4:
         return

@@ -74,11 +74,9 @@ class _Block:
 
 @dataclass
 class _Image:
-    """What is decoded and how, and the results, filled block by block; no pixel belongs to two blocks.
-
-    ``pixels`` flat indices of those to decode (None: all). ``depth_alone``: whether the second direction may be left
-    out where the first shows that there is no depth.
-    """
+    """What is decoded and how, and the results, filled block by block; no pixel belongs to two blocks. ``pixels`` flat
+    indices of those to decode (None: all). ``depth_alone``: whether the second direction may be left out where the
+    first shows that there is no depth."""
 
     frames: dict[int, NDArray[np.uint8]]
     rig: Rig
@@ -135,10 +133,8 @@ class _Image:
         block.measured[plan.direction] = decode(levels, plan, self.limits)
 
     def _keep_within_reach(self, block: _Block) -> None:
-        """Reduce the block to the pixels that can still get a depth after the first direction, if they are few.
-
-        A sample of the block is tested first: where the object fills the block, skipping costs no more than that test.
-        """
+        """Reduce the block to the pixels that can still get a depth after the first direction, if they are few. A
+        sample of the block is tested first: where the object fills the block, skipping costs no more than that test."""
         ((direction, first),) = block.measured.items()
         values = first.coordinate_px, *self._rays(block)
         for part in (slice(None, None, SAMPLING), slice(None)):

@@ -48,11 +48,9 @@ def _depth_in_front(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.
 
 
 def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
-    """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown.
-
-    The ray supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
-    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN.
-    """
+    """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown. The ray
+    supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
+    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN."""
     device = rig.projector
     measured = (coordinate - device.centre[axis]) / device.focal[axis]
     rotated = [rotated_ray(rays, rig, i) for i in range(3)]
@@ -99,8 +97,7 @@ def depth_from_both(
     ``weight_u`` and ``weight_v``: 1 / sigma^2 of the coordinates, up to a common factor; for sinusoids (B / P)^2.
     Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear functions: algebraic start, then
     `GAUSS_NEWTON_STEPS`. ``disagreement_px`` is the measured point's distance from the epipolar line, for any weights,
-    in undistorted px.
-    """
+    in undistorted px."""
     device = rig.projector
     u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)
     tx, ty, tz = rig.t
@@ -135,9 +132,8 @@ def depth_noise_mm(
 
     ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical
     axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / ``|du/dZ|``; for the
-    paper's rig sigma_Z is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add.
-    Projector distortion is ignored; it changes the slope by a few percent.
-    """
+    paper's rig sigma_Z is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add. Projector
+    distortion is ignored; it changes the slope by a few percent."""
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if steps < 3:

@@ -50,8 +50,7 @@ class Rig:
     ``rotation`` (three rows) and ``translation_m`` are kept as tuples, so that a rig is hashable and compares by value;
     `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal fringes along the projector's
     rows, ``pitch_vertical_px`` that of the vertical ones along its columns. Raises `RigError` for a pose that is no
-    rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit.
-    """
+    rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit."""
 
     camera: Pinhole
     projector: Pinhole
@@ -220,10 +219,8 @@ def _mapping(value: object, keys: Iterable[str], name: str) -> dict[str, Any]:
 
 
 def rig_from_dict(data: object) -> Rig:
-    """The rig that a mapping in the form of this module's docstring describes.
-
-    Raises `RigError` naming the key for anything unknown, missing, of the wrong type, or impossible as a rig.
-    """
+    """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
+    anything unknown, missing, of the wrong type, or impossible as a rig."""
     entries = _mapping(data, _RIG_KEYS, "")
     pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
     for device in ("camera", "projector"):
