@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, Submission, check_submission
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, check_submission
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -61,7 +61,8 @@ def predict_split(
     if method.reports:
         write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
         summary = method.summary(list(reports.values()))
-    write_submission(out / SUBMISSION_FILE, check_submission(out, _described(method, median, summary)))
+    submission = check_submission(out, _described(method, median, summary))
+    write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
     return Run(len(samples), median)
 
 
@@ -116,11 +117,6 @@ def _described(method: Method, seconds_per_sample: float, summary: dict[str, Any
         "hardware": describe_hardware().to_dict(), "software": method.software,
         "settings": {**method.settings, **summary}, **({"seeds": dict(method.seeds)} if method.seeds else {}),
     }  # fmt: skip
-
-
-def write_submission(path: Path, submission: Submission) -> None:
-    """Write ``submission.yaml``, complete or not at all."""
-    write_atomically(path, submission.to_yaml().encode("utf-8"))
 
 
 COUNTED_SAMPLES = 6

@@ -78,12 +78,6 @@ class Folders:
         # Not in the folder of the rows: there every .json is a row.
         return self.runs / "all-frames" / f"{self.preset}-{recipe.name}-all-frames.json"
 
-    def result(self, name: str) -> Path:
-        return self.runs / "results" / f"{name}.json"
-
-    def predictions(self, name: str) -> Path:
-        return self.runs / "predictions" / name
-
     def table(self, table: str) -> Path:
         return self.runs / f"{table}.md"
 
@@ -156,7 +150,7 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
             write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
             return
         recorded = json.loads(record.read_text(encoding="utf-8"))
-        fingerprint, recorded_folder = recorded["fingerprint"], recorded["folder"]
+        fingerprint, folder = recorded["fingerprint"], recorded["folder"]
     except OSError as error:
         raise DatasetError(f"{record}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError):
@@ -166,5 +160,5 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
     if fingerprint != opened.fingerprint:
         raise DatasetError(
             f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
-            f"{str(fingerprint)[:8]} ({recorded_folder}); give that dataset as --data, or another --runs"
+            f"{str(fingerprint)[:8]} ({folder}); give that dataset as --data, or another --runs"
         )

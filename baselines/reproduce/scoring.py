@@ -41,17 +41,17 @@ def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folder
     beside the row. Files of an earlier run are replaced at the end: an interrupted run leaves nothing that is taken for
     finished. Raises what predicting, timing and scoring raise."""
     name = row.stem
-    predictions = folders.predictions(name)
+    predictions, results = folders.runs / "predictions" / name, folders.runs / "results"
     making = predictions.with_name(f"{name}.making")
     shutil.rmtree(making, ignore_errors=True)
     predict_split(opened, method, SPLIT, making)
     write_timing(making / SUBMISSION_FILE, time_method(opened, method, SPLIT, repeats=REPEATS))
     result = evaluate(making, opened, SPLIT, TARGET, mode=method.mode)
-    for folder in (folders.rows, folders.result(name).parent):
+    for folder in (folders.rows, results):
         folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(predictions, ignore_errors=True)
     making.rename(predictions)
-    write_result(result, folders.result(name))
+    write_result(result, results / f"{name}.json")
     write_sheet(result, opened, predictions, row.with_suffix(".png"))
     return result
 

@@ -125,9 +125,8 @@ def _network(path: Path, args: argparse.Namespace, opened: "storage.DatasetFolde
 
 
 def _classical(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
-    steps = opened.sequence.steps if args.steps is None else args.steps
-    if args.depth_noise is not None:
-        steps = _steps_for(args, opened)
+    usual = opened.sequence.steps if args.steps is None else args.steps
+    steps = usual if args.depth_noise is None else _steps_for(args, opened)
     return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 
@@ -152,17 +151,13 @@ def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int
 def _phase(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    shading = None if args.no_shading is None else False
-    return _given(
-        direction=args.fringe, prior=args.prior, min_confidence=args.min_confidence, frames=args.frames,
-        error_mm=args.error_mm, shading=shading,
-    )  # fmt: skip
+    options = {name: getattr(args, name) for name in ("prior", "min_confidence", "frames", "error_mm")}
+    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
 def _phase_net(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
-    shading = None if args.no_shading is None else False
-    options = {"threads": args.threads, "min_confidence": args.min_confidence, "weights": args.weights}
-    return _given(direction=args.fringe, shading=shading, **options)
+    options = {name: getattr(args, name) for name in ("threads", "min_confidence", "weights")}
+    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
 def _given(**options: Any) -> dict[str, Any]:

@@ -67,9 +67,11 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
     from fpp_ml_bench.leaderboard import reproduced
 
-    command = _command(args)
-    options = (args.data, args.only_missing, args.minutes, args.anyway)
-    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report=_report)
+    def report(line: str) -> None:  # with the time, where the engine's progress is too
+        print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
+
+    command, options = _command(args), (args.data, args.only_missing, args.minutes, args.anyway)
+    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report)
     outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
@@ -83,11 +85,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"Stopped at {outcome.stopped} after {args.minutes:g} minutes. Continue with: {command}")
         return CHECK_FAILED
     return OK
-
-
-def _report(line: str) -> None:
-    """Print a line with the time on stderr, where the engine's progress is too."""
-    print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
 
 def _command(args: argparse.Namespace) -> str:

@@ -66,8 +66,8 @@ def _phase_net(args: argparse.Namespace) -> int:
     import cv2
 
     cv2.setNumThreads(1)
-    options = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = phase_network.Recipe(**options)
+    given = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
+    recipe = phase_network.Recipe(**given)
     trained = phase_network.train_phase_net(
         recipe, args.dataset, args.out, extra=args.extra, start=args.start, minutes=args.minutes, show=True,
         print_line=print,
