@@ -11,12 +11,38 @@ from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwor
 from fpp_ml_bench.errors import NetworkError
 
 
-class UShape(FringeNetwork):
+class Levels(FringeNetwork):
+    """An encoder, a bottleneck and a decoder that joins what each level of the encoder gave; ``pooled``: every level is
+    halved on its way down, else the blocks do so themselves, and the last level is no skip."""
+
+    last_layer = "dec1"
+    pooled = True
+    encoder: nn.ModuleList
+    decoder: nn.ModuleList
+
+    @property
+    def probe_layers(self) -> dict[str, nn.Module]:
+        layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
+        layers["bottleneck"] = self.bottleneck
+        return layers | {f"dec{len(self.decoder) - step}": block for step, block in enumerate(self.decoder)}
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        x, skips = fringe, []
+        for block in self.encoder:
+            x = block(x)
+            skips.append(x)
+            x = functional.max_pool2d(x, 2) if self.pooled else x
+        x = self.bottleneck(x if self.pooled else skips.pop())
+        for block in self.decoder:
+            x = block(x, skips.pop())
+        return base.in_full_precision(self.head, x)
+
+
+class UShape(Levels):
     """The UNet's encoder and decoder, Kaiming-normal (fan out), around any ``bottleneck``: (B, 8 width, h, w) -> (B, 16
     width, h, w), left as it comes."""
 
     stride = 16
-    last_layer = "dec1"
 
     def __init__(self, width: int, bottleneck: nn.Module, **options: int | float) -> None:
         super().__init__(width=width, **options)
@@ -30,23 +56,6 @@ class UShape(FringeNetwork):
         self.head = nn.Conv2d(width, 1, 1)
         base.initialise(self, "convolutions")
         self.bottleneck = bottleneck
-
-    @property
-    def probe_layers(self) -> dict[str, nn.Module]:
-        layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
-        layers["bottleneck"] = self.bottleneck
-        return layers | {f"dec{4 - step}": block for step, block in enumerate(self.decoder)}
-
-    def represent(self, fringe: Tensor) -> Tensor:
-        x, skips = fringe, []
-        for block in self.encoder:
-            x = block(x)
-            skips.append(x)
-            x = functional.max_pool2d(x, 2)
-        x = self.bottleneck(x)
-        for block in self.decoder:
-            x = block(x, skips.pop())
-        return base.in_full_precision(self.head, x)
 
 
 class UNet(UShape):
@@ -126,14 +135,14 @@ class TransUNet(UShape):
             )
 
 
-class ResUNet(FringeNetwork):
+class ResUNet(Levels):
     """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120. The paper's four
     levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but the first starts
     with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1."""
 
     name = "resunet"
     stride = 8
-    last_layer = "dec1"
+    pooled = False
 
     def __init__(self, *, width: int = 120) -> None:
         width = base.whole(self.name, "width", width)
@@ -150,19 +159,3 @@ class ResUNet(FringeNetwork):
         )
         self.head = nn.Conv2d(width, 1, 1)
         base.initialise(self, "convolutions")
-
-    @property
-    def probe_layers(self) -> dict[str, nn.Module]:
-        layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
-        layers["bottleneck"] = self.bottleneck
-        return layers | {f"dec{3 - step}": block for step, block in enumerate(self.decoder)}
-
-    def represent(self, fringe: Tensor) -> Tensor:
-        x, skips = fringe, []
-        for block in self.encoder:
-            x = block(x)
-            skips.append(x)
-        x = self.bottleneck(skips.pop())
-        for block in self.decoder:
-            x = block(x, skips.pop())
-        return base.in_full_precision(self.head, x)

@@ -61,11 +61,9 @@ def train(
     recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
 ) -> TrainingRun:
     """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
-
     ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
-    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named).
-    """
+    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named)."""
     out, started = Path(out), perf_counter()
     data, validation = open_data(recipe, Path(dataset))
     with PartialState().local_main_process_first():

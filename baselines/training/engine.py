@@ -37,10 +37,8 @@ DIVERGED = 1e6
 
 class Training(ABC):
     """A training's state and loop; a subclass says what is trained on what, at which rate, and how it is validated.
-
     ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, not compiled or
-    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share.
-    """
+    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share."""
 
     name: str
     title: str

@@ -70,12 +70,9 @@ class Loss(StrictModel):
 
 
 class Recipe(StrictModel):
-    """Everything that a training depends on.
-
-    ``size``: the image's width and height in px. ``pairs_per_epoch`` are drawn for each epoch, ``validation_pairs``
-    evenly over the validation split; null takes all. ``frames``: those that are training pairs of their own, one of
-    `CONFIGS`. ``options`` go to `networks.build`.
-    """
+    """Everything that a training depends on. ``size``: the image's width and height in px. ``pairs_per_epoch`` are
+    drawn for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``frames``: those that
+    are training pairs of their own, one of `CONFIGS`. ``options`` go to `networks.build`."""
 
     preset: Text
     size: Annotated[int, Field(ge=16)]

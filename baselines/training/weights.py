@@ -81,11 +81,10 @@ class ModelConfig:
 
 @checked_dataclass(frozen=True, config=_STRICT)
 class NetConfig:
-    """What a phase network is, how its answers are used, and what it was trained on.
-
-    ``options``: arguments of `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added
-    to the logit of the base order, both chosen on the validation split; ``period_px``: image px per fringe period of
-    the training images, by direction; ``steps`` trained; the others as in `ModelConfig`."""
+    """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
+    `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
+    order, both chosen on the validation split; ``period_px``: image px per fringe period of the training images, by
+    direction; ``steps`` trained; the others as in `ModelConfig`."""
 
     name: Text
     title: Text

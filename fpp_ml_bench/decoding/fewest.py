@@ -57,11 +57,9 @@ def gray_levels_in_view(rig: Rig, direction: Direction) -> tuple[int | None, ...
 @dataclass(frozen=True)
 class JointCode:
     """How well both directions' phases together fix the orders, in projector px across the epipolar line.
-
     ``least_gap_px``: smallest distance of a wrong pair of orders from the right one; ``background_gap_px``: smallest at
     which the background could pass for a point in range. ``driver``: the direction of which a ray crosses more periods
-    within the range, ``most_periods`` at most.
-    """
+    within the range, ``most_periods`` at most."""
 
     least_gap_px: float
     background_gap_px: float

@@ -68,11 +68,9 @@ def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> N
 
 def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direction: Direction) -> NDArray[np.float64]:
     """Depth in mm from one projector coordinate per pixel, float64; NaN where there is no depth (NaN input, ray
-    parallel to the projector plane, intersection behind a device, or a distortion that can't be inverted).
-
-    ``rays``: normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for
-    ``direction`` "vertical", v_p for "horizontal", in px, same shape.
-    """
+    parallel to the projector plane, intersection behind a device, or a distortion that can't be inverted). ``rays``:
+    normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for ``direction``
+    "vertical", v_p for "horizontal", in px, same shape."""
     if direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
     axis, device = AXES.index(direction), rig.projector
