@@ -61,9 +61,7 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
     return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
 
 
-def object_near_edges(
-    depth_mm: NDArray[np.floating], bands_px: Sequence[int], jump_mm: float | None = None
-) -> list[NDArray[np.bool_]]:
+def object_near_edges(depth_mm: NDArray, bands_px: Sequence[int], jump_mm: float | None = None) -> list[NDArray]:
     """`object_near_edge` for several bands; the edges are computed once."""
     near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)

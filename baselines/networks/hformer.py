@@ -144,9 +144,8 @@ class Hformer(FringeNetwork):
         level_drops = [[next(drops) for _ in range(depth)] for depth in ENCODER_DEPTHS]
         self.backbone = Backbone(2 * width, branches)
         self.embeds = nn.ModuleList(Embed(c_in, c_out) for c_in, c_out in zip(branches, tokens, strict=True))
-        self.encoder = nn.ModuleList(
-            Level(c, heads, rates, norm=True) for c, heads, rates in zip(tokens, HEADS, level_drops, strict=True)
-        )
+        levels = zip(tokens, HEADS, level_drops, strict=True)
+        self.encoder = nn.ModuleList(Level(c, heads, rates, norm=True) for c, heads, rates in levels)
         self.merges = nn.ModuleList(MergePatches(c) for c in tokens[:3])
         self.decoder = nn.ModuleList(
             ExpandPatches(tokens[level], HEADS[level], level_drops[level][:depth])

@@ -1,9 +1,4 @@
-"""A trained network ready to use: fringe image in, depth in mm out.
-
->>> from fpp_ml_bench.baselines import load
->>> model = load("unet-individual-hybrid_l1_0.7")       # doctest: +SKIP
->>> depth_mm = model.predict(fringe)                    # uint8 (H, W) -> float32 (H, W)    # doctest: +SKIP
-"""
+"""A trained network ready to use: fringe image in, depth in mm out."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -104,9 +99,7 @@ class Probe:
 def probed(network: FringeNetwork) -> Iterator[Probe]:
     """Record the outputs of the bottleneck and the last decoder layer for every batch inside this block."""
     probe, layers = Probe(), {"bottleneck": "bottleneck", "last": network.last_layer}
-    handles = [
-        network.probe_layers[at].register_forward_hook(partial(probe.record, name)) for name, at in layers.items()
-    ]
+    handles = [network.probe_layers[at].register_forward_hook(partial(probe.record, n)) for n, at in layers.items()]
     try:
         yield probe
     finally:
@@ -194,10 +187,8 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
     if not tensors:
         return None
     fields = RangeHeads.__dataclass_fields__
-    if differing := [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]:
-        raise WeightsError(
-            f"{name}: expected the range heads {', '.join(fields)}, differs in {differing[0]}; fit them again"
-        )
+    if odd := [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]:
+        raise WeightsError(f"{name}: expected the range heads {', '.join(fields)}, differs in {odd[0]}; fit them again")
     features = tensors["range_weight"].shape[0] if tensors["range_weight"].dim() == 2 else 0
     channels = tensors["mask_weight"].numel()
     shapes = {

@@ -43,9 +43,7 @@ class Generator(nn.Sequential):
         self.stem = normed(_convolution(1, width, 7, reflect=True), width)
         self.down = nn.Sequential(*(normed(_convolution(c // 2, c, 3, stride=2), c) for c in widths[1:]))
         self.bottleneck = nn.Sequential(*(GeneratorBlock(widths[-1]) for _ in range(RESIDUAL_BLOCKS)))
-        self.up = nn.Sequential(
-            *(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, output_padding=1), c) for c in reversed(widths[:-1]))
-        )
+        self.up = nn.Sequential(*(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, 1), c) for c in reversed(widths[:-1])))
         self.head = nn.Sequential(_convolution(width, 1, 7, reflect=True), nn.Tanh())
 
     def forward(self, x: Tensor) -> Tensor:

@@ -147,9 +147,8 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     best = {twin: tally.best() for twin, tally in tallies.items()}
     heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
     mean_error_mm = _range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges)
-    report = HeadReport(
-        mean_error_mm, error_mm, best["predicted"][2], best["mean"][1], best["predicted"][1], ridge_strength=strength
-    )
+    (_, mean_mae_mm, _), (_, mae_mm, iou) = best["mean"], best["predicted"]
+    report = HeadReport(mean_error_mm, error_mm, iou, mean_mae_mm, mae_mm, strength)
     heads.report.copy_(torch.tensor(report, dtype=torch.float64))
     return heads
 

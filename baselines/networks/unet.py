@@ -2,6 +2,8 @@
 normalisation; TransUNet (section 5.6), the UNet with a vision transformer for its bottleneck; and ResUNet (section
 5.6), of residual blocks on four levels, with batch normalisation."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -46,13 +48,9 @@ class UShape(Levels):
 
     def __init__(self, width: int, bottleneck: nn.Module, **options: int | float) -> None:
         super().__init__(width=width, **options)
-        widths = [width * 2**level for level in range(5)]
-        self.encoder = nn.ModuleList(
-            DoubleConvolution(c_in, c_out) for c_in, c_out in zip([1, *widths], widths[:4], strict=False)
-        )
-        self.decoder = nn.ModuleList(
-            Join(2 * c_out, c_out, DoubleConvolution(2 * c_out, c_out)) for c_out in reversed(widths[:4])
-        )
+        widths = [width * 2**level for level in range(4)]
+        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in pairwise([1, *widths]))
+        self.decoder = nn.ModuleList(Join(2 * c, c, DoubleConvolution(2 * c, c)) for c in reversed(widths))
         self.head = nn.Conv2d(width, 1, 1)
         base.initialise(self, "convolutions")
         self.bottleneck = bottleneck
@@ -150,7 +148,7 @@ class ResUNet(Levels):
         widths = [width * 2**level for level in range(4)]
         self.encoder = nn.ModuleList(
             nn.Sequential(ResidualBlock(c_in, c_out, 1 if c_in == 1 else 2), ResidualBlock(c_out, c_out))
-            for c_in, c_out in zip([1, *widths], widths, strict=False)
+            for c_in, c_out in pairwise([1, *widths])
         )
         self.bottleneck = nn.Sequential(*(ResidualBlock(widths[3], widths[3]) for _ in range(2)))
         self.decoder = nn.ModuleList(

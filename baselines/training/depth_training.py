@@ -251,9 +251,7 @@ class DepthTraining(Training):
         return [losses, object_mae, Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True)]
 
 
-def model_config(
-    recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: dict[str, Any]
-) -> ModelConfig:
+def model_config(recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: Record) -> ModelConfig:
     """Configuration for the weights file."""
     return ModelConfig(
         name=recipe.name, title=recipe.title, network=recipe.network,

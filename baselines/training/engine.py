@@ -47,9 +47,7 @@ class Training(ABC):
     bare: dict[str, nn.Module]
     largest_gradient: float | None = None
 
-    def __init__(
-        self, out: Path, identity: Mapping[str, Any], seed: int, precision: str = "fp32", cpu: bool = False
-    ) -> None:
+    def __init__(self, out: Path, identity: Record, seed: int, precision: str = "fp32", cpu: bool = False) -> None:
         self.out, self.identity = out, dict(identity)
         mixed = "no" if precision == "fp32" else precision
         self.accelerator = Accelerator(mixed_precision=mixed, cpu=cpu, gradient_accumulation_steps=1)

@@ -58,10 +58,8 @@ def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no mapping
-    except (SafetensorError, OSError, ValueError) as error:
-        raise TrainingError(
-            f"{path}: expected a checkpoint of this package, it can't be read ({error}){cure}"
-        ) from None
+    except (SafetensorError, OSError, ValueError) as why:
+        raise TrainingError(f"{path}: expected a checkpoint of this package, it can't be read ({why}){cure}") from None
     if metadata.get("format") != _FORMAT:
         raise TrainingError(f"{path}: expected {_FORMAT!r}, got {metadata.get('format')!r}{cure}")
     if metadata.get("sha256") != _seal(tensors, metadata.get("state", "")):

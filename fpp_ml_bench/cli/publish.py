@@ -46,9 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--source-url", metavar="URL", help="https address where the results come from")
 
 
-def _part(
-    kinds: argparse._SubParsersAction, name: str, summary: str, adopt: bool = True
-) -> Callable[..., argparse.Action]:
+def _part(kinds: argparse._SubParsersAction, name: str, summary: str, adopt: bool = True) -> Callable[..., object]:
     add = kinds.add_parser(name, help=summary, description=f"Publish {summary}.", allow_abbrev=False).add_argument
     add("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
     add("--dry-run", action="store_true", help="print what would change and send nothing")

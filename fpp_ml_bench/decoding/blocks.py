@@ -190,9 +190,7 @@ def depth_and_reason(
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
 
 
-def within_reach(
-    coordinate_px: NDArray[np.float64], rays: Maps, direction: Direction, rig: Rig, limits: Limits
-) -> NDArray[np.bool_]:
+def within_reach(coordinate_px: NDArray, rays: Maps, direction: Direction, rig: Rig, limits: Limits) -> NDArray:
     """Pixels that may still get a depth from both directions; bool (n,). For projectors without distortion only.
     ``coordinate_px`` (n,) of ``direction``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that can't be
     ruled out are True, those with NaN rays too."""
