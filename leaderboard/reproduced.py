@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import reproduce
-from fpp_ml_bench.baselines.reproduce import MAIN_KEY, MEAN, PREDICTED, Folders, Job, Variant
+from fpp_ml_bench.baselines.reproduce import MAIN_KEY, Folders, Job
 from fpp_ml_bench.baselines.training import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
@@ -68,8 +68,8 @@ def _sound_row(path: Path) -> Entry | None:
 @dataclass(frozen=True)
 class Line:
     """A line of a table. ``scores``, those of the row's result or over all frames, and ``entry`` are None where nothing
-    has been measured; ``twins`` maps a twin's suffix to its row. ``paper_mm`` are the paper's errors by the keys of
-    `HEADLINE`, None where it reports none."""
+    has been measured; ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None
+    where it reports none."""
 
     row: str
     label: str
@@ -95,10 +95,9 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
         sha256 = reproduce.file_sha256(weights)
-        suffixes = [variant.suffix for variant in reproduce.variants(recipe)]
-        paths = [folders.row(recipe, variant) for variant in reproduce.variants(recipe)]
-        entry, *others = (row_that_holds(path, opened, sha256) for path in paths)
-        twins = {suffix: twin for suffix, twin in zip(suffixes[1:], others, strict=True) if twin is not None}
+        rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in reproduce.variants(recipe)}
+        entry, *_ = rows.values()
+        twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
         first = None if entry is None else entry.result
         if table != "multi_frame" or len(opened.sequence.config(recipe.frames)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
@@ -177,7 +176,7 @@ def _cells(line: Line) -> list[str]:
         line.label, entry.result.track if entry else "-", _pair(here, "object"),
         " - ".join(map(_mm, interval)) if interval else "-",
         _pair(paper, "object"), _pair(here, "overall"), _pair(paper, "overall"), _pair(here, "background"),
-        _pair(paper, "background"), _twin(line, PREDICTED), _twin(line, MEAN),
+        _pair(paper, "background"), _twin(line, "predicted"), _twin(line, "mean"),
         f"{timing.parameters:,}" if timing else "-",
         *(f"{count:,.0f}" if isinstance(count, int | float) else "-" for count in counts),
         "-" if latency is None else f"{latency:.3g}",
@@ -194,9 +193,9 @@ def _pair(errors: Headline | Mapping[str, float] | None, pixels: str) -> str:
     return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
 
 
-def _twin(line: Line, variant: Variant) -> str:
+def _twin(line: Line, depth_range: str) -> str:
     """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
-    entry = line.twins.get(variant.suffix)
+    entry = line.twins.get(depth_range)
     if entry is None:
         return "-"
     errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]

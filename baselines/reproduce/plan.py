@@ -19,6 +19,7 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics import paper_rig
 
 Report = Callable[[str], object]
+DepthRange = Literal["oracle", "predicted", "mean"] | None
 RUNS = Path("runs")
 
 
@@ -35,25 +36,13 @@ class Job:
         return any(row.startswith("multi_frame/") for row in self.rows)
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A way to use a trained network: the end of its row file's name, and the depth range that turns its output into mm
-    (see `fpp_ml_bench.baselines.networks.NetworkMethod`)."""
-
-    suffix: str
-    depth_range: Literal["oracle", "predicted", "mean"] | None
-
-
-METRIC, ORACLE = Variant("", None), Variant("", "oracle")
-PREDICTED, MEAN = Variant("-range-predicted", "predicted"), Variant("-range-mean", "mean")
-
-
-def variants(recipe: Recipe) -> tuple[Variant, ...]:
-    """The rows that a training gives. Individual normalisation is told the test sample's range, as in the paper; its
-    metric twins are not. With the background removed the object's mask is given anyway, and there are no twins."""
+def variants(recipe: Recipe) -> tuple[DepthRange, ...]:
+    """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
+    individual normalisation it is told the test sample's range, as in the paper; its metric twins are not. With the
+    background removed the object's mask is given anyway, and there are no twins."""
     if recipe.normalisation != "individual":
-        return (METRIC,)
-    return (ORACLE,) if recipe.background_removed else (ORACLE, PREDICTED, MEAN)
+        return (None,)
+    return ("oracle",) if recipe.background_removed else ("oracle", "predicted", "mean")
 
 
 @dataclass(frozen=True)
@@ -71,8 +60,9 @@ class Folders:
         """Best weights, with range heads where the normalisation needs them: the file to ship."""
         return self.runs / "weights" / f"{recipe.name}.safetensors"
 
-    def row(self, recipe: Recipe, variant: Variant) -> Path:
-        return self.rows / f"{self.preset}-{recipe.name}{variant.suffix}.json"
+    def row(self, recipe: Recipe, depth_range: DepthRange) -> Path:
+        twin = "" if depth_range in (None, "oracle") else f"-range-{depth_range}"
+        return self.rows / f"{self.preset}-{recipe.name}{twin}.json"
 
     def all_frames(self, recipe: Recipe) -> Path:
         # Not in the folder of the rows: there every .json is a row.

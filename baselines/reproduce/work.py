@@ -19,7 +19,7 @@ import torch
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads, torch_threads
 from fpp_ml_bench.baselines.reproduce import plan, scoring
-from fpp_ml_bench.baselines.reproduce.plan import PREDICTED, Folders, Job, Report, variants
+from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.files import exclusive, write_atomically
@@ -126,14 +126,14 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         _score_all_frames(recipe, model, settings, opened)
     about: dict[str, Setting] = {"recipe_digest": recipe.digest, "epochs_trained": run.epochs}
     about["training_seconds"] = round(run.seconds, 1)
-    for variant in variants(recipe):
-        path = folders.row(recipe, variant)
+    for depth_range in variants(recipe):
+        path = folders.row(recipe, depth_range)
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
         # A network's method sets torch's threads for the whole process; the next training needs its own.
         with torch_threads(torch.get_num_threads()):
-            method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
+            method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
             result = scoring.score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
@@ -207,7 +207,7 @@ def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, fo
     if keep and _made_from(target, source):
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    if PREDICTED in variants(recipe):
+    if "predicted" in variants(recipe):
         save_with_heads(run.weights, opened.path, target)
     else:
         write_atomically(target, run.weights.read_bytes())

@@ -26,7 +26,6 @@ _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "archit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
     add = parser.add_argument
     add("results", nargs="*", type=Path, metavar="RESULT.json",
         help="result files, or folders of them (default: the rows shipped with the package, ./result*.json and "

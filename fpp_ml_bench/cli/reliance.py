@@ -23,7 +23,6 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
     add = parser.add_argument
     add("method", metavar="METHOD", help=METHOD_HELP)
     text = "dataset folder; scenes are made from its test objects"

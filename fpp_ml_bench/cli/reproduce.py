@@ -23,7 +23,6 @@ ALL = "all"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
     add = parser.add_argument
     add("table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}")
     add("--preset", choices=PRESETS, default="cpu",
@@ -108,7 +107,7 @@ def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
     for title in ("Row", "Training", "State", "Rows written"):
         table.add_column(title, overflow="fold")
     for job in jobs:
-        row_files = [folders.row(job.recipe, variant) for variant in reproduce.variants(job.recipe)]
+        row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
         written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
         table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
     show(table)

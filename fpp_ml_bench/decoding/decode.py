@@ -176,19 +176,22 @@ def decode_stack(
     frame that is not needed may be None. Black and white never are: the Gray code's threshold is the sinusoids' mean.
     ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
     needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels at which the two coordinates
-    disagree by more than ``limits.max_disagreement_px`` across the epipolar line. ``steps``: how many of each
-    direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible. Where they can't be even (N is
-    not a multiple), the phase is the least-squares solution. ``mask`` bool (H, W): pixels to decode; all others get
-    `Reason.NOT_ASKED` and have no influence. The result is the same bit by bit for any number of ``threads``, and
-    inside the mask the same as without a mask. ``details``: also return coordinates, modulation and wrapped phase.
+    disagree by more than ``limits.max_disagreement_px`` across the epipolar line.
+    ``steps``: how many of each direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible.
+    Where they can't be even (N is not a multiple), the phase is the least-squares solution.
+    ``mask`` bool (H, W): pixels to decode; all others get `Reason.NOT_ASKED` and have no influence. The result is the
+    same bit by bit for any number of ``threads``, and inside the mask the same as without a mask. ``details``: also
+    return coordinates, modulation and wrapped phase.
     ``reasons`` False: a pixel that the first direction shows to lie outside the working range (`decoding.blocks`), or
     to have no coordinate, is not read in the second direction. The depth is the same bit by bit; the reason is the
-    first direction's, or OUTSIDE_RANGE. ``fewest``: read only the Gray frames that the rig's working range needs
-    (`decoding.fewest`). With "both" usually none is needed, and the fringe orders come from the two phases together. A
-    depth in range is the same bit by bit, except at pixels whose directions disagree by nearly the allowed distance
-    (`JointCode.tolerance_px`). Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this
-    also removes the background plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a
-    sinusoid whose capture failed (`fpp_ml_bench.decoding.checks`)."""
+    first direction's, or OUTSIDE_RANGE.
+    ``fewest``: read only the Gray frames that the rig's working range needs (`decoding.fewest`). With "both"
+    usually none is needed, and the fringe orders come from the two phases together. A depth in range is the same bit
+    by bit, except at pixels whose directions disagree by nearly the allowed distance (`JointCode.tolerance_px`).
+
+    Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this also removes the background
+    plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose capture
+    failed (`fpp_ml_bench.decoding.checks`)."""
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:

@@ -50,7 +50,7 @@ def test_rows_of_one_recipe_are_one_training(preset):
     ]
     names = [job.recipe.name for job in jobs]
     assert len(set(names)) == len(names)
-    titles = [(job.recipe.title, variant.depth_range) for job in jobs for variant in variants(job.recipe)]
+    titles = [(job.recipe.title, depth_range) for job in jobs for depth_range in variants(job.recipe)]
     assert len(set(titles)) == len(titles)
 
 
@@ -75,9 +75,11 @@ def test_two_recipes_under_one_name_are_refused(monkeypatch):
         planned(["normalization", "loss"], "cpu")
 
 
-def test_variants_of_a_training():
+def test_variants_of_a_training(tmp_path):
     def of(name):
-        return [variant.suffix for variant in variants(load_recipe(name))]
+        recipe = load_recipe(name)
+        rows = [folders(tmp_path).row(recipe, depth_range).stem for depth_range in variants(recipe)]
+        return [row.removeprefix(f"cpu-{recipe.name}") for row in rows]
 
     assert of("normalization/raw") == of("background_removed/individual") == [""]
     assert of("loss/l1") == ["", "-range-predicted", "-range-mean"]
