@@ -24,7 +24,7 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.report import write_sheet
-from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_json, write_result
+from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
 from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
@@ -126,12 +126,6 @@ def _mean(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each headline score over the rows that have it."""
     values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
     return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
-
-
-def write_all_frames(scores: AllFrames, path: Path) -> None:
-    """Write as JSON, complete or not at all. SubmissionError where the file can't be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(scores.model_dump(mode="json"), path)
 
 
 def read_all_frames(path: Path) -> AllFrames:

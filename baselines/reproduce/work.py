@@ -22,6 +22,7 @@ from fpp_ml_bench.baselines.reproduce import plan, scoring
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
+from fpp_ml_bench.evaluation.result import write_json
 from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -149,7 +150,8 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     scores = scoring.score_all_frames(
         opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
     )
-    scoring.write_all_frames(scores, path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(scores.model_dump(mode="json"), path)
     settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
 
 

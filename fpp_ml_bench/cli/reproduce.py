@@ -98,14 +98,13 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from fpp_ml_bench.cli.console import show
 
     jobs = reproduce.planned(tables, folders.preset)
-    table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
-    for title in ("Row", "Training", "State", "Rows written"):
-        table.add_column(title, overflow="fold")
+    columns = [Column(title, overflow="fold") for title in ("Row", "Training", "State", "Rows written")]
+    table = Table(*columns, title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     for job in jobs:
         row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
         written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"

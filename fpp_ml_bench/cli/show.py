@@ -20,8 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
     add("--sheet", action="store_true", help="all objects and views on one sheet instead")
     add("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
-    default = "picture to write (default: SAMPLE.png or sheet.png)"
-    add("--out", type=Path, metavar="FILE.png", help=default)
+    add("--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)")
 
 
 def run(args: argparse.Namespace) -> int:
