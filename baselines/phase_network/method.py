@@ -68,7 +68,6 @@ class PhaseNetMethod(Method):
 
     name = "phase-net"
     target = "depth"
-    crops = True
     packages = ("numpy", "numba", "torch")
 
     def __init__(

@@ -31,7 +31,6 @@ class PhaseMethod(Method):
     an unknown option or an invalid value."""
 
     name = "phase"
-    crops = True
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         try:

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
+from fpp_ml_bench.cli import count
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads, usable_cores
@@ -41,24 +42,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
     )  # fmt: skip
     text = "most samples of a split, taken evenly (default: the probe's)"
-    parser.add_argument("--samples", type=_count, metavar="N", help=text)
+    parser.add_argument("--samples", type=count(), metavar="N", help=text)
     text = "repeats of what depends on random numbers (default: 2)"
-    parser.add_argument("--seeds", type=_count, metavar="N", help=text)
+    parser.add_argument("--seeds", type=count(), metavar="N", help=text)
     text = "a short run for a first look; its numbers are not reliable"
     parser.add_argument("--quick", action="store_true", help=text)
     parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
     parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
-    parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
+    parser.add_argument("--threads", type=count(), metavar="N", help="threads (default: every core)")
     parser.add_argument(
         "--units", choices=UNITS,
         help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
     )  # fmt: skip
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:

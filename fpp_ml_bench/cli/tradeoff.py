@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fpp_ml_bench.baselines import tradeoff
+from fpp_ml_bench.cli import count
 from fpp_ml_bench.leaderboard import page
 from fpp_ml_bench.machine import limit_threads
 
@@ -27,19 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)")  # fmt: skip
     add("--quick", action="store_true", help="fewer settings, views, runs and sizes")
     add("--list", action="store_true", help="show what would be measured, and stop")
-    add("--threads", type=_count, default=1, metavar="N", help="threads a method may use (default: 1)")
+    add("--threads", type=count(1000), default=1, metavar="N", help="threads a method may use (default: 1)")
     add("--clock", choices=("wall", "processor"), default="wall",
         help="processor: processor time of this process, for a shared machine (default: wall)")  # fmt: skip
-    add("--views", type=_count, metavar="N", help="views of each test object (default: 2, quick: 1)")
+    add("--views", type=count(1000), metavar="N", help="views of each test object (default: 2, quick: 1)")
     add("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
-    add("--widths", type=_count, nargs="*", metavar="W",
+    add("--widths", type=count(1000), nargs="*", metavar="W",
         help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)")  # fmt: skip
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 1000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 1000, got {text!r}")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:

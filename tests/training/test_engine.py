@@ -95,7 +95,7 @@ def test_a_gan_paused_is_the_same_too(tiny, tmp_path):
 
 def validation_of(weights, dataset, recipe):
     """What a log must say of ``weights``, by `score_sample` and NumPy: the mean loss and the scores in mm."""
-    data = FringeDepthDataset(dataset, "validation", recipe.data_config, recipe.normalisation)
+    data = FringeDepthDataset(dataset, "validation", recipe.frames, recipe.normalisation)
     model, rows, losses = load(weights), [], []
     for index in spread(len(data), recipe.validation_pairs):
         item = data[index]
