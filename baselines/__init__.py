@@ -1,7 +1,4 @@
-"""Methods that turn fringes into depth, and running them over a dataset.
-
-A method takes the frames it names and gives ``depth_mm``; `fpp_ml_bench.baselines.method` lists what there is, and
-`fpp_ml_bench.baselines.run` runs one over a split and writes predictions that ``fpp-eval`` scores.
+"""Methods that turn fringes into depth (`fpp_ml_bench.baselines.method`), and running them over a split.
 
 >>> from fpp_ml_bench.baselines import build, load
 >>> network = build("unet")                              # bare and untrained    # doctest: +SKIP

@@ -14,9 +14,8 @@ from fpp_ml_bench.optics import DIRECTIONS, Rig
 
 
 class ClassicalMethod(Method):
-    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned.
-
-    ``fewest``: of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.decoding.fewest`)."""
+    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned. ``fewest``:
+    of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.decoding.fewest`)."""
 
     name = "classical"
 

@@ -31,8 +31,8 @@ class Method(ABC):
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
     packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
-    says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports,
-    crops: whether `predict_reported` reports, and there is a `crop`.
+    says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports:
+    whether `predict_reported` reports.
     """
 
     name: str
@@ -52,7 +52,6 @@ class Method(ABC):
     weights_config: "training.ModelConfig | training.NetConfig | None" = None
     batched: bool = False
     reports: bool = False
-    crops: bool = False
 
     @abstractmethod
     def predict(self, frames: Frames) -> NDArray[np.float32]:
@@ -66,9 +65,9 @@ class Method(ABC):
         """`predict`, and a report of the sample as JSON."""
         return self.predict(frames), {}
 
-    def crop(self, frames: Frames) -> tuple[slice, slice]:
-        """Rows and columns outside which nothing is computed, where the method ``crops``."""
-        raise NotImplementedError
+    def crop(self, frames: Frames) -> tuple[slice, slice] | None:
+        """Rows and columns outside which nothing is computed; None for a method that computes everywhere."""
+        return None
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         """Summary of a split's reports, for the settings of the submission."""

@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, Submission, check_submission
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, check_submission
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -41,11 +41,8 @@ def predict_split(
     `REPORTS_FILE`, and its summary of them into the submission's settings.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
-    the median over the split.
-
-    Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same samples, and
-    `DatasetError` when the dataset lacks a frame that the method needs.
-    """
+    the median over the split. Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the
+    same samples, and `DatasetError` when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)
     _prepare(out, samples)
     seconds: list[float] = []
@@ -64,7 +61,8 @@ def predict_split(
     if method.reports:
         write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
         summary = method.summary(list(reports.values()))
-    write_submission(out / SUBMISSION_FILE, check_submission(out, _described(method, median, summary)))
+    submission = check_submission(out, _described(method, median, summary))
+    write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
     return Run(len(samples), median)
 
 
@@ -121,11 +119,6 @@ def _described(method: Method, seconds_per_sample: float, summary: dict[str, Any
     }  # fmt: skip
 
 
-def write_submission(path: Path, submission: Submission) -> None:
-    """Write ``submission.yaml``, complete or not at all."""
-    write_atomically(path, submission.to_yaml().encode("utf-8"))
-
-
 COUNTED_SAMPLES = 6
 """Pixels are counted on this many samples, spread evenly over the split; frames follow from the method alone."""
 
@@ -160,14 +153,16 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
             pixels * (len(method.frames_used) // 2), saved_s * scale,
             f"{how} predicted again now with skipping off and on, and scaled up",
         ))  # fmt: skip
-    elif method.crops:
+    else:
         for frames in stacks:
-            rows, columns = method.crop(frames)
+            if (crop := method.crop(frames)) is None:
+                break
+            rows, columns = crop
             done += (rows.stop - rows.start) * (columns.stop - columns.start)
-        lines.append(LeftOut(
-            "local fits and orders far from the object", "pixels", round(done * scale),
-            round((count * height * width - done) * scale), None, None,
-            f"pixels counted on {how}; the crop is part of the method, so there is no run without it to measure "
-            "against",
-        ))  # fmt: skip
+        else:
+            rule = "the crop is part of the method, so there is no run without it to measure against"
+            lines.append(LeftOut(
+                "local fits and orders far from the object", "pixels", round(done * scale),
+                round((count * height * width - done) * scale), None, None, f"pixels counted on {how}; {rule}",
+            ))  # fmt: skip
     return explained("predict", f"{method.title}; {len(samples)} samples of {width}x{height} px", lines)

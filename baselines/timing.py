@@ -6,6 +6,8 @@ import resource
 import statistics
 import sys
 from collections.abc import Callable
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.run import captured_frames, write_submission
+from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.errors import DatasetError, SubmissionError
-from fpp_ml_bench.evaluation.result import HardwareInfo, Timing, read_result, write_result
+from fpp_ml_bench.evaluation.result import HardwareInfo, Timing, read_result, write_file, write_result
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -29,11 +31,9 @@ def time_method(
     opened: DatasetFolder, method: Method, split: str = "test", batch: int = 4, repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Timing:  # fmt: skip
-    """Time ``method`` on images of ``split``: see `Timing` for what each figure means.
-
-    Frames are in memory before the clock starts, at most ``batch`` sequences of them: no reading or writing counts.
-    Raises `DatasetError` for an empty split, or when the dataset lacks a frame that the method needs.
-    """
+    """Time ``method`` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before the
+    clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an empty
+    split, or when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)
     if not samples:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to time")
@@ -41,20 +41,15 @@ def time_method(
         raise ValueError(f"expected a batch and repeats of at least 1, got {batch} and {repeats}")
     # A batch larger than the split holds its samples again: views, which cost no memory.
     stacks = [captured_frames(opened, method, sample) for sample in samples[:batch]]
-    cuda: Any = None
-    if method.device.startswith("cuda"):
-        import torch
-
-        cuda = torch.cuda
+    cuda: Any = import_module("torch").cuda if method.device.startswith("cuda") else None
+    # Calls to a GPU return before their work is done.
+    finish: Callable[[], object] = partial(cuda.synchronize, method.device) if cuda is not None else lambda: None
 
     def seconds(run: Callable[[], object]) -> float:
-        """Time of ``run``; calls to a GPU return before their work is done."""
-        if cuda is not None:
-            cuda.synchronize(method.device)
+        finish()
         started = perf_counter()
         run()
-        if cuda is not None:
-            cuda.synchronize(method.device)
+        finish()
         return perf_counter() - started
 
     def latency_s(number: int) -> float:
@@ -116,10 +111,8 @@ def _status_mib(key: str) -> float:
 
 
 def check_target(path: Path, method: Method) -> None:
-    """Refuse, before any work, a file that is no submission or result, or that describes another method.
-
-    Raises SubmissionError, which says what differs.
-    """
+    """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
+    SubmissionError, which says what differs."""
     submission = read_result(path).submission if path.suffix == ".json" else _described(path)
     for key, in_file, timed in (
         ("method", submission.method, method.name),
@@ -145,11 +138,8 @@ def write_timing(path: Path, timing: Timing) -> None:
     submission = Submission.model_validate({**submission.model_dump(mode="json"), **measured})
     if result is not None:
         write_result(result.model_copy(update={"submission": submission}), path)
-        return
-    try:
-        write_submission(path, submission)
-    except OSError as error:
-        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
+    else:
+        write_file(submission.to_yaml().encode("utf-8"), path)
 
 
 def _described(path: Path) -> Submission:

@@ -143,7 +143,7 @@ def fill(materials: Materials, path: Path, again: bool) -> str:
     row_method, scenes = materials.method_and_scenes(entry)
     check_same_method(entry, row_method)
     weights = row_method.settings.get("weights_sha256")
-    stored = entry.reliance
+    stored = entry.result.reliance
     if stored is not None and not again:
         same = (stored.version, stored.dataset_fingerprint, stored.weights_sha256)
         if same == (RELIANCE_VERSION, scenes.dataset.fingerprint, weights):
@@ -159,7 +159,7 @@ def table(entries: list[Entry]) -> str:
     """Every row that has a phase reliance as Markdown, the highest score first."""
     titles = ("Row", "Reliance", "95% interval", "Periods aside", "Follows phase", "Follows brightness",
               "Change by outline", "No fringe inside", "No fringe outside", "Object MAE, mm", "Track")  # fmt: skip
-    measured = [(entry, entry.reliance) for entry in entries if entry.reliance is not None]
+    measured = [(entry, entry.result.reliance) for entry in entries if entry.result.reliance is not None]
     measured.sort(key=lambda pair: (-pair[1].score, pair[0].name))
     lines = []
     for entry, measured_reliance in measured:

@@ -1,8 +1,6 @@
-"""Constants of the scoring protocol: version, metric names, limits. PROTOCOL.md explains them.
-
-A change that can move any number in a result raises `PROTOCOL_VERSION`; a change of the file format raises
-`RESULT_SCHEMA_VERSION`. Results of different protocol versions are never ranked together.
-"""
+"""Constants of the scoring protocol: version, metric names, limits. PROTOCOL.md explains them. A change that can move
+any number in a result raises `PROTOCOL_VERSION`; a change of the file format raises `RESULT_SCHEMA_VERSION`. Results of
+different protocol versions are never ranked together."""
 
 from typing import Literal, get_args
 

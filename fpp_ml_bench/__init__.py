@@ -19,10 +19,8 @@ _ROOMS = frozenset(f"{__name__}.{room}" for room in ("loaders", "evaluation", "b
 
 
 class _Checkout:
-    """Finds the four subpackages of a source checkout, which are folders beside this one, and nothing else there.
-
-    When the checkout is only the current folder, it shadows an installed wheel; the two must not mix.
-    """
+    """Finds the four subpackages of a source checkout, which are folders beside this one, and nothing else there. When
+    the checkout is only the current folder, it shadows an installed wheel; the two must not mix."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> _ModuleSpec | None:

@@ -29,11 +29,9 @@ def edge_jump_mm(size_px: int) -> float:
 
 
 def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.bool_]:
-    """Pixels beside a depth edge, bool (H, W).
-
-    An edge runs between an object pixel and a background pixel beside it (4-neighbours), or between two object pixels
-    whose depths differ by more than ``jump_mm`` (default: `edge_jump_mm` of the width). Both pixels are marked.
-    """
+    """Pixels beside a depth edge, bool (H, W). An edge runs between an object pixel and a background pixel beside it
+    (4-neighbours), or between two object pixels whose depths differ by more than ``jump_mm`` (default: `edge_jump_mm`
+    of the width). Both pixels are marked."""
     jump = edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm
     inside = object_mask(depth_mm)
     edge = np.zeros(depth_mm.shape, dtype=bool)
@@ -63,9 +61,7 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
     return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
 
 
-def object_near_edges(
-    depth_mm: NDArray[np.floating], bands_px: Sequence[int], jump_mm: float | None = None
-) -> list[NDArray[np.bool_]]:
+def object_near_edges(depth_mm: NDArray, bands_px: Sequence[int], jump_mm: float | None = None) -> list[NDArray]:
     """`object_near_edge` for several bands; the edges are computed once."""
     near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)
@@ -111,11 +107,9 @@ def normalise(
     out: NDArray[np.floating] | None = None,
 ) -> NDArray:  # fmt: skip
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
-
     In single precision where depth and range are float32: the difference of two such depths within a factor of two is
     exact (Sterbenz), and the division rounds once. Else in float64, rounded at the end. Raises ``ValueError`` for an
-    unknown name or a range that is not finite and ordered.
-    """
+    unknown name or a range that is not finite and ordered."""
     _check(name)
     result = np.empty(depth_mm.shape, dtype=np.float32) if out is None else out
     if name == "raw":
@@ -138,10 +132,8 @@ def normalise(
 
 
 def denormalise(values: NDArray, name: Normalisation, depth_min_mm: float, depth_max_mm: float) -> NDArray[np.float64]:
-    """A network's output in the representation ``name`` back to mm, float64; ``ValueError`` as `normalise`.
-
-    Under ``individual`` every pixel goes through the same affine map: 0 becomes D_min (paper Section 5.3.2).
-    """
+    """A network's output in the representation ``name`` back to mm, float64; ``ValueError`` as `normalise`. Under
+    ``individual`` every pixel goes through the same affine map: 0 becomes D_min (paper Section 5.3.2)."""
     _check(name)
     depth = values.astype(np.float64)
     if name == "individual":

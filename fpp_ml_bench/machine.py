@@ -135,10 +135,8 @@ def numba_enabled() -> bool:
 
 def njit(function: Function) -> Function:
     """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is.
-
     No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
-    processor and for any number of threads.
-    """
+    processor and for any number of threads."""
     if _numba() is None:
         return function
     try:

@@ -7,7 +7,6 @@ from .ranking import shipped_rows as shipped_rows
 from .rows import chosen_tables as chosen_tables
 from .rows import read_entry as read_entry
 from .rows import write_row as write_row
-from .rows import write_text as write_text
 from .tables import group_tables as group_tables
 from .tables import markdown as markdown
 from .tables import paper_rich_tables as paper_rich_tables

@@ -3,9 +3,9 @@ how a group, its data and its rows are called. Rows of this package's methods ge
 every other submission keeps its own name, cut at a word.
 """
 
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import index
 
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.submission import Submission
@@ -61,11 +61,9 @@ class GroupKey:
 
     @classmethod
     def of(cls, result: Result) -> "GroupKey":
-        data = result.dataset
-        return cls(
-            result.track, result.mode, data.split, result.target, data.fingerprint, (data.size[0], data.size[1]),
-            result.edge_band_px, result.protocol_version,
-        )  # fmt: skip
+        data, protocol = result.dataset, (result.edge_band_px, result.protocol_version)
+        size = data.size[0], data.size[1]
+        return cls(result.track, result.mode, data.split, result.target, data.fingerprint, size, *protocol)
 
     @property
     def is_legacy(self) -> bool:
@@ -80,8 +78,7 @@ class GroupKey:
     @property
     def data_title(self) -> str:
         """``fpp-bench-full version 0, 960 x 960 px``; other data by size and the fingerprint's first 8 digits."""
-        height, width = self.size
-        benchmark, pixels = benchmark_of(self.fingerprint), f"{width} x {height} px"
+        benchmark, pixels = benchmark_of(self.fingerprint), f"{self.size[1]} x {self.size[0]} px"
         if benchmark is not None:
             return f"{benchmark.title}, {pixels}"
         return f"{pixels}, data {self.fingerprint[:8]}" + (", legacy" if self.is_legacy else "")
@@ -124,9 +121,8 @@ class Group:
 
 def assumption(result: Result) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
-    about = result.submission
-    assumes = about.method in ("phase", "phase-net") and about.settings.get("shading") is True
-    return ASSUMED if assumes else ""
+    method, shading = result.submission.method, result.submission.settings.get("shading")
+    return ASSUMED if method in ("phase", "phase-net") and shading is True else ""
 
 
 def assumption_sentences(result: Result) -> str:
@@ -136,10 +132,8 @@ def assumption_sentences(result: Result) -> str:
 
 
 def short_names(submissions: Sequence[Submission]) -> list[str]:
-    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name.
-
-    Where two would get the same, the later by its own name has a number behind it.
-    """
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name. Where
+    two would get the same, the later by its own name has a number behind it."""
     derived = {submission.name: _from_settings(submission) for submission in submissions}
     chosen: dict[str, str] = {}
     taken: set[str] = set()
@@ -178,7 +172,7 @@ def _direction(submission: Submission) -> str:
 
 
 def _classical(submission: Submission) -> str:
-    steps, direction = _whole(submission.settings["steps"]), _direction(submission)
+    steps, direction = index(submission.settings["steps"]), _direction(submission)  # type: ignore[arg-type]
     if not submission.settings.get("fewest"):
         return f"Classical {steps}+Gray, {direction}"
     gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
@@ -190,7 +184,7 @@ def _phase(submission: Submission) -> str:
     if "error_mm" in settings:
         name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
     else:
-        name = f"Phase, {_whole(settings['frames'])} {direction}"
+        name = f"Phase, {index(settings['frames'])} {direction}"  # type: ignore[arg-type]
     standoff = settings.get("prior") == "standoff"
     if not settings["shading"]:
         return f"{name}, standoff alone" if standoff else f"{name}, no shading"
@@ -198,9 +192,8 @@ def _phase(submission: Submission) -> str:
 
 
 def _phase_net(submission: Submission) -> str:
-    settings = submission.settings
-    shading = "" if settings["shading"] else ", no shading"
-    return f"{printable(settings['weights'])}, 1 {_direction(submission)}{shading}"
+    shading = "" if submission.settings["shading"] else ", no shading"
+    return f"{printable(submission.settings['weights'])}, 1 {_direction(submission)}{shading}"
 
 
 def _network(submission: Submission) -> str:
@@ -213,10 +206,9 @@ def _network(submission: Submission) -> str:
     if trained_frames not in CONFIGS:
         raise ValueError("unknown frames")
     frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
-    background = "no background" if settings["background_removed"] else ""
-    depth_range = _RANGES[settings.get("depth_range")]  # type: ignore[index]
-    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}", background, depth_range]
-    return ", ".join(part for part in parts if part)
+    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}"]
+    parts += ["no background" if settings["background_removed"] else "", _RANGES[settings.get("depth_range")]]  # type: ignore[index]
+    return ", ".join(filter(None, parts))
 
 
 def _loss(label: str) -> str:
@@ -226,10 +218,6 @@ def _loss(label: str) -> str:
         loss, _, weight = rest.partition("_")
         return f"hybrid {_LOSSES[loss]} {float(weight):g}"
     return f"masked {_LOSSES[rest]}" if kind == "masked" else _LOSSES[label]
-
-
-def _whole(value: object) -> int:
-    return operator.index(value)  # type: ignore[arg-type]  # TypeError for all but a whole number
 
 
 _METHODS = {

@@ -6,7 +6,7 @@ Own definition; 10 mm is the widest tolerance that this benchmark counts pixels 
 """
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,10 +141,8 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
 
 
 def write_page_of(results: Sequence[Path], folder: Path) -> None:
-    """Write the page of result and row files, or of the rows shipped with the package where none are named.
-
-    Nothing is looked for in the current folder. Raises SubmissionError for a file that is no sound result.
-    """
+    """Write the page of result and row files, or of the rows shipped with the package where none are named. Nothing is
+    looked for in the current folder. Raises SubmissionError for a file that is no sound result."""
     rows = expand(results) if results else shipped_rows()
     settings = None if results else shipped_tradeoff()
     write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
@@ -152,10 +150,8 @@ def write_page_of(results: Sequence[Path], folder: Path) -> None:
 
 def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
     """Copy the page in folder ``page`` to ``folder`` and add the Space's README; ``dataset_repo`` is linked from it.
-
-    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space
-    publishes every file.
-    """
+    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space publishes
+    every file."""
     if not (page / INDEX).is_file():
         raise PublishError(f"{page}: expected a page with {INDEX}; write one with: fpp-bench leaderboard --page {page}")
     files = staged_files(page)
@@ -187,24 +183,13 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
     return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", tuple(sorted(owned)))
 
 
-@dataclass(frozen=True)
-class ScoredOn:
-    """The published dataset that results belong to: its repository, the ``revision`` there, and what its mark file
-    says (``about``). ``source_url``: https address where the results come from."""
-
-    repo: str
-    revision: str
-    about: Mapping[str, Any]
-    source_url: str | None = None
-
-
-def stage_results(paths: Sequence[Path], repo: str, scored_on: ScoredOn, folder: Path) -> Publication:
-    """Write a file for each result into ``folder``; it replaces an earlier result of the same task.
-
-    Only numbers and fixed words of a result are published, no text that its author wrote. A result scored on other data
-    is refused, as is a result of another split or target, or without an object score (`PublishError`).
-    """
-    source_url, fingerprint = scored_on.source_url, scored_on.about.get("fingerprint")
+def stage_results(
+    paths: Sequence[Path], repo: str, folder: Path, scored_on: str, revision: str, fingerprint: object,
+    source_url: str | None = None,
+) -> Publication:  # fmt: skip
+    """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
+    fixed words of a result are published, no text that its author wrote. A result scored on other data is refused, as
+    is a result of another split or target, or without an object score (`PublishError`)."""
     if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
         raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")
     named: dict[str, Path] = {}
@@ -214,7 +199,7 @@ def stage_results(paths: Sequence[Path], repo: str, scored_on: ScoredOn, folder:
         if result.dataset.fingerprint != fingerprint:
             raise PublishError(
                 f"{file}: was scored on other data (fingerprint {result.dataset.fingerprint[:12]}) than "
-                f"{scored_on.repo} holds ({printable(fingerprint, 12)}); score the predictions on that dataset, or "
+                f"{scored_on} holds ({printable(fingerprint, 12)}); score the predictions on that dataset, or "
                 "publish this one"
             )
         task = task_of(result, file).id
@@ -230,11 +215,11 @@ def stage_results(paths: Sequence[Path], repo: str, scored_on: ScoredOn, folder:
                 f"{file}: has no object score (no sample shows an object), so there is nothing to rank by"
             )
         entry = EvalResultEntry(
-            dataset_id=scored_on.repo, task_id=task, value=score(error_mm), dataset_revision=scored_on.revision,
+            dataset_id=scored_on, task_id=task, value=score(error_mm), dataset_revision=revision,
             date=result.created[:10], source_url=source_url,
             source_name=f"{NAME} leaderboard" if source_url is not None else None, notes=_notes(result),
         )  # fmt: skip
-        name = f"{task}--{scored_on.repo.replace('/', '--')}.yaml"
+        name = f"{task}--{scored_on.replace('/', '--')}.yaml"
         (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([entry])).encode())
     return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")
 

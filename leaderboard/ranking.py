@@ -1,5 +1,6 @@
 """Result files into ranked groups. Results on different data or by different rules are never ranked together."""
 
+import operator
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -47,11 +48,9 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last.
-
-    Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group
-    holds a name twice.
-    """
+    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last. Equal
+    values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group holds a
+    name twice."""
     if sort not in SORT_KEYS:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
@@ -92,7 +91,10 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
                 f"{printable(entry.name)!r} on the same data; leave one out, or give one another name"
             )
         named[entry.name] = entry
-    valued = [(_badness(entry.value(sort), sort), entry) for entry in entries]
+    # Smaller is better: a tolerance share with its sign turned, a bias without its sign.
+    turned = operator.neg if sort in HIGHER_IS_BETTER else abs
+    values = [entry.value(sort) for entry in entries]
+    valued = [(None if v is None else turned(v), entry) for v, entry in zip(values, entries, strict=True)]
     valued.sort(key=lambda pair: (pair[0] is None, pair[0] or 0.0, pair[1].name))
     ordered = [entry for _, entry in valued]
     without_interval = sort in HIGHER_IS_BETTER or sort in SIGNED
@@ -101,10 +103,3 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     names = short_names([entry.result.submission for entry in ordered])
     ranked = tuple(Ranked(*ends, entry, name) for ends, entry, name in zip(ranges, ordered, names, strict=True))
     return Group(key, min(entry.result.dataset.name for entry in entries), ranked)
-
-
-def _badness(value: float | None, sort: str) -> float | None:
-    """``value`` such that smaller is better: a tolerance share with its sign turned, a bias without its sign."""
-    if value is None:
-        return None
-    return -value if sort in HIGHER_IS_BETTER else abs(value)

@@ -31,10 +31,8 @@ def check_same_method(entry: Entry, method: Method) -> None:
 
 
 def write_reliance(entry: Entry, reliance: Reliance) -> None:
-    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; row files keep their provenance.
-
-    Raises SubmissionError for a block that contradicts the result (other weights, other units).
-    """
+    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; row files keep their provenance. Raises
+    SubmissionError for a block that contradicts the result (other weights, other units)."""
     content = {**result_content(entry.result), "reliance": reliance.model_dump(mode="json")}
     result: Result = validate(Result, content, entry.path, "result of fpp-eval")
     if entry.provenance == LOCAL:

@@ -18,14 +18,14 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import reproduce
-from fpp_ml_bench.baselines.reproduce import MAIN_KEY, MEAN, PREDICTED, Folders, Job, Variant
+from fpp_ml_bench.baselines.reproduce import MAIN_KEY, Folders, Job
 from fpp_ml_bench.baselines.training import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.report import percent
-from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.evaluation.result import Headline, Result, write_file
 from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, Entry, paper_tables, read_entry, write_row, write_text
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, Entry, paper_tables, read_entry, write_row
 from fpp_ml_bench.leaderboard.tables import device, markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -41,11 +41,10 @@ def write_measured(result: Result, path: Path) -> None:
 
 def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> Entry | None:
     """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
-    entry = _sound_row(path)
-    if entry is None:
+    if (entry := _sound_row(path)) is None:
         return None
-    result = entry.result
-    found = (result.dataset.fingerprint, result.submission.settings.get("weights_sha256"), result.protocol_version)
+    data, settings, protocol = entry.result.dataset, entry.result.submission.settings, entry.result.protocol_version
+    found = (data.fingerprint, settings.get("weights_sha256"), protocol)
     return entry if found == (opened.fingerprint, weights_sha256, PROTOCOL_VERSION) else None
 
 
@@ -67,41 +66,24 @@ def _sound_row(path: Path) -> Entry | None:
 
 
 @dataclass(frozen=True)
-class Scored:
-    """Errors in mm by the keys of `HEADLINE`, the 95% interval of the object MAE, and each sample's own: sample to
-    (object, object MAE in mm)."""
-
-    errors_mm: dict[str, float | None]
-    interval_mm: tuple[float, float] | None
-    samples: dict[str, tuple[str, float | None]]
-
-
-def scored(scores: Result | reproduce.AllFrames) -> Scored:
-    """The scores of a row's result, or those over all frames."""
-    samples = {row.sample: (row.object, getattr(getattr(row, "metrics", row), MAIN_KEY)) for row in scores.per_sample}
-    return Scored({key: getattr(scores.metrics, key) for key in HEADLINE}, scores.intervals.of(MAIN_KEY), samples)
-
-
-@dataclass(frozen=True)
 class Line:
-    """A line of a table. ``scored`` and ``entry`` are None where nothing has been measured; ``twins`` maps a twin's
-    suffix to its row. ``paper_mm`` are the paper's errors by the keys of `HEADLINE`, None where it reports none."""
+    """A line of a table. ``scores``, those of the row's result or over all frames, and ``entry`` are None where nothing
+    has been measured; ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None
+    where it reports none."""
 
     row: str
     label: str
     recipe: Recipe
-    scored: Scored | None
+    scores: Result | reproduce.AllFrames | None
     entry: Entry | None
     paper_mm: dict[str, float] | None
     twins: dict[str, Entry] = field(default_factory=dict)
 
 
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty.
-
-    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
-    the leaderboard: the first frame only, without a number of the paper.
-    """
+    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty. Where the paper
+    scores every frame (multi-frame), a training's first line does too, and a second line is its row in the leaderboard:
+    the first frame only, without a number of the paper."""
     reported = {row.row: row for row in paper_tables()[table].rows}
     recipes = {name: job.recipe for job in jobs for name in job.rows}
     lines = []
@@ -113,16 +95,15 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
         sha256 = reproduce.file_sha256(weights)
-        suffixes = [variant.suffix for variant in reproduce.variants(recipe)]
-        paths = [folders.row(recipe, variant) for variant in reproduce.variants(recipe)]
-        entry, *others = (row_that_holds(path, opened, sha256) for path in paths)
-        twins = {suffix: twin for suffix, twin in zip(suffixes[1:], others, strict=True) if twin is not None}
-        first = None if entry is None else scored(entry.result)
-        if table != "multi_frame" or len(opened.sequence.config(recipe.data_config)) == 1:
+        rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in reproduce.variants(recipe)}
+        entry, *_ = rows.values()
+        twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
+        first = None if entry is None else entry.result
+        if table != "multi_frame" or len(opened.sequence.config(recipe.frames)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
         every = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
-        lines.append(Line(row, label, recipe, None if every is None else scored(every), entry, paper_mm))
+        lines.append(Line(row, label, recipe, every, entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
 
@@ -149,11 +130,12 @@ class Ordering:
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
     """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
-    compared = [
-        (line.paper_mm[MAIN_KEY], line.scored.samples, line)
-        for line in lines
-        if line.scored is not None and line.paper_mm is not None
-    ]
+    compared = []
+    for line in lines:
+        if line.scores is not None and line.paper_mm is not None:
+            errors = [(s.sample, s.object, getattr(getattr(s, "metrics", s), MAIN_KEY)) for s in line.scores.per_sample]
+            samples = {sample: (name, error_mm) for sample, name, error_mm in errors}
+            compared.append((line.paper_mm[MAIN_KEY], samples, line))
     judged = []
     for (better_mm, best, better), (worse_mm, worst, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
         pairs = [(sample, best[sample][1], worst[sample][1]) for sample in best if sample in worst]
@@ -186,7 +168,7 @@ def _titles(preset: str) -> list[tuple[str, str | None]]:
 def _cells(line: Line) -> list[str]:
     """A dash where nothing is known; errors with the paper's two decimals."""
     entry, paper = line.entry, line.paper_mm
-    here, interval = (line.scored.errors_mm, line.scored.interval_mm) if line.scored else (None, None)
+    here, interval = (line.scores.metrics, line.scores.intervals.of(MAIN_KEY)) if line.scores else (None, None)
     settings = entry.result.submission.settings if entry else {}
     counts = [settings.get("epochs_trained"), settings.get("training_seconds")]
     timing, latency = (entry.result.timing, entry.latency_ms) if entry else (None, None)
@@ -194,7 +176,7 @@ def _cells(line: Line) -> list[str]:
         line.label, entry.result.track if entry else "-", _pair(here, "object"),
         " - ".join(map(_mm, interval)) if interval else "-",
         _pair(paper, "object"), _pair(here, "overall"), _pair(paper, "overall"), _pair(here, "background"),
-        _pair(paper, "background"), _twin(line, PREDICTED), _twin(line, MEAN),
+        _pair(paper, "background"), _twin(line, "predicted"), _twin(line, "mean"),
         f"{timing.parameters:,}" if timing else "-",
         *(f"{count:,.0f}" if isinstance(count, int | float) else "-" for count in counts),
         "-" if latency is None else f"{latency:.3g}",
@@ -205,14 +187,15 @@ def _mm(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _pair(errors_mm: Mapping[str, float | None] | None, pixels: str) -> str:
+def _pair(errors: Headline | Mapping[str, float] | None, pixels: str) -> str:
     """MAE and RMSE."""
+    errors_mm = errors.model_dump() if isinstance(errors, Headline) else errors
     return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
 
 
-def _twin(line: Line, variant: Variant) -> str:
+def _twin(line: Line, depth_range: str) -> str:
     """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
-    entry = line.twins.get(variant.suffix)
+    entry = line.twins.get(depth_range)
     if entry is None:
         return "-"
     errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
@@ -224,7 +207,7 @@ def write_table(table: str, settings: reproduce.ReproduceSettings, outcome: repr
     folders = settings.folders
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
     text = table_markdown(table, lines, folders.preset, settings.command, outcome.failed)
-    write_text(folders.table(table), text)
+    write_file(text.encode("utf-8"), folders.table(table))
     return folders.table(table)
 
 
@@ -286,7 +269,7 @@ def _about(lines: Sequence[Line]) -> list[str]:
 
 
 def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
-    empty = [line for line in lines if line.scored is None]
+    empty = [line for line in lines if line.scores is None]
     if not empty:
         return []
     why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe.name in failed]

@@ -14,9 +14,9 @@ from typing import Literal, get_args
 
 from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Reliance, Result, parse_result, read_json, result_content, write_json
+from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, result_content, write_json
 from fpp_ml_bench.evaluation.schema import StrictModel, validate
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import printable
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
@@ -69,10 +69,8 @@ class Entry:
     @property
     def latency_ms(self) -> float | None:
         """Median time per image in ms; None when unknown."""
-        if self.result.timing is not None:
-            return self.result.timing.latency_median_ms
-        seconds = self.result.submission.seconds_per_sample
-        return None if seconds is None else 1000 * seconds
+        timing, seconds = self.result.timing, self.result.submission.seconds_per_sample
+        return timing.latency_median_ms if timing else None if seconds is None else 1000 * seconds
 
     @property
     def time_measured(self) -> bool:
@@ -81,19 +79,13 @@ class Entry:
         source = timing.provenance if timing is not None else submission.seconds_source
         return source == "measured" and self.provenance in ("measured here", LOCAL)
 
-    @property
-    def reliance(self) -> Reliance | None:
-        """How far the method follows the fringe's phase; None where it was not measured."""
-        return self.result.reliance
-
     def value(self, key: str) -> float | None:
         """Value of a sort key; None for an empty pixel set or an unknown time."""
         if key == "seconds_per_sample":
             return None if self.latency_ms is None else self.latency_ms / 1000
         if key == "frames_used":
             return float(self.frames)
-        value: float | None = getattr(self.result.metrics, key)
-        return value
+        return getattr(self.result.metrics, key)  # type: ignore[no-any-return]
 
     def interval(self, key: str) -> tuple[float, float] | None:
         """The 95% interval of ``key``; None where it has none."""
@@ -124,19 +116,9 @@ def write_row(entry: Entry, provenance: str, path: Path) -> None:
     write_json({**head, "result": result_content(entry.result)}, path)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 ``text``, complete or not at all. SubmissionError where it can't be written."""
-    try:
-        write_atomically(path, text.encode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{printable(str(path), 500)} can't be written: {error.strerror}") from None
-
-
 def picture_of(entry: Entry) -> bytes | None:
-    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size.
-
-    Its pixels are not decoded here; a browser shows it as a PNG or not at all.
-    """
+    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size. Its
+    pixels are not decoded here; a browser shows it as a PNG or not at all."""
     path = entry.path.with_suffix(".png")
     if path.is_symlink() or not path.is_file():
         return None
@@ -177,8 +159,9 @@ def paper_tables() -> dict[str, PaperTable]:
     content = json.loads(Path(__file__).with_name("paper_rows.json").read_text(encoding="utf-8"))
     tables = {}
     for table in content["tables"]:
-        errors_mm = [dict(zip(content["columns"], row.pop("errors_mm"), strict=True)) for row in table["rows"]]
-        rows = tuple(PaperRow(**row, errors_mm=errors) for row, errors in zip(table["rows"], errors_mm, strict=True))
+        for row in table["rows"]:
+            row["errors_mm"] = dict(zip(content["columns"], row["errors_mm"], strict=True))
+        rows = tuple(PaperRow(**row) for row in table["rows"])
         tables[table["name"]] = PaperTable(table["name"], table["title"], rows)
     return {name: tables[name] for name in TABLES}
 

@@ -117,12 +117,13 @@ def _milliseconds(row: Ranked) -> str:
 
 def reliance(entry: Entry) -> str:
     """The phase-reliance score with two decimals."""
-    return NOT_MEASURED if entry.reliance is None else f"{entry.reliance.score:.2f}"
+    measured = entry.result.reliance
+    return NOT_MEASURED if measured is None else f"{measured.score:.2f}"
 
 
 def reliance_interval(entry: Entry) -> str:
     """The ends of its interval; empty without any."""
-    low, high = (None, None) if entry.reliance is None else entry.reliance.interval
+    low, high = entry.result.reliance.interval if entry.result.reliance else (None, None)
     return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
 
 
@@ -150,15 +151,12 @@ def paper_note(paper: PaperTable) -> str:
 
 
 def group_tables(groups: Sequence[Group], sort: str, width: int) -> list[Table | Text]:
-    """A table for each group, for a terminal of ``width`` characters; without groups, how to begin.
-
-    Submitted text goes in as `Text`: it is never markup.
-    """
+    """A table for each group, for a terminal of ``width`` characters; without groups, how to begin. Submitted text goes
+    in as `Text`: it is never markup."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
-    all_columns = columns(sort)
-    shown = [column for column in all_columns if column.from_width <= width]
+    shown = [column for column in columns(sort) if column.from_width <= width]
     for group in groups:
         table = Table(title=Text(group.key.title), title_justify="left")
         for column in shown:
@@ -168,7 +166,7 @@ def group_tables(groups: Sequence[Group], sort: str, width: int) -> list[Table |
         for row in group.rows:
             table.add_row(*(Text(column.text(row)) for column in shown))
         parts += [table, Text(f"{LEGACY_NOTE}\n" if group.key.is_legacy else "")]
-    left_out = [column.title for column in all_columns if width < column.from_width < ONLY_IN_FILES]
+    left_out = [column.title for column in columns(sort) if width < column.from_width < ONLY_IN_FILES]
     hint = f" In a wider terminal, --markdown and --json: {', '.join(left_out)}." if left_out else ""
     return [*parts, Text(NOTE + hint + "\n")]
 
@@ -188,9 +186,7 @@ def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
 
 def markdown_text(text: str) -> str:
     """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
-
-    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins.
-    """
+    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
     safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
     return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
 

@@ -48,11 +48,9 @@ _ANSWERS = {
 
 @dataclass(frozen=True)
 class Publication:
-    """Files staged for a repository; every file below ``folder`` is part of it, hidden files included.
-
-    ``owned`` are folders (ending in ``/``) that only this publication fills: any other file in them is deleted.
-    ``message`` is the commit message.
-    """
+    """Files staged for a repository; every file below ``folder`` is part of it, hidden files included. ``owned`` are
+    folders (ending in ``/``) that only this publication fills: any other file in them is deleted. ``message`` is the
+    commit message."""
 
     kind: Kind
     repo: str
@@ -106,10 +104,8 @@ def staged_files(folder: Path) -> dict[str, Path]:
 
 
 def changes(publication: Publication, remote: Remote) -> list[Change]:
-    """What publishing does to each file of ``publication``, sorted by path, and what it deletes.
-
-    Reads every staged file once. Other files of the repository outside ``owned`` stay as they are.
-    """
+    """What publishing does to each file of ``publication``, sorted by path, and what it deletes. Reads every staged
+    file once. Other files of the repository outside ``owned`` stay as they are."""
     staged = staged_files(publication.folder)
     planned = [Change(_status(at, remote.files.get(name)), name, at.stat().st_size) for name, at in staged.items()]
     gone = (name for name in remote.files if name not in staged and name.startswith(publication.owned))
@@ -218,10 +214,8 @@ class Hub:
         sent: Callable[[int], None] = lambda count: None,
     ) -> str:  # fmt: skip
         """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
-
-        All files become visible together; a run after an interrupted one sends only what is missing. ``sent`` is
-        called with the bytes of each batch. Raises `PublishError`, also after a commit by someone else meanwhile.
-        """
+        All files become visible together; a run after an interrupted one sends only what is missing. ``sent`` is called
+        with the bytes of each batch. Raises `PublishError`, also after a commit by someone else meanwhile."""
         repo, kind = publication.repo, publication.kind
         if not remote.exists:
             with self._explained(f"making {kind} {repo}"):

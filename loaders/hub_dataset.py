@@ -28,10 +28,8 @@ _IDENTITY, _FILES = "staged.sha256", "files"
 @contextmanager
 def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``, kept for the next run.
-
     ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are kept for the same identity and
-    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write.
-    """
+    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write."""
     if chosen is None:
         with tempfile.TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
             yield Path(folder)
@@ -78,17 +76,8 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
         "task_categories": ["depth-estimation"],
         "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
-        "configs": [
-            {
-                "config_name": config,
-                **({"default": True} if config == dataset.configs[0] else {}),
-                "version": storage.data_version(dataset.fingerprint),
-                # Files by name, not by pattern: a stray file can never join the data.
-                "data_files": [{"split": split, "path": list(paths)} for split, paths in files.items()],
-                "columns": storage.columns(dataset, config),
-            }
-            for config in dataset.configs
-        ],
+        # Files by name, not by pattern: a stray file can never join the data.
+        "configs": storage.card_configs(dataset, dataset.fingerprint, files, preview=True),
     }
     return f"---\n{yaml_text(head)}---\n"
 
@@ -98,10 +87,8 @@ def stage_dataset(
     row_done: Callable[[int], None] = lambda rows: None,
 ) -> Publication:  # fmt: skip
     """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
-
     Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
-    ``OSError`` when a file can't be written.
-    """
+    ``OSError`` when a file can't be written."""
     for name, shard in storage.data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)

@@ -48,9 +48,7 @@ VOID = Flag.UNLIT | Flag.MIXED
 @dataclass
 class Row:
     """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest.
-
-    The images' memory may be reused as soon as the writer takes the next row.
-    """
+    The images' memory may be reused as soon as the writer takes the next row."""
 
     sample: str
     object: str

@@ -18,12 +18,9 @@ from fpp_ml_bench.optics import CONFIGS
 
 
 class FringeDepth(NamedTuple):
-    """A training sample, or a batch of samples with a leading axis B.
-
-    ``fringe`` float32 (1, H, W) in [0, 1]; ``depth`` float32 (1, H, W) in the chosen representation, 0 = background;
-    ``depth_range_mm`` float32 (2,), D_min and D_max of the sample; ``row`` and ``frame`` int64, the sample's row in
-    the split and the frame index.
-    """
+    """A training sample, or a batch of samples with a leading axis B. ``fringe`` float32 (1, H, W) in [0, 1]; ``depth``
+    float32 (1, H, W) in the chosen representation, 0 = background; ``depth_range_mm`` float32 (2,), D_min and D_max of
+    the sample; ``row`` and ``frame`` int64, the sample's row in the split and the frame index."""
 
     fringe: torch.Tensor
     depth: torch.Tensor
@@ -100,11 +97,8 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         )  # fmt: skip
 
     def batches(self, size: int, order: Sequence[int] | None = None) -> Iterator[FringeDepth]:
-        """Batches of ``size`` items (the last may be smaller) in ``order``, default ascending.
-
-        The tensors are views of a buffer that the next batch overwrites: copy data that is needed longer (moving a
-        batch to a GPU copies it).
-        """
+        """Batches of ``size`` items (the last may be smaller) in ``order``, default ascending. The tensors are views of
+        a buffer that the next batch overwrites: copy data that is needed longer (moving a batch to a GPU copies it)."""
         order = range(len(self)) if order is None else order
         buffer = self.empty(size)
         for start in range(0, len(order), size):

@@ -32,10 +32,10 @@ def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
 
 
 def oracle(opened, fields):
-    """An `Oracle` of the maps ``fields`` of `Truth`, as a subject."""
+    """An `Oracle` of the maps ``fields`` of `truth`, as a subject."""
     maps = {}
     for sample in opened.samples("all"):
         ground_truth = truth(opened.depth_mm(sample), opened.rig, "horizontal")
         key = subject_with(nn.Identity(), opened.size).input_batch([[opened.frame(sample, 0)]])[0]
-        maps[float(key.double().sum())] = torch.from_numpy(np.stack([getattr(ground_truth, name) for name in fields]))
+        maps[float(key.double().sum())] = torch.from_numpy(np.stack([ground_truth[name] for name in fields]))
     return subject_with(Oracle(maps), opened.size)

@@ -1,6 +1,8 @@
 from .counterfactual_scenes import VIEWS_PER_OBJECT as VIEWS_PER_OBJECT
 from .counterfactual_scenes import SceneSet as SceneSet
-from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import JSON_FILE as JSON_FILE
+from .diagnosis import REPORT_FILE as REPORT_FILE
+from .diagnosis import ProbeResult as ProbeResult
 from .diagnosis import checked_names as checked_names
 from .diagnosis import diagnose as diagnose
 from .phase_reliance import measure as measure

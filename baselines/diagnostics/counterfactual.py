@@ -20,8 +20,7 @@ from fpp_ml_bench.evaluation.score import caution
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 MOST_VIEWS = 6
-_WIDE, _GAP = 11.5, 2
-"""Width of the figure of scenes in inches, and gap between two scenes in px."""
+_WIDE, _GAP = 11.5, 2  # width of the figure of scenes in inches, and gap between two scenes in px
 _FOLLOWS = {
     "follows_phase": "phase alone", "follows_light": "brightness alone", "follows_both": "both, as in\na photograph",
     "follows_constant": "phase, by\na constant", "order_free_follows_phase": "phase, whole\nperiods aside",
@@ -56,13 +55,10 @@ class Counterfactual(Probe):
         # The middle sample of the list, which is the same for every method.
         middle = samples[len(samples) // 2].sample
         scenes = next(scenes for scenes in scene_set.scenes(reliance.direction) if scenes.original.sample == middle)
-        return self.finding(
-            summary(reliance),
-            {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample},
-            tables(reliance, samples),
-            _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes, folder),
-            _draw_parts(reliance, samples, folder),
-        )
+        values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
+        drawn = _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes, folder)
+        bars = _draw_parts(reliance, samples, folder)
+        return self.finding(summary(reliance), values, tables(reliance, samples), drawn, bars)
 
 
 def summary(reliance: Reliance) -> str:
@@ -88,17 +84,11 @@ def summary(reliance: Reliance) -> str:
 def tables(reliance: Reliance, samples: Sequence[SampleReliance]) -> list[Table]:
     """The parts of the score, and the score of every sample."""
     shown = ("follows_phase", "follows_light", "change_outline")
-    return [
-        Table(
-            "Parts of the score, and further measurements", ("Part", "Mean over samples"),
-            [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()],
-        ),
-        Table(
-            "Sample by sample",
-            ("Sample", "Score", "Whole periods aside", "Follows phase", "Follows brightness", "Change by outline"),
-            [(s.sample, s.score, s.order_free_score, *(s.parts.get(part) for part in shown)) for s in samples],
-        ),
-    ]  # fmt: skip
+    parts = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
+    header = ("Sample", "Score", "Whole periods aside", "Follows phase", "Follows brightness", "Change by outline")
+    rows = [(s.sample, s.score, s.order_free_score, *(s.parts.get(part) for part in shown)) for s in samples]
+    means = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), parts)
+    return [means, Table("Sample by sample", header, rows)]
 
 
 def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Path) -> Figure:

@@ -23,14 +23,11 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
-SMALLEST_SHIFT_RAD = 0.05 * TAU
-"""Where the working range allows only smaller shifts, the move is left out."""
+SMALLEST_SHIFT_RAD = 0.05 * TAU  # where the working range allows only smaller shifts, the move is left out
 REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "other direction", "other pitch")
 VIEWS_PER_OBJECT = 2
-_STORED_PX = 300
-"""Scenes of images up to this width are kept in memory; larger ones are made again for each method."""
-GROWTH = 0.1
-"""How far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area."""
+_STORED_PX = 300  # scenes of images up to this width are kept in memory; larger ones are made again for each method
+GROWTH = 0.1  # how far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area
 KEPT_SHARE = 0.5
 """Share of the object that an ellipse leaves; of the other objects' outlines the nearest to this share is used."""
 
@@ -60,10 +57,8 @@ def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Or
 @dataclass(frozen=True)
 class Move:
     """The surface moved to ``depth_mm``, so that its phase changes by ``amplitude_rad`` times the field ``name``.
-
     ``phase``: the phase of the moved surface with the brightness of the original. ``light``: the brightness of the
-    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed.
-    """
+    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed."""
 
     name: str
     amplitude_rad: float
@@ -75,12 +70,10 @@ class Move:
 
 @dataclass(frozen=True)
 class OutlineChange:
-    """The same phase under another outline; ``unchanged`` bool (H, W): target pixels that show the object before and
-    after."""
+    """The same phase under another outline; target pixels within the scene's mask show the object before and after."""
 
     name: str
     scene: Scene
-    unchanged: NDArray[np.bool_]
     depth_mm: NDArray[np.float64]
 
 
@@ -95,9 +88,9 @@ class Counterfactuals:
     outline_changes: tuple[OutlineChange, ...]
     reprojected: dict[str, Scene]
 
-    def moves_within(self) -> tuple[Move, ...]:
+    def moves_within(self) -> list[Move]:
         """Moves that vary over the object, so all but the constant."""
-        return tuple(move for move in self.moves if move.name != "constant")
+        return [move for move in self.moves if move.name != "constant"]
 
 
 def counterfactuals(
@@ -106,14 +99,10 @@ def counterfactuals(
     """Every scene of ``sample``, which shows an object and may be cut to the outlines of ``outline_samples``."""
     sample_scene = original(dataset, renderer, sample)
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
-    return Counterfactuals(
-        original=sample_scene,
-        direction=direction,
-        layer=CalibrationLayer.of(renderer.rig, direction),
-        moves=tuple(_moves(sample_scene, renderer, direction)),
-        outline_changes=tuple(outline_changes(sample_scene, renderer, outlines)),
-        reprojected={name: replace(sample_scene.scene, projected=name) for name in REPROJECTED},
-    )
+    moves, changes = _moves(sample_scene, renderer, direction), outline_changes(sample_scene, renderer, outlines)
+    reprojected = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
+    layer = CalibrationLayer.of(renderer.rig, direction)
+    return Counterfactuals(sample_scene, direction, layer, tuple(moves), tuple(changes), reprojected)
 
 
 def fields(surface: Surface) -> dict[str, Field]:
@@ -135,9 +124,8 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
             amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
-            moved_surface = rendering.moved(surface, renderer.rig, direction, rendering.times(amplitude, field))
-            lit = renderer.light(moved_surface)
-            before = sample.scene.lit
+            moved_surface = rendering.moved(surface, renderer.rig, direction, field, amplitude)
+            lit, before = renderer.light(moved_surface), sample.scene.lit
             phase, light, both = (
                 replace(sample.scene, lit=replace(one, gain=brightness.gain, ambient=brightness.ambient))
                 for one, brightness in ((lit, before), (before, lit), (lit, lit))
@@ -173,9 +161,9 @@ def outline_changes(
         cuts["another object's outline"] = moved[int(np.argmin(np.abs(np.array(shares) - KEPT_SHARE)))]
     for name, cut in cuts.items():
         inside_cut = cut.ravel()[sample.surface.pixels]
-        kept, pixels = sample.target & cut, sample.scene.pixels[inside_cut]
-        scene = replace(sample.scene, pixels=pixels, lit=_part(sample.scene.lit, inside_cut), mask=kept)
-        yield OutlineChange(name, scene, kept, sample.depth_mm * (inside & cut))
+        lit, pixels = _part(sample.scene.lit, inside_cut), sample.scene.pixels[inside_cut]
+        scene = replace(sample.scene, pixels=pixels, lit=lit, mask=sample.target & cut)
+        yield OutlineChange(name, scene, sample.depth_mm * (inside & cut))
     yield _grown(sample, renderer, inside)
 
 
@@ -192,7 +180,7 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
     gain = np.concatenate([sample.scene.lit.gain, sample.scene.lit.gain[source]])
     lit = replace(renderer.light(both), gain=gain)
     scene = replace(sample.scene, pixels=both.pixels.astype(np.uint32), lit=lit, mask=sample.target | ring)
-    return OutlineChange("grown", scene, sample.target, both.depth_mm(renderer.shape))
+    return OutlineChange("grown", scene, both.depth_mm(renderer.shape))
 
 
 def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
@@ -212,8 +200,7 @@ def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray
 
 
 def _ellipse(sample: Original) -> NDArray[np.bool_]:
-    """An ellipse at the target's centre, with axes in proportion to its standard deviations, that holds `KEPT_SHARE` of
-    its pixels."""
+    """An ellipse that holds `KEPT_SHARE` of the target's pixels, with its centre and shape (standard deviations)."""
     points = np.argwhere(sample.target).astype(np.float64)
     spread = np.maximum(points.std(axis=0), 1.0)
     rows, columns = np.indices(sample.target.shape)
@@ -243,10 +230,8 @@ def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple
 
 
 class SceneSet:
-    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods.
-
-    Raises `DiagnosisError` for a split without an object.
-    """
+    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods. Raises
+    `DiagnosisError` for a split without an object."""
 
     def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
         self.dataset, self.renderer = dataset, SceneRenderer.of(dataset)

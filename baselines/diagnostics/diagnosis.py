@@ -44,25 +44,14 @@ class ProbeResult:
     reused: bool
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """All findings about a subject in the report's order, and the files ``report`` and ``values``."""
-
-    results: tuple[ProbeResult, ...]
-    report: Path
-    values: Path
-
-
 def diagnose(
     subject: Subject, dataset: DatasetFolder, probe_names: Sequence[str], settings: ProbeSettings, out: Path,
     progress: Callable[[Probe], Progress], command: str = "",
-) -> Diagnosis:  # fmt: skip
-    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``.
-
-    A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the same; those of other
-    probes join the report. ``progress`` is called with a probe before it runs. ``command`` is quoted in the report.
-    Raises `DiagnosisError` for an ``out`` that holds other files, and the errors of the probes; earlier findings stay.
-    """
+) -> list[ProbeResult]:  # fmt: skip
+    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
+    in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
+    same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
+    ``command``. Raises `DiagnosisError` if ``out`` holds other files, and errors of probes; earlier findings stay."""
     _prepare(out)
     selected = checked_names(probe_names)
     results = []
@@ -84,23 +73,19 @@ def diagnose(
             save_finding(out, key, finding, seconds)
             results.append(ProbeResult(probe, finding, seconds, reused=False))
     context = _context(subject, dataset, settings, command)
-    findings = {
-        one.finding.probe: {
-            "title": one.finding.title, "summary": one.finding.summary, "skipped": one.finding.skipped,
-            "seconds": one.seconds, "values": one.finding.values,
-        }
-        for one in results
-    }  # fmt: skip
+    findings = {}
+    for one in results:
+        told = {key: getattr(one.finding, key) for key in ("title", "summary", "skipped")}
+        findings[one.finding.probe] = {**told, "seconds": one.seconds, "values": one.finding.values}
     content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
     _write_json(out / JSON_FILE, content)
     html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
     write_atomically(out / REPORT_FILE, html.encode("utf-8"))
-    return Diagnosis(tuple(results), out / REPORT_FILE, out / JSON_FILE)
+    return results
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """``names`` without repeats, in the order of the report; all probes if empty. Raises `DiagnosisError` for an
-    unknown name."""
+    """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
     for name in names:
         if name not in PROBES:
             hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))
@@ -130,8 +115,7 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, (text + "\n").encode("utf-8"))
+    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode("utf-8"))
 
 
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
@@ -162,12 +146,9 @@ def _prepare(out: Path) -> None:
 
 
 def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
+    told = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
     return {
-        "subject": {
-            "name": subject.name, "title": subject.title, "sha256": subject.sha256, "units": subject.units,
-            "normalisation": subject.normalisation, "frames_used": list(subject.frames_used),
-            "direction": subject.direction, "layers": list(subject.layer_names),
-        },
+        "subject": {**{key: getattr(subject, key) for key in told}, "layers": subject.layer_names},
         "dataset": {
             "name": dataset.path.resolve().name, "fingerprint": dataset.fingerprint, "size": list(dataset.size),
             "samples": {split: len(names) for split, names in dataset.splits.items()},
@@ -182,14 +163,11 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
 def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
     """The report: a section for each finding with its question and its pictures from ``folder``; ``context`` is what
     ``diagnose.json`` says about subject, dataset, settings and machine."""
-    sections = [
-        (
-            question, finding,
-            [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures],
-            [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables],
-        )
-        for question, finding in findings
-    ]  # fmt: skip
+    sections = []
+    for question, finding in findings:
+        figures = [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures]
+        tables = [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables]
+        sections.append((question, finding, figures, tables))
     body = render("fpp_ml_bench.baselines.diagnostics", "diagnosis.html", sections=sections, **context)
     name = context["subject"]["name"]
     return page(f"{name}: diagnosis", body, _STYLE, description=f"What {name} read")

@@ -6,7 +6,6 @@ are ours. Both learn from the network's batches as they come, so no activations 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -25,10 +24,8 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.optics import Direction, Rig
 
 Image = NDArray[np.float32]
-Source = tuple[str, str]
-"""A network, or `INPUT`, and a layer."""
-INPUT = "input"
-"""Name of the raw input, which is probed like a layer as a control."""
+Source = tuple[str, str]  # a network, or `INPUT`, and a layer
+INPUT = "input"  # name of the raw input, which is probed like a layer as a control
 RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
 WIDTH = 16
@@ -44,11 +41,9 @@ def activations_of(
     network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor, reduce: Callable[[Tensor], Tensor], name: str
 ) -> dict[str, Tensor]:
     """``reduce(activations)`` of every layer by its name, of one forward pass of the network called ``name``.
-
     ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
     output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or that the pass does not reach, and
-    for an output that is not a depth map.
-    """
+    for an output that is not a depth map."""
     activations: dict[str, Tensor] = {}
 
     def hook(name: str) -> Any:
@@ -94,45 +89,22 @@ def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor
     return values[:, :, 0].transpose(1, 2)
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth of a sample, each map (H, W).
-
-    ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range,
-    background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object.
-    ``order``: the fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order
-    follows from the pixel's position alone.
-    """
-
-    inside: NDArray[np.bool_]
-    edges: Image
-    depth: Image
-    depth_mm: Image
-    sine: Image
-    cosine: Image
-    order: Image
-
-
-def truth(depth_mm: Image, rig: Rig, direction: Direction) -> Truth:
-    """`Truth` of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``.
-
-    Raises ``ValueError`` for a map without an object.
-    """
+def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]:
+    """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``. Raises
+    ``ValueError`` for a map without an object. ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``:
+    normalised to the sample's own range, background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the
+    wrapped phase, 0 outside the object. ``order``: the fringe order minus that of a plane at the rig's standoff, 0
+    outside the object; the plane's order follows from the pixel's position alone. All but ``inside`` are float32."""
     inside = object_mask(depth_mm)
     if not inside.any():
         raise ValueError("expected a depth map with an object, got background throughout")
     periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
     phase = TAU * (periods - np.floor(periods))
     order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
-    return Truth(
-        inside,
-        edge_map(depth_mm),
-        normalised_depth(depth_mm),
-        np.asarray(depth_mm, dtype=np.float32),
-        np.where(inside, np.sin(phase), 0.0).astype(np.float32),
-        np.where(inside, np.cos(phase), 0.0).astype(np.float32),
-        order.astype(np.float32),
-    )
+    sine, cosine = (np.where(inside, of(phase), 0.0) for of in (np.sin, np.cos))
+    maps = {"edges": edge_map(depth_mm), "depth": normalised_depth(depth_mm), "depth_mm": depth_mm, "sine": sine,
+            "cosine": cosine, "order": order}  # fmt: skip
+    return {"inside": inside, **{name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}}
 
 
 def normalised_depth(depth_mm: Image) -> Image:
@@ -162,8 +134,7 @@ def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.
 
 @lru_cache(maxsize=2)
 def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    plane = np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M)
-    return periods_at(plane, rig, direction)
+    return periods_at(np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M), rig, direction)
 
 
 class NormalEquations:
@@ -213,13 +184,12 @@ def grid_step(size: tuple[int, int]) -> int:
     return max(SHARE, -(-max(size) // LONGEST))
 
 
-@dataclass
 class Moments:
     """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
 
-    count: int = 0
-    total: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
-    square: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = self.square = torch.zeros((), dtype=torch.float64)
 
     def add(self, features: Tensor) -> None:
         """Add a batch (B, C, h, w)."""
@@ -237,10 +207,8 @@ class Moments:
 
 class ConvolutionProbe(nn.Module):
     """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
-
     The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
-    5 x 5 grid points.
-    """
+    5 x 5 grid points."""
 
     def __init__(self, moments: Moments, target_mean: float) -> None:
         super().__init__()

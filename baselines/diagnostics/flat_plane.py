@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
-from fpp_ml_bench.baselines.diagnostics.subjects import Frames, Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
-RECTANGLE_SIDE = 0.5
-"""Side of the rectangle, as a share of the image's side."""
+RECTANGLE_SIDE = 0.5  # side of the rectangle, as a share of the image's side
 NORMALISED_BACKGROUND = 0.1
 OUTLINES, QUICK_OUTLINES = 5, 2
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
@@ -118,10 +117,14 @@ def kind_of(outline: str) -> str:
     return outline if outline in (FRAME, RECTANGLE) else SILHOUETTE
 
 
-def prediction_of(subject: Subject, frames: Frames) -> NDArray[np.float32]:
-    """The subject's prediction (H, W) in mm, or the network's own output where it is normalised. Range heads, which
-    would convert it to mm, are not part of the paper's probe."""
-    return subject.represent(frames) if subject.normalisation == "individual" else subject.predict(frames)
+def shown_to(
+    subject: Subject, renderer: SceneRenderer, scene: Scene
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
+    """The first frame of ``scene`` that the subject uses, and its prediction (H, W) in mm, or the network's own output
+    where it is normalised. Range heads, which would convert it to mm, are not part of the paper's probe."""
+    frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
+    predict = subject.represent if subject.normalisation == "individual" else subject.predict
+    return frames[subject.frames_used[0]], predict(frames)
 
 
 def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
@@ -149,10 +152,9 @@ def predict_planes(
                 lit, seen = renderer.light(surface), mask.copy()
                 seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
                 scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
-                frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
-                frame, prediction = frames[subject.frames_used[0]], prediction_of(subject, frames)
+                frame, answer = shown_to(subject, renderer, scene)
                 depth_mm = surface.depth_mm(renderer.shape)
-                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), prediction)
+                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), answer)
 
 
 def control_of(
@@ -162,8 +164,7 @@ def control_of(
     shares = []
     for sample in samples:
         unchanged = original(dataset, renderer, sample)
-        frames = renderer.frames(unchanged.scene, subject.frames_used, subject.uses_ground_truth_mask)
-        predicted = prediction_of(subject, frames)[unchanged.target].astype(np.float64)
+        predicted = shown_to(subject, renderer, unchanged.scene)[1][unchanged.target].astype(np.float64)
         true = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
         if scale.normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
@@ -173,8 +174,7 @@ def control_of(
 
 
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
-    """The share that collapsed in each outline, the mean prediction at the paper's distance, and for mm the means at
-    all distances."""
+    """The share that collapsed in each outline, the mean at the paper's distance, and for mm those at all distances."""
     shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
               for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
@@ -212,19 +212,12 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
         )
         pose = f"{distance_m:g} m", f"{across:g}, {down:g}"
         lines.append((name, *pose, mean, std, f"{least:.4g} to {most:.4g}", *others))
-    return [
-        Table(
-            "Predictions for planes" + (", mm by the mean range of the test split" if normalised else ""),
-            ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
-             "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm"),
-            lines,
-        ),
-        Table(
-            "Share of background: the control", ("Pixels of", "Share"),
-            (("real objects, predicted", control["collapsed_share"]),
-             ("real objects, in truth", control["collapsed_share_true"])),
-        ),
-    ]  # fmt: skip
+    title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
+    header = ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
+              "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm")  # fmt: skip
+    keys = {"real objects, predicted": "collapsed_share", "real objects, in truth": "collapsed_share_true"}
+    shares = [(pixels, control[key]) for pixels, key in keys.items()]
+    return [Table(title, header, lines), Table("Share of background: the control", ("Pixels of", "Share"), shares)]
 
 
 def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> Figure:

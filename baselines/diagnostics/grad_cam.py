@@ -7,6 +7,7 @@ with the edges of the true depth and with the local standard deviation of the fr
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,8 +17,9 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fpp_ml_bench.baselines.diagnostics import probe
 from fpp_ml_bench.baselines.diagnostics.fits import edge_map
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, ProbeSettings, Progress, Sheet, Table, mean_of
 from fpp_ml_bench.baselines.diagnostics.probe import with_interval as text_of
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
@@ -40,7 +42,7 @@ _EXAMPLES = 3
 _BAR = 0.2
 
 
-class GradCam(Probe):
+class GradCam(probe.Probe):
     """Heatmaps of the test split against edges and fringes, for the network and for random weights."""
 
     name = "grad-cam"
@@ -61,13 +63,9 @@ class GradCam(Probe):
             "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
             "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
         }  # fmt: skip
-        return self.finding(
-            summary(correlations),
-            {"protocol": protocol, **correlations.to_dict()},
-            tables(correlations),
-            _draw_bars(correlations, folder),
-            _draw_heatmaps(subject, dataset, samples, layers, folder),
-        )
+        values = {"protocol": protocol, **correlations.to_dict()}
+        drawn = _draw_bars(correlations, folder), _draw_heatmaps(subject, dataset, samples, layers, folder)
+        return self.finding(summary(correlations), values, tables(correlations), *drawn)
 
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
@@ -78,9 +76,7 @@ def cam_layers(subject: Subject) -> tuple[str, ...]:
 
 def heatmaps(network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor) -> dict[str, Tensor]:
     """Grad-CAM of the mean prediction before its ReLU, by layer: (B, H, W) at the size of ``fringe`` (B, 1, H, W).
-
-    Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction.
-    """
+    Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction."""
     heatmaps_by_layer = {}
     for name, layer in layers.items():
         cam = LayerGradCam(lambda x: network(x).mean(dim=(1, 2, 3)), layer)
@@ -117,10 +113,8 @@ def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[st
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
-    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32.
-
-    The window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored.
-    """
+    """Standard deviation of a fringe image (H, W) over a square window of one period, in grey levels, float32. The
+    window side is the smallest odd number of px that covers ``period_px``, at least 3; the border is mirrored."""
     side = max(3, 2 * int(np.ceil((period_px - 1) / 2)) + 1)
     image = np.asarray(grey, dtype=np.float64)
     mean, square = (cv2.blur(of, (side, side), borderType=cv2.BORDER_REFLECT_101) for of in (image, image * image))
@@ -145,8 +139,7 @@ class Mean(NamedTuple):
 
 
 class Correlations:
-    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference map; one value per sample, whose
-    objects are ``objects``."""
+    """Correlations by weights (``trained``, ``untrained 0``, ...), layer and reference, of samples of ``objects``."""
 
     def __init__(self, layers: Sequence[str], objects: list[str]) -> None:
         self.layers, self.objects = tuple(layers), objects
@@ -165,7 +158,7 @@ class Correlations:
         """Mean over layers, as in the paper's bottom row, with an interval over samples."""
         means = [self.mean(layer, reference, trained).r for layer in self.layers]
         interval = self._over_samples(self._sample_means(self.layers, reference, trained)).interval
-        return Mean(_mean_of(means), interval, sum(r is not None for r in means))
+        return Mean(mean_of(means), interval, sum(r is not None for r in means))
 
     @property
     def references(self) -> Mean:
@@ -177,10 +170,10 @@ class Correlations:
             values for (weights, layer, target), values in self.values.items()
             if layer in layers and target == reference and (weights == "trained") == trained
         ]  # fmt: skip
-        return [_mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
+        return [mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
 
     def _over_samples(self, values: Sequence[float | None]) -> Mean:
-        return Mean(_mean_of(values), object_interval(values, self.objects), sum(r is not None for r in values))
+        return Mean(mean_of(values), object_interval(values, self.objects), sum(r is not None for r in values))
 
     def to_dict(self) -> dict[str, Any]:
         """For ``diagnose.json``."""
@@ -205,11 +198,6 @@ def ratio(edges: float | None, fringes: float | None) -> float | None:
     return None if edges is None or not fringes else edges / fringes
 
 
-def _mean_of(values: Sequence[float | None]) -> float | None:
-    defined = [value for value in values if value is not None]
-    return float(np.mean(defined)) if defined else None
-
-
 def measure(
     subject: Subject, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str], seeds: int,
     progress: Progress,
@@ -218,25 +206,21 @@ def measure(
     network, untrained = subject.networks()
     correlations = Correlations(layers, [split_sample_name(name)[0] for name in samples])
     total, done = len(samples) * (1 + seeds), 0
-    random_networks = [untrained(seed) for seed in range(seeds)]
+    networks = {"trained": network} | {f"untrained {seed}": untrained(seed) for seed in range(seeds)}
     for start in range(0, len(samples), subject.batch_size):
         batch_samples = samples[start : start + subject.batch_size]
-        trained_maps = dict(maps(subject, network, dataset, batch_samples, layers))
         reference_maps = {sample: references(subject, dataset, sample) for sample in batch_samples}
-        for sample in batch_samples:
-            correlations.edges_with_fringes.append(correlation(*reference_maps[sample].values()))
-            for layer, heat in trained_maps[sample].items():
-                for target, reference in reference_maps[sample].items():
-                    correlations.add("trained", layer, target, correlation(heat, reference))
-        done += len(batch_samples)
-        progress(done, total, "Grad-CAM")
-        for number, random_network in enumerate(random_networks):
-            for sample, heat_of in maps(subject, random_network, dataset, batch_samples, layers):
-                for layer, heat in heat_of.items():
-                    for target, reference in (*reference_maps[sample].items(), (OWN, trained_maps[sample][layer])):
-                        correlations.add(f"untrained {number}", layer, target, correlation(heat, reference))
+        correlations.edges_with_fringes += [correlation(*of_sample.values()) for of_sample in reference_maps.values()]
+        trained_maps: dict[str, dict[str, Image]] = {}
+        for weights, one_network in networks.items():
+            heatmaps_of = dict(maps(subject, one_network, dataset, batch_samples, layers))
+            for sample, layer in product(batch_samples, layers):
+                own = {OWN: trained_maps[sample][layer]} if trained_maps else {}
+                for target, reference in {**reference_maps[sample], **own}.items():
+                    correlations.add(weights, layer, target, correlation(heatmaps_of[sample][layer], reference))
+            trained_maps = trained_maps or heatmaps_of
             done += len(batch_samples)
-            progress(done, total, "Grad-CAM of random weights")
+            progress(done, total, "Grad-CAM" if weights == "trained" else "Grad-CAM of random weights")
     return correlations
 
 
@@ -273,22 +257,18 @@ def tables(correlations: Correlations) -> list[Table]:
         pairs[name] = [correlations.mean(layer, target) for target in (EDGES, FRINGES)]
     for name, trained in (("Average", True), ("Average, random weights", False)):
         pairs[name] = [correlations.average(target, trained) for target in (EDGES, FRINGES)]
-    rows = [(name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()]
-    random = {layer: [correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN)]
-              for layer in correlations.layers}  # fmt: skip
-    return [
-        Table(
-            f"Correlation of Grad-CAM with edges and fringes, {len(correlations.objects)} test samples (the paper's "
-            "table)",
-            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "Ratio"),
-            [*rows, ("Edges with fringes", text_of(*correlations.references[:2]), None, None)],
-        ),
-        Table(
-            "Sanity check: the same with random weights",
-            ("Layer", "r(CAM, edges)", "r(CAM, fringes)", "r(CAM, trained CAM)"),
-            [(layer, *(text_of(*mean[:2]) for mean in means)) for layer, means in random.items()],
-        ),
+    rows: list[tuple[probe.Cell, ...]] = [
+        (name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()
     ]
+    rows.append(("Edges with fringes", text_of(*correlations.references[:2]), None, None))
+    random = []
+    for layer in correlations.layers:
+        means = (correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN))
+        random.append((layer, *(text_of(*mean[:2]) for mean in means)))
+    count, header = len(correlations.objects), ("Layer", "r(CAM, edges)", "r(CAM, fringes)")
+    title = f"Correlation of Grad-CAM with edges and fringes, {count} test samples (the paper's table)"
+    sanity = "Sanity check: the same with random weights"
+    return [Table(title, (*header, "Ratio"), rows), Table(sanity, (*header, "r(CAM, trained CAM)"), random)]
 
 
 def _draw_bars(correlations: Correlations, folder: Path) -> Figure:

@@ -23,24 +23,18 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 """Training samples of the probes, and training samples and epochs of a quick run."""
 SEEDS = 2
-POSITION = "position"
-"""The pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image."""
-PIXELS = 1024
-"""Pixels drawn with replacement from each sample: so many over the image, and as many within the object."""
+POSITION = "position"  # the pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image
+PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
 TARGETS: dict[str, tuple[str, ...]] = {
     "edges": ("edges",), "depth": ("depth",), "distance": ("depth_mm",), "phase": ("sine", "cosine"),
     "order": ("order",),
 }  # fmt: skip
-"""Targets of the linear probe, by the names in `Truth`; the phase is an angle and so has two."""
-INSIDE = ("distance", "phase", "order")
-"""Targets on object pixels only."""
-FRINGE = ("phase", "order")
-"""Targets that need fringes of a single direction."""
-SPATIAL = ("edges", "depth")
-"""Targets of the four-convolution probes, as in the paper."""
+"""Targets of the linear probe, by the names in `fits.truth`; the phase is an angle and so has two."""
+INSIDE = ("distance", "phase", "order")  # targets on object pixels only
+FRINGE = ("phase", "order")  # targets that need fringes of a single direction
+SPATIAL = ("edges", "depth")  # targets of the four-convolution probes, as in the paper
 
-Errors = dict[tuple[str, str], list[float]]
-"""Squared error of each sample, by layer and target."""
+Errors = dict[tuple[str, str], list[float]]  # squared error of each sample, by layer and target
 Drawn = dict[bool, tuple[Tensor, Tensor]]
 """Pixels of a sample (P,) and their target values (P, T), over the image (False) and within the object (True)."""
 
@@ -74,13 +68,10 @@ class LinearProbing(Probe):
             "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
             "image_px_a_grid_step": fits.grid_step(subject.image_size),
         }  # fmt: skip
-        return self.finding(
-            linear_report.summary(linear, spatial),
-            {"protocol": protocol, **linear_report.values(linear, spatial)},
-            linear_report.tables(linear, spatial),
-            linear_report.draw_four_convolutions(spatial, folder),
-            linear_report.draw_one_by_one(linear, folder),
-        )
+        summary, tables = linear_report.summary(linear, spatial), linear_report.tables(linear, spatial)
+        values = {"protocol": protocol, **linear_report.values(linear, spatial)}
+        drawn = linear_report.draw_four_convolutions(spatial, folder), linear_report.draw_one_by_one(linear, folder)
+        return self.finding(summary, values, tables, *drawn)
 
 
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
@@ -91,10 +82,8 @@ def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
 
 
 class Pixels:
-    """Pixels drawn from each sample, the same for every network, and cached.
-
-    ``columns``: for each target its set (over the image or within the object) and its columns in that set's targets.
-    """
+    """Pixels drawn from each sample, the same for every network, and cached. ``columns``: for each target its set (over
+    the image or within the object) and its columns in that set's targets."""
 
     def __init__(self, subject: Subject, dataset: DatasetFolder) -> None:
         self.dataset, self.direction = dataset, subject.direction
@@ -113,15 +102,12 @@ class Pixels:
             rng = np.random.default_rng([list(dataset.splits).index(split), dataset.samples(split).index(sample)])
             direction = "horizontal" if self.direction == "both" else self.direction
             truth = fits.truth(dataset.depth_mm(sample), dataset.rig, direction)
-            inside, size = np.flatnonzero(truth.inside), truth.inside.size
+            inside, size = np.flatnonzero(truth["inside"]), truth["inside"].size
             pixels = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
-            self._drawn[sample] = {
-                key: (
-                    torch.from_numpy(pixels[key]),
-                    torch.from_numpy(np.stack([getattr(truth, name).ravel()[pixels[key]] for name in fields], axis=1)),
-                )
-                for key, fields in self.fields.items()
-            }
+            self._drawn[sample] = {}
+            for key, fields in self.fields.items():
+                values = np.stack([truth[name].ravel()[pixels[key]] for name in fields], axis=1)
+                self._drawn[sample][key] = torch.from_numpy(pixels[key]), torch.from_numpy(values)
         return self._drawn[sample]
 
     def errors_of(self, layer: str, inside: bool, errors: Tensor) -> Iterator[tuple[tuple[str, str], float]]:
@@ -132,10 +118,8 @@ class Pixels:
 
 
 class Experiment:
-    """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``.
-
-    ``tick`` is called with the number of samples just processed and the activity.
-    """
+    """Fits probes to frozen layers on the samples ``train`` and measures their errors on ``validation``. ``tick`` is
+    called with the number of samples just processed and the activity."""
 
     def __init__(
         self, subject: Subject, dataset: DatasetFolder, train: Sequence[str], validation: Sequence[str],
@@ -160,10 +144,8 @@ class Experiment:
         return scores
 
     def linear_errors(self, network: nn.Module, controls: bool = False) -> tuple[Errors, dict[str, list[float]]]:
-        """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target.
-
-        With ``controls`` the raw input and the position are probed like layers.
-        """
+        """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target. With
+        ``controls`` the raw input and the position are probed like layers."""
         equations: dict[tuple[str, bool], fits.NormalEquations] = {}
         for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
             if (layer, key) not in equations:
@@ -224,10 +206,8 @@ class Experiment:
         self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
     ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
         """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed; and
-        those of predicting the mean, by target.
-
-        The raw input has `INPUT` as network and layer; ``seeds``: number of seeds of each network and the input.
-        """
+        those of predicting the mean, by target. The raw input has `INPUT` as network and layer; ``seeds``: number of
+        seeds of each network and the input."""
         moments: dict[fits.Source, fits.Moments] = {}
         sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
         for features, targets in self._map_batches(networks, self.train, "spread of the activations"):
@@ -240,8 +220,7 @@ class Experiment:
         steps = epochs * -(-len(self.train) // fits.BATCH)
         probes = fits.ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
         for epoch in range(epochs):
-            order = np.random.default_rng([1, epoch]).permutation(len(self.train))
-            shuffled = [self.train[index] for index in order]
+            shuffled = [self.train[index] for index in np.random.default_rng([1, epoch]).permutation(len(self.train))]
             for features, targets in self._map_batches(networks, shuffled, "training four-convolution probes"):
                 probes.step(features, targets)
         errors: dict[tuple[fits.Source, str, int], list[float]] = {}

@@ -1,7 +1,6 @@
 """Linear probing: scores of the probes, and the report on them: the paper's table and figure, and the controls."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from fpp_ml_bench.baselines.diagnostics.fits import INPUT
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Sheet, Table, with_interval
-from fpp_ml_bench.evaluation.score import Interval, object_interval
+from fpp_ml_bench.evaluation.score import object_interval
 
 PAPER_RATIO = 2.82
 TITLES = {
@@ -20,34 +19,18 @@ _CONTROLS = {INPUT: "raw input", "position": "pixel's position alone"}
 _BAR = 0.38
 
 
-@dataclass(frozen=True)
-class Score:
-    """``mse``: mean over samples and seeds. ``mse_of_mean``: error of predicting the training samples' mean everywhere.
-
-    ``r2`` = 1 - mse / mse_of_mean: 1 is perfect, 0 is no better than the mean. Intervals: 95%, resampled over objects;
-    that of r2, a ratio of two means, to first order. ``seeds``: r2 of each seed.
-    """
-
-    mse: float
-    mse_interval: Interval | None
-    r2: float
-    r2_interval: Interval | None
-    seeds: tuple[float, ...]
-    mse_of_mean: float
-
-
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
-Layers = Mapping[str, Mapping[str, Score]]
-"""Scores by layer, then target."""
+Score = dict[str, Any]
+"""``mse``: mean over samples and seeds. ``mse_of_mean``: error of predicting the training samples' mean everywhere.
+``r2`` = 1 - mse / mse_of_mean: 1 is perfect, 0 is no better than the mean. Intervals: 95%, resampled over objects; that
+of r2, a ratio of two means, to first order. ``seeds``: r2 of each seed."""
 Scores = dict[str, dict[str, dict[str, Score]]]
 """Scores by `TRAINED`, `UNTRAINED` or `CONTROLS`, then layer, then target."""
 
 
 def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects: Sequence[str]) -> Score:
-    """`Score` of ``errors`` (seeds, samples), squared, against those of the mean, ``reference`` (samples,).
-
-    Raises ``ValueError`` where the reference error is 0, so for a constant target.
-    """
+    """`Score` of ``errors`` (seeds, samples), squared, against those of the mean, ``reference`` (samples,). Raises
+    ``ValueError`` where the reference error is 0, so for a constant target."""
     table = np.asarray(errors, dtype=np.float64)
     mean_error = float(np.mean(reference))
     if not mean_error > 0:
@@ -58,42 +41,40 @@ def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects
     # To first order, r2 of a resample differs by -mean(sample_means - (1 - r2) reference) / mean_error. Large objects
     # have large errors in both terms, which cancels.
     deviation = object_interval(((sample_means - (1 - r2) * np.asarray(reference)) / mean_error).tolist(), objects)
-    r2_interval = None if deviation is None else (r2 - deviation[1], r2 - deviation[0])
-    interval = object_interval(sample_means.tolist(), objects)
-    return Score(mse, interval, r2, r2_interval, tuple((1 - table.mean(axis=1) / mean_error).tolist()), mean_error)
+    return {
+        "mse": mse, "mse_interval": object_interval(sample_means.tolist(), objects), "r2": r2,
+        "r2_interval": None if deviation is None else (r2 - deviation[1], r2 - deviation[0]),
+        "seeds": (1 - table.mean(axis=1) / mean_error).tolist(), "mse_of_mean": mean_error,
+    }  # fmt: skip
 
 
 def values(linear: Scores, spatial: Scores) -> dict[str, Any]:
     """For ``diagnose.json``."""
-    four, one = (
-        {source: {layer: {name: asdict(one) for name, one in targets.items()} for layer, targets in layers.items()}
-         for source, layers in scores.items()} for scores in (spatial, linear)
-    )  # fmt: skip
     return {
-        "four_convolutions": four, "ratio": mean_ratio(spatial[TRAINED]),
-        "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]), "linear": one,
+        "four_convolutions": spatial, "ratio": mean_ratio(spatial[TRAINED]),
+        "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]), "linear": linear,
     }  # fmt: skip
 
 
-def mean_mse(layers: Layers, target: str) -> float:
+def mean_over(layers: Mapping[str, Mapping[str, Score]], target: str, key: str = "mse") -> float:
     """Mean over layers, as in the paper's bottom row."""
-    return float(np.mean([targets[target].mse for targets in layers.values()]))
+    return float(np.mean([targets[target][key] for targets in layers.values()]))
 
 
-def mean_ratio(layers: Layers) -> float:
+def mean_ratio(layers: Mapping[str, Mapping[str, Score]]) -> float:
     """The paper's ratio: mean over layers of the depth probes' MSE, over that of the edge probes."""
-    return mean_mse(layers, "depth") / mean_mse(layers, "edges")
+    return mean_over(layers, "depth") / mean_over(layers, "edges")
 
 
 def ratio_of_means(layer: Mapping[str, Score]) -> float:
     """The paper's ratio for a probe that predicts the means, so the ratio of the targets' variances."""
-    return layer["depth"].mse_of_mean / layer["edges"].mse_of_mean
+    return float(layer["depth"]["mse_of_mean"] / layer["edges"]["mse_of_mean"])
 
 
 def summary(linear: Scores, spatial: Scores) -> str:
     """The result in a few sentences."""
     trained, raw = spatial[TRAINED], spatial[CONTROLS]
-    edges, depth = (float(np.mean([layer[target].r2 for layer in trained.values()])) for target in ("edges", "depth"))
+    edges, depth = (mean_over(trained, target, "r2") for target in ("edges", "depth"))
     easier = "edges are" if edges > depth else "depth is"
     text = (
         f"The paper's ratio, depth MSE over edge MSE, is {mean_ratio(trained):.2f} (paper: {PAPER_RATIO}). The raw "
@@ -102,11 +83,11 @@ def summary(linear: Scores, spatial: Scores) -> str:
         f"variance, {easier} easier to read on average over layers (R2 {edges:.2f} for edges, {depth:.2f} for depth)."
     )
     if "phase" in linear[CONTROLS][INPUT]:
-        r2 = {layer: scores["phase"].r2 for layer, scores in linear[TRAINED].items()}
+        r2 = {layer: scores["phase"]["r2"] for layer, scores in linear[TRAINED].items()}
         best, last = max(r2, key=r2.__getitem__), list(r2)[-1]
         text += (
             f" Linear probes read the wrapped phase best from {best} (R2 {r2[best]:.2f}). From the last layer, {last}, "
-            f"they reach R2 {r2[last]:.2f}; with random weights {linear[UNTRAINED][last]['phase'].r2:.2f}."
+            f"they reach R2 {r2[last]:.2f}; with random weights {linear[UNTRAINED][last]['phase']['r2']:.2f}."
         )
     return text
 
@@ -116,40 +97,31 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     trained, untrained, raw = spatial[TRAINED], spatial[UNTRAINED], spatial[CONTROLS][INPUT]
     rows = {layer: {layer: targets} for layer, targets in trained.items()}
     rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
-    errors = [
-        (name, mean_mse(rows[name], "edges"), mean_mse(rows[name], "depth"), mean_ratio(rows[name])) for name in rows
-    ]
-    of_mean = ("Predicting the mean", raw["edges"].mse_of_mean, raw["depth"].mse_of_mean, ratio_of_means(raw))
+    keys = ("edges", "depth")
+    errors = [(name, *(mean_over(row, key) for key in keys), mean_ratio(row)) for name, row in rows.items()]
+    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw)))
 
     def r2(one: Score) -> str:
-        return with_interval(one.r2, one.r2_interval)
+        return with_interval(one["r2"], one["r2_interval"])
 
-    shares = [
-        (layer, *(r2(scores[layer][target]) for target in ("edges", "depth") for scores in (trained, untrained)))
-        for layer in trained
-    ]
+    shares = [(layer, *(r2(one[layer][key]) for key in keys for one in (trained, untrained))) for layer in trained]
     targets = list(next(iter(linear[TRAINED].values())))
     one_by_one: list[list[str | None]] = []
     for layer, scores in linear[TRAINED].items():
         pairs = ((scores[target], linear[UNTRAINED][layer][target]) for target in targets)
-        one_by_one.append([layer, *(f"{one.r2:.3f}" for pair in pairs for one in pair)])
+        one_by_one.append([layer, *(f"{one['r2']:.3f}" for pair in pairs for one in pair)])
     for layer, scores in linear[CONTROLS].items():
-        one_by_one.append([_CONTROLS[layer], *(cell for key in targets for cell in (f"{scores[key].r2:.3f}", None))])
+        cells = ((f"{scores[target]['r2']:.3f}", None) for target in targets)
+        one_by_one.append([_CONTROLS[layer], *(cell for pair in cells for cell in pair)])
+    paper = ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges")
+    both = ("Layer", "Edges R2", "random weights", "Depth R2", "random weights")
+    each = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
+    of_raw = ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)
     return [
-        Table(
-            "Four-convolution probes, validation MSE (the paper's table; lower is easier to read)",
-            ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges"), [*errors, of_mean],
-        ),
-        Table(
-            "The same probes, share of variance explained (R2)",
-            ("Layer", "Edges R2", "random weights", "Depth R2", "random weights"),
-            [*shares, ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)],
-        ),
-        Table(
-            "Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)",
-            ["Layer", *(title for target in targets for title in (TITLES[target], "random"))], one_by_one,
-        ),
-    ]  # fmt: skip
+        Table("Four-convolution probes, validation MSE (the paper's table; lower is easier to read)", paper, errors),
+        Table("The same probes, share of variance explained (R2)", both, [*shares, of_raw]),
+        Table("Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)", each, one_by_one),
+    ]
 
 
 def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
@@ -163,14 +135,14 @@ def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
         for shift, target in ((-1, "edges"), (1, "depth")):
             positions, colour = np.arange(len(layers)) + shift * _BAR / 2, sheet.COLOURS[target]
             scores = [spatial[TRAINED][layer][target] for layer in layers]
-            bars = [(getattr(one, key), getattr(one, f"{key}_interval")) for one in scores]
+            bars = [(one[key], one[f"{key}_interval"]) for one in scores]
             sheet.bars(axis, positions, bars, width=_BAR, color=colour, label=target)
-            random = [getattr(spatial[UNTRAINED][layer][target], key) for layer in layers]
+            random = [spatial[UNTRAINED][layer][target][key] for layer in layers]
             label = "random weights" if shift > 0 else None
             mark = {"marker": "_", "markersize": 9, "markeredgewidth": 2, "color": "black", "label": label}
             axis.plot(positions, random, linestyle="none", **mark)
             style = {"color": colour, "linewidth": 1, "linestyle": ":"}
-            axis.axhline(getattr(raw[target], key), label=f"raw input, {target}", **style)
+            axis.axhline(raw[target][key], label=f"raw input, {target}", **style)
         _name_layers(axis, layers)
         sheet.tidy(axis, title, y="MSE" if key == "mse" else "R2")
     handles, labels = sheet.axes[0, 0].get_legend_handles_labels()
@@ -189,19 +161,19 @@ def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
     for axis, target in zip(sheet.axes.flat, targets, strict=False):
         colour, grey = sheet.COLOURS[target], sheet.COLOURS["random"]
         trained, random = ([linear[source][layer][target] for layer in layers] for source in (TRAINED, UNTRAINED))
-        low, high = ([end(one.seeds) for one in random] for end in (min, max))
+        low, high = ([end(one["seeds"]) for one in random] for end in (min, max))
         axis.fill_between(positions, low, high, color=grey, alpha=0.4, linewidth=0)
-        axis.plot(positions, [one.r2 for one in random], color=grey, label="random weights")
+        axis.plot(positions, [one["r2"] for one in random], color=grey, label="random weights")
         style = {"color": colour, "marker": "o", "markersize": 4, "label": "trained"}
-        axis.plot(positions, [one.r2 for one in trained], **style)
+        axis.plot(positions, [one["r2"] for one in trained], **style)
         for x, one in zip(positions, trained, strict=True):
-            if one.r2_interval is not None:
-                axis.plot([x, x], one.r2_interval, color=colour, linewidth=1)
+            if one["r2_interval"] is not None:
+                axis.plot([x, x], one["r2_interval"], color=colour, linewidth=1)
         for control, label, line in ((INPUT, "raw input", ":"), ("position", "pixel's position", "--")):
-            r2 = linear[CONTROLS][control][target].r2
+            r2 = linear[CONTROLS][control][target]["r2"]
             axis.axhline(r2, color="black", linewidth=1, linestyle=line, label=label)
         axis.axhline(0, color=sheet.GRID, linewidth=1)
-        axis.set_ylim(min(-0.1, max(-0.5, min(one.r2 for one in trained) - 0.05)), 1.02)
+        axis.set_ylim(min(-0.1, max(-0.5, min(one["r2"] for one in trained) - 0.05)), 1.02)
         _name_layers(axis, layers)
         sheet.tidy(axis, TITLES[target], y="R2")
     for axis in sheet.axes.flat[len(targets) :]:

@@ -8,13 +8,13 @@ errors of whole periods.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfactuals, Move, SceneSet
-from fpp_ml_bench.baselines.diagnostics.probe import Progress, silent
+from fpp_ml_bench.baselines.diagnostics.probe import Progress, mean_of, silent
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
@@ -23,16 +23,17 @@ from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+    from fpp_ml_bench.baselines.method import Method
+
 Map = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the prediction in a counterfactual scene, at the pixels that are compared.
-
-    ``expected`` and ``actual`` change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists
-    before and after.
-    """
+    """Change of the prediction in a counterfactual scene, at the pixels that are compared. ``expected`` and ``actual``
+    change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists before and after."""
 
     expected: NDArray[np.float64]
     actual: NDArray[np.float64]
@@ -100,18 +101,6 @@ def sample_score(follow: float | None, change: float | None) -> float | None:
     return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
 
 
-class DepthMethod(Protocol):
-    """The part of a method, or of the subject of a diagnosis, that is needed here."""
-
-    @property
-    def frames_used(self) -> tuple[int, ...]: ...
-    @property
-    def units(self) -> str: ...
-    @property
-    def uses_ground_truth_mask(self) -> bool: ...
-    def predict(self, frames: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.float32]: ...
-
-
 @dataclass(frozen=True)
 class SampleReliance:
     """A sample's score, order-free score, and ``parts`` by the names of `RelianceParts`."""
@@ -126,7 +115,7 @@ class SampleReliance:
 class ScenePredictor:
     """Runs ``method`` on scenes and gives the true depth in the units of its predictions."""
 
-    def __init__(self, method: DepthMethod, renderer: SceneRenderer) -> None:
+    def __init__(self, method: "Method | Subject", renderer: SceneRenderer) -> None:
         self.method, self.renderer, self.in_mm = method, renderer, method.units == "mm"
         if method.units not in ("mm", "normalised"):
             raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
@@ -161,7 +150,7 @@ def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> Sample
     moved = [(predictor.predict(move.phase), move.depth_mm) for move in within]
     phase_changes = [change(after, depth_mm, target, target) for after, depth_mm in moved]
     unit, follow = rms_expected(phase_changes), follows(phase_changes)
-    outlined = [(predictor.predict(other.scene), other, other.unchanged & target) for other in scenes.outline_changes]
+    outlined = [(predictor.predict(other.scene), other, other.scene.mask & target) for other in scenes.outline_changes]
     outline_changes = [
         change(after, other.depth_mm, other.scene.mask & (other.depth_mm > 0), where)
         for after, other, where in outlined
@@ -205,7 +194,7 @@ def _phase_change(scenes: Counterfactuals, before: Map, after: Map, depth_mm: Ma
 
 
 def measure(
-    method: DepthMethod, scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
+    method: "Method | Subject", scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
 ) -> tuple[Reliance, list[SampleReliance]]:
     """The reliance block of a method, and the values of every sample. Raises `DiagnosisError` for a method of other
     units, and where no sample has a score."""
@@ -221,26 +210,18 @@ def measure(
     interval = object_interval([sample.score for sample in scored], [sample.object for sample in scored])
     reliance = Reliance(
         version=RELIANCE_VERSION,
-        score=_mean(sample.score for sample in scored) or 0.0,
+        score=mean_of(sample.score for sample in scored) or 0.0,
         interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
-        order_free_score=_mean(sample.order_free_score for sample in scored),
-        parts=RelianceParts.model_validate(
-            {key: _mean(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
+        order_free_score=mean_of(sample.order_free_score for sample in scored),
+        parts=RelianceParts(
+            **{key: mean_of(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
         ),
-        units="mm" if predictor.in_mm else "normalised",
-        direction=direction,
-        samples=len(scored),
-        objects=len({sample.object for sample in scored}),
-        dataset_fingerprint=scene_set.dataset.fingerprint,
-        protocol_version=PROTOCOL_VERSION,
+        units="mm" if predictor.in_mm else "normalised", direction=direction,
+        samples=len(scored), objects=len({sample.object for sample in scored}),
+        dataset_fingerprint=scene_set.dataset.fingerprint, protocol_version=PROTOCOL_VERSION,
         weights_sha256=weights_sha256,
-    )
+    )  # fmt: skip
     return reliance, samples
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    defined = [value for value in values if value is not None]
-    return float(np.mean(defined)) if defined else None
 
 
 def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> Direction:

@@ -6,7 +6,8 @@ Importing this module imports neither numpy nor matplotlib, so that the command 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -32,11 +33,9 @@ def silent(*progress: object) -> None:
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much a probe measures; None means the probe's default.
-
-    ``samples``: most samples of each split, taken evenly over it (`spread`). ``seeds``: repeats of what depends on
-    random numbers. ``quick``: a short run for a first look. Raises `DiagnosisError` for a number below 1.
-    """
+    """How much a probe measures; None means the probe's default. ``samples``: most samples of each split, taken evenly
+    over it (`spread`). ``seeds``: repeats of what depends on random numbers. ``quick``: a short run for a first look.
+    Raises `DiagnosisError` for a number below 1."""
 
     samples: int | None = None
     seeds: int | None = None
@@ -58,6 +57,14 @@ def spread(names: Sequence[str], limit: int | None) -> list[str]:
     if limit is None or limit >= len(names):
         return list(names)
     return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Mean of ``values`` other than None; None where there are none."""
+    import numpy as np
+
+    defined = [value for value in values if value is not None]
+    return float(np.mean(defined)) if defined else None
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
@@ -92,9 +99,7 @@ class Figure:
 @dataclass(frozen=True)
 class Finding:
     """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None instead of NaN.
-
-    ``skipped``: why the probe does not apply to this subject; then the other fields are empty.
-    """
+    ``skipped``: why the probe does not apply to this subject; then the other fields are empty."""
 
     probe: str
     title: str
@@ -105,7 +110,7 @@ class Finding:
     skipped: str | None = None
 
 
-class Probe:
+class Probe(ABC):
     """A test of a model. ``version`` goes up when its result for the same model changes. ``without_network``: what a
     method without a network lacks for this probe, or None."""
 
@@ -121,11 +126,11 @@ class Probe:
             return None
         return f"{subject.name} is a method without a network: {self.without_network}."
 
+    @abstractmethod
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         """Measure ``subject``; pictures are written into ``folder``, which exists."""
-        raise NotImplementedError
 
     def finding(self, summary: str, values: Mapping[str, Any], tables: Sequence[Table], *figures: Figure) -> Finding:
         """The result of this probe."""

@@ -24,11 +24,8 @@ from fpp_ml_bench.optics import Direction, Rig
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
 
-
-_STEP = 1e-6
-"""Step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding."""
-_SAME_SURFACE_M = 1e-3
-"""A traced depth that differs from the stored depth by more belongs to another triangle."""
+_STEP = 1e-6  # step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding
+_SAME_SURFACE_M = 1e-3  # a traced depth that differs from the stored depth by more belongs to another triangle
 _GRAZING = 0.02
 """Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
 
@@ -36,11 +33,6 @@ _GRAZING = 0.02
 def constant(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """The `Field` that is 1 everywhere."""
     return np.ones_like(x)
-
-
-def times(amplitude: float, field: Field) -> Field:
-    """``amplitude`` times ``field``."""
-    return lambda x, y: amplitude * field(x, y)
 
 
 @dataclass(frozen=True)
@@ -125,13 +117,13 @@ def plane(
     return Surface(pixels, x, y, depth_m, np.tile(normal / np.linalg.norm(normal), (pixels.size, 1)))
 
 
-def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) -> Surface:
-    """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``shift_rad``, with its
-    new normals; the outline stays."""
+def moved(surface: Surface, rig: Rig, direction: Direction, field: Field, amplitude_rad: float = 1.0) -> Surface:
+    """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``amplitude_rad`` times
+    ``field``, with its new normals; the outline stays."""
 
     def moved_m(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
         layer = CalibrationLayer.of(rig, direction, (x, y))
-        phase = layer.absolute_phase(depth_m * MM_PER_M) + shift_rad(x, y)
+        phase = layer.absolute_phase(depth_m * MM_PER_M) + amplitude_rad * field(x, y)
         return layer.depth_of_residual_mm(phase - layer.infinity_rad - TAU * layer.infinity_order) / MM_PER_M
 
     new_m = moved_m(surface.x, surface.y, surface.depth_m)
@@ -154,18 +146,14 @@ def moved(surface: Surface, rig: Rig, direction: Direction, shift_rad: Field) ->
 
 
 Projected = Literal["sequence", "no fringe inside", "no fringe outside", "other direction", "other pitch"]
-PITCH_FACTOR = 4 / 3
-"""Factor of the changed pitch: 18 px become 24."""
-Frames = list[NDArray[np.uint8] | None]
+PITCH_FACTOR = 4 / 3  # factor of the changed pitch: 18 px become 24
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Lit pixels in front of the empty scene, and the pattern that is projected on them.
-
-    ``pixels`` uint32 (n,), with ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use
-    it. ``stream``: key of the noise. With ``no fringe`` the mean light of the sequence is projected.
-    """
+    """Lit pixels in front of the empty scene, and the pattern that is projected on them. ``pixels`` uint32 (n,), with
+    ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use it. ``stream``: key of the
+    noise. With ``no fringe`` the mean light of the sequence is projected."""
 
     pixels: NDArray[np.uint32]
     lit: render.LitPixels
@@ -201,10 +189,9 @@ class SceneRenderer:
 
     @cached_property
     def _other_pitch(self) -> render.Exposure:
-        pitches = {
-            name: PITCH_FACTOR * getattr(self.rig, name) for name in ("pitch_horizontal_px", "pitch_vertical_px")
-        }
-        return render.Exposure.of(replace(self.rig, **pitches), self.noise)
+        names = ("pitch_horizontal_px", "pitch_vertical_px")
+        wider = replace(self.rig, **{name: PITCH_FACTOR * getattr(self.rig, name) for name in names})
+        return render.Exposure.of(wider, self.noise)
 
     @cached_property
     def _empty(self) -> render.LitPixels:
@@ -214,16 +201,15 @@ class SceneRenderer:
         """The light on ``surface``; no cast shadows, as in the paper."""
         return render.light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
 
-    def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> Frames:
-        """Frames ``indices`` of ``scene``, uint8 (H, W), by frame number; None for all others. With ``masked`` they are
-        0 outside ``scene.mask``."""
+    def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
+        """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
         usual = self._other_pitch if scene.projected == "other pitch" else self.exposure
         inside = self._uniform if scene.projected == "no fringe inside" else usual
         outside = self._uniform if scene.projected == "no fringe outside" else usual
         swapped = scene.projected == "other direction"
         projected_indices = [self._partner(index) if swapped else index for index in indices]
         object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
-        frames: Frames = [None] * len(self.rig.sequence)
+        frames: list[NDArray[np.uint8] | None] = [None] * len(self.rig.sequence)
         for index, projected_index, values in zip(indices, projected_indices, object_values, strict=True):
             image = self._background(scene.stream, projected_index, outside).copy()
             image.ravel()[scene.pixels] = values

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.method import METHODS, Frames, Method, load_method
 from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
@@ -25,28 +25,21 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
-Frames = Sequence[NDArray[np.uint8] | None]
-"""A captured sequence by frame number, with None for frames that are not needed."""
 OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
 FACTORY_MARK = ".py:"
 BATCH = 8
-PIXELS_AT_ONCE = BATCH * 224 * 224
-"""Most images in a batch, and most pixels: at 960 px a batch is one image."""
+PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A model under diagnosis; ``sha256`` identifies it and its settings.
-
-    ``units`` of `predict`: mm, or normalised to the sample's own depth range. ``direction``: that of the fringes in
-    ``frames_used``. With ``uses_ground_truth_mask`` it expects frames that are 0 outside the object (`captured`).
-
-    ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and outputs depth in the
-    representation ``normalisation``. Without a network, it and the following fields are None or empty. ``layer_names``:
-    the layers to probe, in forward order. ``untrained(seed)``: the same architecture with random weights.
-    ``find_layers``: the layers of any network of that architecture by name.
-    """
+    """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
+    the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
+    it expects frames that are 0 outside the object (`captured`). ``network`` takes the single frame in ``frames_used``
+    as (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
+    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
+    same architecture with random weights. ``find_layers``: the layers of any network of that architecture by name."""
 
     name: str
     title: str
@@ -93,8 +86,7 @@ class Subject:
         return depth.astype(np.float32, copy=False)
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
-        """The input of ``network`` for several samples: float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without
-        its frame."""
+        """Input of ``network``, float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without its frame."""
         return _input_batch(stacks, self.frames_used[0], self.image_size, self.name)
 
     @property
@@ -142,16 +134,13 @@ def subject(
     name: str, dataset: DatasetFolder, layers: Sequence[str] | None = None, units: OutputUnits | None = None,
     frame: int | None = None, threads: int = 1,
 ) -> Subject:  # fmt: skip
-    """The model called ``name``, ready to be diagnosed on ``dataset``.
-
-    ``name``: a method of `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or
-    ``file.py:factory``, where ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth
-    (B, 1, H, W) in ``units`` (default: normalised). ``layers``: names of the layers to probe, by default the network's
-    ``probe_layers``, or every child of a module without them. ``frame``: number of the network's input frame, by
-    default the first that it was trained on. ``threads``: torch threads of the process.
-
-    Raises `DiagnosisError` for a name, layer or module that can't be used, and other `FppBenchError` of the model.
-    """
+    """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
+    `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
+    ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
+    (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
+    child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
+    trained on. ``threads``: torch threads of the process. Raises `DiagnosisError` for a name, layer or module that
+    can't be used, and other `FppBenchError` of the model."""
     if FACTORY_MARK in name:
         return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:
@@ -167,18 +156,13 @@ def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: A
     """A method as a subject; ``network``: the fields of a `Subject` with one."""
     # A network's settings hold the hash of its weights; those of the machine don't matter.
     settings = {key: value for key, value in depth_method.settings.items() if key not in ("threads", "device")}
+    same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
     return Subject(
-        name=depth_method.name,
-        title=depth_method.title,
+        **{key: getattr(depth_method, key) for key in same},
         sha256=hashlib.sha256(json.dumps([depth_method.name, settings], sort_keys=True).encode()).hexdigest(),
-        units=depth_method.units,
-        image_size=dataset.size,
-        frames_used=depth_method.frames_used,
-        direction=_direction_of(dataset, depth_method.frames_used),
-        predict_frames=depth_method.predict,
-        uses_ground_truth_mask=depth_method.uses_ground_truth_mask,
-        **network,
-    )
+        image_size=dataset.size, direction=_direction_of(dataset, depth_method.frames_used),
+        predict_frames=depth_method.predict, **network,
+    )  # fmt: skip
 
 
 def _subject_of_weights(
@@ -208,15 +192,11 @@ def _subject_of_weights(
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     return subject_of_method(
-        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence),
-        dataset,
-        normalisation=config.normalisation,
-        network=model.network,
+        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence), dataset,
+        normalisation=config.normalisation, network=model.network, weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network.probe_layers, config.name),
-        find_layers=lambda network: network.probe_layers,
-        untrained=untrained,
-        weights_sha256=model.sha256,
-    )
+        find_layers=lambda network: network.probe_layers, untrained=untrained,
+    )  # fmt: skip
 
 
 def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
@@ -261,20 +241,14 @@ def _subject_of_factory(
         return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
 
     user_subject = Subject(
-        name=path.stem,
-        title=f"{path.name}:{name.rpartition(':')[2]}",
-        sha256=_digest(path, network, f"{units} {frame}"),
-        units="normalised" if units == "normalised" else "mm",
-        image_size=dataset.size,
-        frames_used=(frame,),
-        direction=_direction_of(dataset, (frame,)),
-        predict_frames=predict,
-        normalisation=normalisation,
-        network=network,
+        name=path.stem, title=f"{path.name}:{name.rpartition(':')[2]}",
+        sha256=_digest(path, network, f"{units} {frame}"), units="normalised" if units == "normalised" else "mm",
+        image_size=dataset.size, frames_used=(frame,), direction=_direction_of(dataset, (frame,)),
+        predict_frames=predict, normalisation=normalisation, network=network,
         layer_names=_select_layers(layers, _layers(network, bool(layers)), name),
         find_layers=lambda model: _layers(model, bool(layers)),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
-    )
+    )  # fmt: skip
     first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
     if first is None:
         raise DiagnosisError(f"{dataset.path}: holds no sample")

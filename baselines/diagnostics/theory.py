@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved, times
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
@@ -25,21 +25,17 @@ from fpp_ml_bench.optics import Direction, Rig
 
 DISTANCES_M = (0.3, 10.0)
 POINTS = 400
-SMALL_PERIODS = 1 / 64
-"""An error so small that the linear model holds over all distances."""
-WITHIN = 0.01
-"""Relative difference from exponent 2 that still counts as quadratic."""
+SMALL_PERIODS = 1 / 64  # an error so small that the linear model holds over all distances
+WITHIN = 0.01  # relative difference from exponent 2 that still counts as quadratic
 STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own position."""
-SET_BACK_M = 0.1
-"""Distance of the projector behind the camera in the rig that shows the limit of the thin baseline."""
+SET_BACK_M = 0.1  # distance of the projector behind the camera in the rig that shows the limit of the thin baseline
 _SHOWN_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
 
 
 @dataclass(frozen=True)
 class Twins:
-    """Two scenes that a frame can't distinguish. Depths float64 (H, W) in mm, 0 outside the object; frames uint8, one
-    of each scene."""
+    """Two scenes that a frame can't tell apart: depths float64 (H, W) in mm, 0 outside the object; frames uint8."""
 
     sample: str
     direction: Direction
@@ -63,20 +59,10 @@ class Twins:
         }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ErrorCurve:
-    """Depth error (n,) in mm of a phase error of ``periods`` at ``distances_m`` (n,), inf where there is no depth; the
-    exponent of distance, ``local`` (n,) and ``exponent`` fitted over ``fitted_m``; ``quadratic_m``: range of distances
-    whose local exponent is within `WITHIN` of 2, None where there are none."""
-
-    name: str
-    periods: float
-    distances_m: NDArray[np.float64]
-    error_mm: NDArray[np.float64]
-    local: NDArray[np.float64]
-    exponent: float
-    fitted_m: list[float] | None
-    quadratic_m: list[float] | None
+Curve = dict[str, Any]
+"""Depth error ``error_mm`` (n,) of a phase error of ``periods`` at ``distances_m`` (n,), inf where there is no depth;
+the exponent of distance, ``local`` (n,) and ``exponent`` fitted over ``fitted_m``; ``quadratic_m``: range of distances
+whose local exponent is within `WITHIN` of 2, None where there are none."""
 
 
 class Theory(Probe):
@@ -94,11 +80,8 @@ class Theory(Probe):
         progress(1, 2, "one period, many distances")
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
-        values = {
-            "twins": twins.to_dict(),
-            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": [{key: getattr(curve, key) for key in keys} for curve in curves],
-        }
+        shown = [{key: curve[key] for key in keys} for curve in curves]
+        values = {"twins": twins.to_dict(), "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "curves": shown}
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 
@@ -110,8 +93,8 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
     for sample in dataset.samples("test"):
         first = original(dataset, renderer, sample)
         for start in STARTS_PERIODS if first.target.any() else ():
-            shifts = (times(TAU * turns, constant) for turns in (start, start + 1))
-            pair = [moved(first.surface, renderer.rig, direction, shift) for shift in shifts]
+            shifts_rad = (TAU * turns for turns in (start, start + 1))
+            pair = [moved(first.surface, renderer.rig, direction, constant, shift) for shift in shifts_rad]
             if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
                 return _photographed(renderer, first, pair, direction)
     raise DiagnosisError(
@@ -152,8 +135,7 @@ def kappa_per_m(rig: Rig, direction: Direction) -> float:
 def depth_error_mm(
     rig: Rig, direction: Direction, distances_m: NDArray[np.float64], periods: float
 ) -> NDArray[np.float64]:
-    """|depth of the wrong phase - depth| along the camera's axis, in mm; inf where no point in front of the camera has
-    the wrong phase."""
+    """|depth of the wrong phase - depth| on the camera's axis, in mm; inf where no point ahead has the wrong phase."""
     layer = _axis(rig, direction)
     residual = layer.absolute_phase(distances_m * MM_PER_M) - layer.infinity_rad - TAU * layer.infinity_order
     # A depth error away from the camera reduces the magnitude of the residual phase.
@@ -163,7 +145,7 @@ def depth_error_mm(
     return np.where((depth > 0) & np.isfinite(depth), np.abs(depth - distances_m * MM_PER_M), np.inf)
 
 
-def error_curves(rig: Rig, direction: Direction) -> list[ErrorCurve]:
+def error_curves(rig: Rig, direction: Direction) -> list[Curve]:
     """Curves of a small error, of a period away from and toward the camera, of their mean, and of a small error on a
     rig whose projector is behind the camera."""
     distances = np.geomspace(*DISTANCES_M, POINTS)
@@ -180,20 +162,20 @@ def error_curves(rig: Rig, direction: Direction) -> list[ErrorCurve]:
     ]
 
 
-def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: NDArray[np.float64]) -> ErrorCurve:
+def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: NDArray[np.float64]) -> Curve:
     """The exponent is fitted where the local exponent is within `WITHIN` of 2; if nowhere, over all finite values."""
     with np.errstate(invalid="ignore"):
         local = np.gradient(np.log(error_mm), np.log(distances))
     finite = np.isfinite(error_mm) & np.isfinite(local)
     quadratic = finite & (np.abs(np.where(finite, local, 0.0) - 2) <= 2 * WITHIN)
     fitted = quadratic if quadratic.sum() > 2 else finite
-    exponent = float(np.polyfit(np.log(distances[fitted]), np.log(error_mm[fitted]), 1)[0])
-    fitted_m, quadratic_m = (
-        [float(end(distances[chosen])) for end in (np.min, np.max)] if chosen.any() else None
-        for chosen in (fitted, quadratic)
-    )
-    local = np.where(finite, local, np.nan)
-    return ErrorCurve(name, periods, distances, error_mm, local, exponent, fitted_m, quadratic_m)
+    spans = {"fitted_m": distances[fitted], "quadratic_m": distances[quadratic]}
+    return {
+        "name": name, "periods": periods, "distances_m": distances, "error_mm": error_mm,
+        "local": np.where(finite, local, np.nan),
+        "exponent": float(np.polyfit(np.log(distances[fitted]), np.log(error_mm[fitted]), 1)[0]),
+        **{key: [float(chosen.min()), float(chosen.max())] if chosen.size else None for key, chosen in spans.items()},
+    }  # fmt: skip
 
 
 def summary(values: Mapping[str, Any]) -> str:
@@ -217,12 +199,12 @@ def _span(ends: Sequence[float] | None) -> str:
     return "-" if ends is None else f"{ends[0]:.2g} to {ends[1]:.2g} m"
 
 
-def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Table]:
+def tables(values: Mapping[str, Any], curves: Sequence[Curve]) -> list[Table]:
     """Exponents, and errors at some distances."""
     errors = []
     for curve in curves:
-        shown = np.interp(np.log(_SHOWN_M), np.log(curve.distances_m), curve.error_mm)
-        errors.append((curve.name, *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
+        shown = np.interp(np.log(_SHOWN_M), np.log(curve["distances_m"]), curve["error_mm"])
+        errors.append((curve["name"], *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
     same = {
         "pixels of the object": "object_pixels",
         "depth between the two, mean, mm": "depth_apart_mean_mm",
@@ -231,7 +213,7 @@ def tables(values: Mapping[str, Any], curves: Sequence[ErrorCurve]) -> list[Tabl
         "pixels that differ in the other direction's frame": "differing_pixels_other_direction",
         "least albedo factor on the brighter surface": "paint_least",
     }
-    exponents = [(curve.name, curve.exponent, _span(curve.fitted_m), _span(curve.quadratic_m)) for curve in curves]
+    exponents = [(one["name"], one["exponent"], _span(one["fitted_m"]), _span(one["quadratic_m"])) for one in curves]
     header = ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2")
     return [
         Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
@@ -260,13 +242,13 @@ def _draw_twins(twins: Twins, folder: Path) -> Figure:
     return sheet.save(folder, "theory_twins.png", "Two scenes, one frame", alt)
 
 
-def _draw_curves(curves: Sequence[ErrorCurve], folder: Path) -> Figure:
+def _draw_curves(curves: Sequence[Curve], folder: Path) -> Figure:
     sheet = Sheet(1, 2, 10, 3.8)
     errors, exponents = sheet.axes[0]
     for curve, name in zip(curves, ("edges", "depth", "phase", "order", "raw"), strict=True):
-        finite, style = np.isfinite(curve.error_mm), {"color": sheet.COLOURS[name], "linewidth": 1.4}
-        errors.loglog(curve.distances_m[finite], curve.error_mm[finite], label=curve.name, **style)
-        exponents.semilogx(curve.distances_m, curve.local, **style)
+        finite, style = np.isfinite(curve["error_mm"]), {"color": sheet.COLOURS[name], "linewidth": 1.4}
+        errors.loglog(curve["distances_m"][finite], curve["error_mm"][finite], label=curve["name"], **style)
+        exponents.semilogx(curve["distances_m"], curve["local"], **style)
     exponents.axhspan(1.98, 2.02, color=sheet.GRID)
     exponents.text(0.31, 2.2, "grey: 2 within 1%", fontsize=7)
     exponents.set_ylim(1.0, 3.5)

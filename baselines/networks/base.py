@@ -48,12 +48,11 @@ class FringeNetwork(nn.Module, ABC):
 
     def check_input(self, fringe: Tensor) -> None:
         """Raises `NetworkError` unless ``fringe`` is floating (B, 1, H, W) of a size that the network takes."""
-        shape = tuple(fringe.shape)
+        shape, kind = tuple(fringe.shape), fringe.dtype
         if fringe.dim() != 4 or shape[1] != 1:
             raise NetworkError(f"{self.name} takes one fringe channel, (B, 1, H, W); it was given {shape}")
         if not fringe.is_floating_point():
-            words = f"takes floating fringe in [0, 1]; it was given {fringe.dtype}; divide by 255"
-            raise NetworkError(f"{self.name} {words}")
+            raise NetworkError(f"{self.name} takes floating fringe in [0, 1]; it was given {kind}; divide by 255")
         self.check_size(shape[2], shape[3])
 
     def check_size(self, height: int, width: int) -> None:
@@ -78,8 +77,7 @@ def in_full_precision(layer: nn.Module, features: Tensor) -> Tensor:
 
 
 def _nearest(side: int, stride: int, least: int) -> str:
-    below = max(side // stride * stride, least)
-    above = max(-(-side // stride) * stride, least)
+    below, above = (max(strides * stride, least) for strides in (side // stride, -(-side // stride)))
     return str(below) if below == above else f"({below} or {above})"
 
 
@@ -106,28 +104,23 @@ def parameter_count(module: nn.Module) -> int:
 _CONVOLUTIONS = (nn.Conv2d, nn.ConvTranspose2d)
 
 
-def _initialise(module: nn.Module, kinds: tuple[type, ...], draw: Callable[[Tensor], object]) -> None:
-    """Weights by ``draw`` and zero biases in every layer of ``kinds``."""
-    for layer in module.modules():
-        if isinstance(layer, kinds):
-            draw(layer.weight)  # type: ignore[arg-type]
-            if layer.bias is not None:
-                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+_RULES: dict[str, tuple[tuple[type, ...], Callable[[Tensor], object]]] = {
+    "convolutions": (_CONVOLUTIONS, partial(nn.init.kaiming_normal_, mode="fan_out", nonlinearity="relu")),
+    "tokens": ((nn.Linear,), partial(nn.init.trunc_normal_, std=0.02)),
+    "gan": (_CONVOLUTIONS, partial(nn.init.normal_, mean=0.0, std=0.02)),
+}
 
 
-def initialise_convolutions(module: nn.Module) -> None:
-    """Kaiming-normal weights (fan out, ReLU) in every convolution, transposed ones too."""
-    _initialise(module, _CONVOLUTIONS, partial(nn.init.kaiming_normal_, mode="fan_out", nonlinearity="relu"))
-
-
-def initialise_tokens(module: nn.Module) -> None:
-    """Normal weights of spread 0.02, cut at two units of the weight, in every linear layer."""
-    _initialise(module, (nn.Linear,), partial(nn.init.trunc_normal_, std=0.02))
-
-
-def initialise_normal(module: nn.Module) -> None:
-    """Weights from N(0, 0.02) in every convolution (the GAN's rule)."""
-    _initialise(module, _CONVOLUTIONS, partial(nn.init.normal_, mean=0.0, std=0.02))
+def initialise(module: nn.Module, *rules: str) -> None:
+    """Weights by the ``rules`` and zero biases: Kaiming-normal (fan out, ReLU) ``convolutions``, transposed ones too;
+    ``tokens``: linear layers, normal of spread 0.02, cut at two units of the weight; ``gan``: convolutions, N(0, 0.02).
+    """
+    for kinds, draw in map(_RULES.__getitem__, rules):
+        for layer in module.modules():
+            if isinstance(layer, kinds):
+                draw(layer.weight)  # type: ignore[arg-type]
+                if layer.bias is not None:
+                    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -262,8 +255,7 @@ class DropPath(nn.Module):
         if not self.training or self.rate == 0.0:
             return x
         keep_rate = 1.0 - self.rate
-        mask = x.new_empty((x.shape[0],) + (1,) * (x.dim() - 1)).bernoulli_(keep_rate)
-        return x * mask.div_(keep_rate)
+        return x * x.new_empty((x.shape[0],) + (1,) * (x.dim() - 1)).bernoulli_(keep_rate).div_(keep_rate)
 
     def extra_repr(self) -> str:
         return f"rate={self.rate:.3f}"
@@ -277,9 +269,8 @@ class TransformerLayer(nn.Module):
         self.norm_attention = nn.LayerNorm(channels)
         self.attention = Attention(channels, heads)
         self.norm_mlp = nn.LayerNorm(channels)
-        self.mlp = nn.Sequential(
-            nn.Linear(channels, mlp_ratio * channels), nn.GELU(), nn.Linear(mlp_ratio * channels, channels)
-        )
+        hidden = mlp_ratio * channels
+        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
         self.drop_path = DropPath(drop_path)
 
     def forward(self, tokens: Tensor) -> Tensor:

@@ -142,12 +142,10 @@ class Hformer(FringeNetwork):
         last = sum(ENCODER_DEPTHS) - 1
         drops = iter([drop_path * layer / last for layer in range(last + 1)])
         level_drops = [[next(drops) for _ in range(depth)] for depth in ENCODER_DEPTHS]
-
         self.backbone = Backbone(2 * width, branches)
         self.embeds = nn.ModuleList(Embed(c_in, c_out) for c_in, c_out in zip(branches, tokens, strict=True))
-        self.encoder = nn.ModuleList(
-            Level(c, heads, rates, norm=True) for c, heads, rates in zip(tokens, HEADS, level_drops, strict=True)
-        )
+        levels = zip(tokens, HEADS, level_drops, strict=True)
+        self.encoder = nn.ModuleList(Level(c, heads, rates, norm=True) for c, heads, rates in levels)
         self.merges = nn.ModuleList(MergePatches(c) for c in tokens[:3])
         self.decoder = nn.ModuleList(
             ExpandPatches(tokens[level], HEADS[level], level_drops[level][:depth])
@@ -156,8 +154,7 @@ class Hformer(FringeNetwork):
         self.up1 = nn.Sequential(nn.ConvTranspose2d(width, width // 2, 2, 2), nn.ReLU(inplace=True))
         self.up2 = nn.Sequential(nn.ConvTranspose2d(width // 2, width // 4, 2, 2), nn.ReLU(inplace=True))
         self.head = nn.Conv2d(width // 4, 1, 1)
-        base.initialise_convolutions(self)
-        base.initialise_tokens(self)
+        base.initialise(self, "convolutions", "tokens")
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:

@@ -22,14 +22,11 @@ class NetworkMethod(Method):
     """A `Model` that takes one frame of the sequence.
 
     Under raw and global normalisation a network puts out mm, and ``depth_range`` must be None. Under individual
-    normalisation it is ``oracle`` (values go out normalised, and the scoring takes the range of the very sample),
-    or ``predicted`` or ``mean`` (the range heads of the weights file make mm). None takes ``predicted`` where the file
-    holds heads, else ``oracle``.
-
-    ``frame``: its index, by default the first of those that the network was trained on. ``threads`` are torch's while
-    it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises `PredictionError` for an unknown
-    range or frame.
-    """
+    normalisation it is ``oracle`` (values go out normalised, and the scoring takes the range of the very sample), or
+    ``predicted`` or ``mean`` (the range heads of the weights file make mm). None takes ``predicted`` where the file
+    holds heads, else ``oracle``. ``frame``: its index, by default the first of those that the network was trained on.
+    ``threads`` are torch's while it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises
+    `PredictionError` for an unknown range or frame."""
 
     target = "depth"
     packages = ("numpy", "torch", "safetensors")

@@ -24,11 +24,9 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
 
     The file takes ``fringe`` float32 (B, 1, H, W) in [0, 1] and gives ``depth_representation`` of the same shape; B is
     free, H and W are ``size`` (one number for a square). ``model``: a `FringeNetwork`, or what holds one as
-    ``.network``. Torch's older exporter takes 0.4 to 2 s where the newer takes 6 to 30 s, to the same numbers.
-
-    Raises `FppBenchError` where the onnx package is missing or the file can't be written, and `NetworkError` for
-    something that is no network or a size that it does not take.
-    """
+    ``.network``. Torch's older exporter takes 0.4 to 2 s where the newer takes 6 to 30 s, to the same numbers. Raises
+    `FppBenchError` where the onnx package is missing or the file can't be written, and `NetworkError` for something
+    that is no network or a size that it does not take."""
     if importlib.util.find_spec("onnx") is None:
         raise FppBenchError('ONNX export needs the onnx package; install it with: pip install "fpp-ml-bench[onnx]"')
     network = model if isinstance(model, FringeNetwork) else getattr(model, "network", None)
@@ -36,12 +34,10 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
         raise NetworkError(f"expected a network or a model that holds one; it was given {type(model).__name__}")
     height, width = (size, size) if isinstance(size, int) else size
     network.check_size(height, width)
-
     target = Path(path)
     if not target.parent.is_dir():
         raise FppBenchError(f"can't write {target}: there is no folder {target.parent}; make it first")
-    first = next(network.parameters())
-    example = torch.zeros(1, 1, height, width, dtype=torch.float32, device=first.device)
+    example = torch.zeros(1, 1, height, width, dtype=torch.float32, device=next(network.parameters()).device)
     try:
         # A file that appears under its name only when whole.
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:

@@ -43,9 +43,7 @@ class Generator(nn.Sequential):
         self.stem = normed(_convolution(1, width, 7, reflect=True), width)
         self.down = nn.Sequential(*(normed(_convolution(c // 2, c, 3, stride=2), c) for c in widths[1:]))
         self.bottleneck = nn.Sequential(*(GeneratorBlock(widths[-1]) for _ in range(RESIDUAL_BLOCKS)))
-        self.up = nn.Sequential(
-            *(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, output_padding=1), c) for c in reversed(widths[:-1]))
-        )
+        self.up = nn.Sequential(*(normed(nn.ConvTranspose2d(2 * c, c, 3, 2, 1, 1), c) for c in reversed(widths[:-1])))
         self.head = nn.Sequential(_convolution(width, 1, 7, reflect=True), nn.Tanh())
 
     def forward(self, x: Tensor) -> Tensor:
@@ -55,12 +53,10 @@ class Generator(nn.Sequential):
 
 
 class Pix2Pix(FringeNetwork):
-    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back.
-
-    Output can't leave [0, 1], so the network suits representations in that range. width: channels of the first layer.
-    Convolutions start from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width
-    channels, 1/16 of the image), up4..up1 (up1 at full resolution, ``width`` channels).
-    """
+    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back. Output can't leave
+    [0, 1], so the network suits representations in that range. width: channels of the first layer. Convolutions start
+    from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width channels, 1/16 of the
+    image), up4..up1 (up1 at full resolution, ``width`` channels)."""
 
     name = "pix2pix"
     stride = 2**DOWNSAMPLINGS
@@ -70,7 +66,7 @@ class Pix2Pix(FringeNetwork):
         width = base.whole(self.name, "width", width)
         super().__init__(width=width)
         self.generator = Generator(width)
-        base.initialise_normal(self)
+        base.initialise(self, "gan")
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
@@ -84,12 +80,10 @@ class Pix2Pix(FringeNetwork):
 
 
 class Discriminator(nn.Module):
-    """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64.
-
-    ``forward`` takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1]. It gives, for each scale (full
-    resolution first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the
-    judgement, (B, 1, h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer.
-    """
+    """Judges fringe and depth together at full and at half resolution; 5,527,426 parameters at width 64. ``forward``
+    takes floating (B, 2, H, W): fringe and depth, each mapped to [-1, 1]. It gives, for each scale (full resolution
+    first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the judgement, (B, 1,
+    h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer."""
 
     def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
         width = base.whole("discriminator", "width", width)
@@ -98,7 +92,7 @@ class Discriminator(nn.Module):
         super().__init__()
         self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
         self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))
-        base.initialise_normal(self)
+        base.initialise(self, "gan")
 
     def forward(self, pair: Tensor) -> list[list[Tensor]]:
         features = []

@@ -39,11 +39,9 @@ def fit_heads(
 
     Mean range, ridge regression and mask come from the training split; the ridge's strength and the masks' thresholds
     (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. ``progress`` is given the
-    number of pairs done.
-
-    Raises `WeightsError` for a network of another normalisation, a dataset of another size or fingerprint than
-    ``config`` says, or without an object in either split; `PredictionError` where the network's output is not finite.
-    """
+    number of pairs done. Raises `WeightsError` for a network of another normalisation, a dataset of another size or
+    fingerprint than ``config`` says, or without an object in either split; `PredictionError` where the network's output
+    is not finite."""
     if config.normalisation != "individual":
         raise WeightsError(f"{config.name}: its output is metric ({config.normalisation}); it needs no range heads")
     was_training = network.training
@@ -54,16 +52,14 @@ def fit_heads(
                 split: _Pairs(network, probe, config, dataset_folder, split, cap, progress)
                 for split, cap in (("train", TRAIN_PAIRS), ("validation", VALIDATION_PAIRS))
             }
-            return _fit(runs["train"], runs["validation"]).to_tensors()
+            return vars(_fit(runs["train"], runs["validation"]))
     finally:
         network.train(was_training)
 
 
 def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str | Path) -> None:
-    """Write the network of the file ``weights``, with heads fitted on its training data, as the file ``target``.
-
-    Raises as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written.
-    """
+    """Write the network of the file ``weights``, with heads fitted on its training data, as the file ``target``. Raises
+    as `fit_heads`, and `WeightsError` for a file that is no weights or can't be written."""
     model = load(weights)
     save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
 
@@ -92,8 +88,7 @@ class _Pairs:
         places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
         self.order = [usable[place] for place in places]
         self.network, self.probe, self.name, self.progress = network, probe, config.name, progress
-        self.device = next(network.parameters()).device
-        self.size = source.size
+        self.device, self.size = next(network.parameters()).device, source.size
         self.batch = max(1, min(4, _PIXELS_AT_ONCE // (self.size[0] * self.size[1])))
 
     def run(self) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
@@ -134,9 +129,8 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     )
     validation_features = [(validation.probe.pooled().numpy(), range_mm) for _, _, range_mm in validation.run()]
     validation_pooled, validation_ranges = (np.concatenate(part) for part in zip(*validation_features, strict=True))
-    strength, weight, bias, error_mm = _ridge(
-        np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges
-    )
+    fitted = _ridge(np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges)
+    strength, weight, bias, error_mm = fitted
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
         mean_range_mm=torch.from_numpy(mean), range_weight=torch.from_numpy(weight), range_bias=torch.from_numpy(bias),
@@ -152,15 +146,10 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
             tally.add(logits, depth.cpu().numpy()[:, 0], depth_mm)
     best = {twin: tally.best() for twin, tally in tallies.items()}
     heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
-    report = HeadReport(
-        mean_range_error_mm=_range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges),
-        predicted_range_error_mm=error_mm,
-        mask_iou=best["predicted"][2],
-        mean_overall_mae_mm=best["mean"][1],
-        predicted_overall_mae_mm=best["predicted"][1],
-        ridge_strength=strength,
-    )
-    heads.report.copy_(report.to_tensor())
+    mean_error_mm = _range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges)
+    (_, mean_mae_mm, _), (_, mae_mm, iou) = best["mean"], best["predicted"]
+    report = HeadReport(mean_error_mm, error_mm, iou, mean_mae_mm, mae_mm, strength)
+    heads.report.copy_(torch.tensor(report, dtype=torch.float64))
     return heads
 
 
@@ -243,7 +232,6 @@ class _Tally:
         equal = np.flatnonzero(above == above.min())
         run = equal[: np.flatnonzero(np.diff(equal, append=-1) != 1)[0] + 1]
         best_bin = int(run[len(run) // 2])
-        pixels = self.inside.sum() + self.outside.sum()
-        hit, false = self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
-        iou = float(hit / (self.inside.sum() + false))
-        return best_bin * LOGIT_STEP - LOGIT_LIMIT, float((self.without + above[best_bin]) / pixels), iou
+        inside, hit, false = self.inside.sum(), self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
+        mae_mm = float((self.without + above[best_bin]) / (inside + self.outside.sum()))
+        return best_bin * LOGIT_STEP - LOGIT_LIMIT, mae_mm, float(hit / (inside + false))

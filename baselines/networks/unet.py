@@ -2,58 +2,58 @@
 normalisation; TransUNet (section 5.6), the UNet with a vision transformer for its bottleneck; and ResUNet (section
 5.6), of residual blocks on four levels, with batch normalisation."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import base
-from fpp_ml_bench.baselines.networks.base import (
-    DoubleConvolution,
-    FringeNetwork,
-    Join,
-    ResidualBlock,
-    TransformerLayer,
-    in_full_precision,
-)
+from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwork, Join, ResidualBlock
 from fpp_ml_bench.errors import NetworkError
 
 
-class UShape(FringeNetwork):
-    """The UNet's encoder and decoder, Kaiming-normal (fan out), around any ``bottleneck``: (B, 8 width, h, w) -> (B, 16
-    width, h, w), left as it comes."""
+class Levels(FringeNetwork):
+    """An encoder, a bottleneck and a decoder that joins what each level of the encoder gave; ``pooled``: every level is
+    halved on its way down, else the blocks do so themselves, and the last level is no skip."""
 
-    stride = 16
     last_layer = "dec1"
-
-    def __init__(self, width: int, bottleneck: nn.Module, **options: int | float) -> None:
-        super().__init__(width=width, **options)
-        widths = [width * 2**level for level in range(5)]
-        self.encoder = nn.ModuleList(
-            DoubleConvolution(c_in, c_out) for c_in, c_out in zip([1, *widths], widths[:4], strict=False)
-        )
-        self.decoder = nn.ModuleList(
-            Join(2 * c_out, c_out, DoubleConvolution(2 * c_out, c_out)) for c_out in reversed(widths[:4])
-        )
-        self.head = nn.Conv2d(width, 1, 1)
-        base.initialise_convolutions(self)
-        self.bottleneck = bottleneck
+    pooled = True
+    encoder: nn.ModuleList
+    decoder: nn.ModuleList
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
         layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
         layers["bottleneck"] = self.bottleneck
-        return layers | {f"dec{4 - step}": block for step, block in enumerate(self.decoder)}
+        return layers | {f"dec{len(self.decoder) - step}": block for step, block in enumerate(self.decoder)}
 
     def represent(self, fringe: Tensor) -> Tensor:
         x, skips = fringe, []
         for block in self.encoder:
             x = block(x)
             skips.append(x)
-            x = functional.max_pool2d(x, 2)
-        x = self.bottleneck(x)
+            x = functional.max_pool2d(x, 2) if self.pooled else x
+        x = self.bottleneck(x if self.pooled else skips.pop())
         for block in self.decoder:
             x = block(x, skips.pop())
-        return in_full_precision(self.head, x)
+        return base.in_full_precision(self.head, x)
+
+
+class UShape(Levels):
+    """The UNet's encoder and decoder, Kaiming-normal (fan out), around any ``bottleneck``: (B, 8 width, h, w) -> (B, 16
+    width, h, w), left as it comes."""
+
+    stride = 16
+
+    def __init__(self, width: int, bottleneck: nn.Module, **options: int | float) -> None:
+        super().__init__(width=width, **options)
+        widths = [width * 2**level for level in range(4)]
+        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in pairwise([1, *widths]))
+        self.decoder = nn.ModuleList(Join(2 * c, c, DoubleConvolution(2 * c, c)) for c in reversed(widths))
+        self.head = nn.Conv2d(width, 1, 1)
+        base.initialise(self, "convolutions")
+        self.bottleneck = bottleneck
 
 
 class UNet(UShape):
@@ -70,7 +70,7 @@ class UNet(UShape):
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
         bottleneck = DoubleConvolution(8 * width, 16 * width)
-        base.initialise_convolutions(bottleneck)
+        base.initialise(bottleneck, "convolutions")
         super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout)
 
 
@@ -80,11 +80,9 @@ MLP_RATIO = 4
 
 
 class TokenBottleneck(nn.Module):
-    """Patches of a map through a transformer and back, (B, c_in, m, m) -> (B, c_out, m, m).
-
-    Each p x p patch of all ``c_in`` channels becomes one token of ``channels`` numbers, a learned position is added,
-    pre-norm layers and a last layer norm follow, and one linear layer turns a token into its p x p x ``c_out`` patch.
-    """
+    """Patches of a map through a transformer and back, (B, c_in, m, m) -> (B, c_out, m, m). Each p x p patch of all
+    ``c_in`` channels becomes one token of ``channels`` numbers, a learned position is added, pre-norm layers and a last
+    layer norm follow, and one linear layer turns a token into its p x p x ``c_out`` patch."""
 
     def __init__(self, c_in: int, c_out: int, channels: int, map_size: int, patch: int) -> None:
         super().__init__()
@@ -92,10 +90,10 @@ class TokenBottleneck(nn.Module):
         self.patch = patch
         self.embed = nn.Conv2d(c_in, channels, patch, patch)
         self.position = nn.Parameter(torch.empty(1, self.grid**2, channels))
-        self.layers = nn.Sequential(*(TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
+        self.layers = nn.Sequential(*(base.TransformerLayer(channels, HEADS, MLP_RATIO) for _ in range(LAYERS)))
         self.norm = nn.LayerNorm(channels)
         self.unembed = nn.Linear(channels, c_out * patch**2)
-        base.initialise_tokens(self)
+        base.initialise(self, "tokens")
         for weight in (self.position, self.embed.weight):
             nn.init.trunc_normal_(weight, std=0.02)
         if self.embed.bias is not None:
@@ -135,16 +133,14 @@ class TransUNet(UShape):
             )
 
 
-class ResUNet(FringeNetwork):
-    """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120.
-
-    The paper's four levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but
-    the first starts with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1.
-    """
+class ResUNet(Levels):
+    """Channels width x (1, 2, 4, 8), two residual blocks a level; 88,941,841 parameters at width 120. The paper's four
+    levels end at 1/8 of the image, and the bottleneck, two blocks more, stays there. Each level but the first starts
+    with stride 2. Convolutions start Kaiming-normal (fan out). Decoder layers: dec3..dec1."""
 
     name = "resunet"
     stride = 8
-    last_layer = "dec1"
+    pooled = False
 
     def __init__(self, *, width: int = 120) -> None:
         width = base.whole(self.name, "width", width)
@@ -152,7 +148,7 @@ class ResUNet(FringeNetwork):
         widths = [width * 2**level for level in range(4)]
         self.encoder = nn.ModuleList(
             nn.Sequential(ResidualBlock(c_in, c_out, 1 if c_in == 1 else 2), ResidualBlock(c_out, c_out))
-            for c_in, c_out in zip([1, *widths], widths, strict=False)
+            for c_in, c_out in pairwise([1, *widths])
         )
         self.bottleneck = nn.Sequential(*(ResidualBlock(widths[3], widths[3]) for _ in range(2)))
         self.decoder = nn.ModuleList(
@@ -160,20 +156,4 @@ class ResUNet(FringeNetwork):
             for c in reversed(widths[:3])
         )
         self.head = nn.Conv2d(width, 1, 1)
-        base.initialise_convolutions(self)
-
-    @property
-    def probe_layers(self) -> dict[str, nn.Module]:
-        layers = {f"enc{level}": block for level, block in enumerate(self.encoder, 1)}
-        layers["bottleneck"] = self.bottleneck
-        return layers | {f"dec{3 - step}": block for step, block in enumerate(self.decoder)}
-
-    def represent(self, fringe: Tensor) -> Tensor:
-        x, skips = fringe, []
-        for block in self.encoder:
-            x = block(x)
-            skips.append(x)
-        x = self.bottleneck(skips.pop())
-        for block in self.decoder:
-            x = block(x, skips.pop())
-        return in_full_precision(self.head, x)
+        base.initialise(self, "convolutions")

@@ -13,16 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines import phase_route
-from fpp_ml_bench.baselines.phase_route import (
-    TAU,
-    CalibrationLayer,
-    Crop,
-    Image,
-    Mask,
-    Observation,
-    PhaseRoute,
-    wrapped,
-)
+from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer, Image, Mask, Observation, wrapped
 from fpp_ml_bench.optics import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
@@ -88,12 +79,12 @@ class Geometry:
     """Route and rotation for all images of a rig and fringe direction."""
 
     rig: Rig
-    route: PhaseRoute
+    route: phase_route.PhaseRoute
     rotation: Rotation
 
     @classmethod
     def of(cls, rig: Rig, settings: phase_route.Settings) -> "Geometry":
-        route = PhaseRoute(rig, settings)
+        route = phase_route.PhaseRoute(rig, settings)
         return cls(rig, route, Rotation.of(route.layer, settings.direction))
 
     @property
@@ -108,16 +99,13 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Scene:
-    """The part ``crop`` of an image, maps (h, w) in the image's own orientation.
+    """The part ``crop`` of an image, maps (h, w) in the image's own orientation. ``light``: captured light without the
+    ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a white plane at the
+    standoff; ``noise`` in the same unit; ``inside``: mask of the measured route; ``phase_rad`` in [-pi, pi] and
+    ``order``: the base order; ``bright``: half the modulation, in units of light; ``weight``: of the fit's window;
+    ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median residual phase of the object."""
 
-    ``light``: captured light without the ambient light, and ``plane_light``: the empty scene's prediction of it, both
-    as multiples of a white plane at the standoff; ``noise`` in the same unit; ``inside``: mask of the measured route;
-    ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in units of light;
-    ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median
-    residual phase of the object.
-    """
-
-    crop: Crop
+    crop: phase_route.Crop
     light: Image
     plane_light: Image
     noise: float
@@ -153,14 +141,10 @@ class Scene:
         return replace(self, crop=crop, inside=inside, slopes=slopes, **maps)
 
     def single(self, real: type = np.float32, whole: type = np.int32) -> "Scene":
-        """In single precision, or in another."""
+        """In single precision, or in another: half saves memory, and is not for use."""
         maps = {name: getattr(self, name).astype(real) for name in _REAL_MAPS}
         slopes: tuple[Image, Image] = (self.slopes[0].astype(real), self.slopes[1].astype(real))
         return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
-
-    def half(self) -> "Scene":
-        """In half precision, to save memory; call `single` before use."""
-        return self.single(np.float16, np.int16)
 
 
 def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> NDArray[np.float32]:

@@ -17,11 +17,9 @@ from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError, Weig
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.optics import Direction, Rig
 
-SHIPPED = Path(__file__).resolve().parent / "weights"
-"""Folder of the weights that come with the package."""
+SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "phase-net"
-PERIOD_TOLERANCE = 2.2
-"""Factor by which an image's fringe period in px may differ from that of the training images."""
+PERIOD_TOLERANCE = 2.2  # factor by which an image's fringe period in px may differ from that of the training images
 
 
 @dataclass(frozen=True)
@@ -64,15 +62,12 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile
 
 class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
-
     ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
     Raises `WeightsError` for weights that can't be used, and `PredictionError` for an invalid option and for a rig
-    whose fringe period in the image is far from that of the training data.
-    """
+    whose fringe period in the image is far from that of the training data."""
 
     name = "phase-net"
     target = "depth"
-    crops = True
     packages = ("numpy", "numba", "torch")
 
     def __init__(

@@ -22,8 +22,7 @@ FIRST_BIAS = 2.5  # start value of the biases of the base order and of no correc
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
     parts: list[nn.Module] = []
     for width in (inputs, outputs):
-        convolution = nn.Conv2d(width, outputs, 3, padding=1, bias=False)
-        parts += [convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
+        parts += [nn.Conv2d(width, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*parts)
 
 
@@ -46,15 +45,12 @@ class UNet(nn.Module):
 
 
 class PhaseNet(nn.Module):
-    """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W).
-
-    The correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
+    """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W). The
+    correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
     none, with weights from the network, plus a free part of at most half of ``bound_rad``, clipped at ``bound_rad``.
-
     ``widths``: channels of each level, the first at half the image's resolution; ``squeezed`` and ``fine``: of the maps
     at full resolution, before and after them; ``order_widths``: of the branch that looks for the order, at a quarter of
-    the resolution. H and W must be multiples of ``stride``.
-    """
+    the resolution. H and W must be multiples of ``stride``."""
 
     def __init__(
         self, widths: tuple[int, ...] = (24, 32, 48, 64), fine: int = 14, squeezed: int = 20,

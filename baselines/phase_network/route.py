@@ -44,15 +44,16 @@ def network_answers(
     with torch.inference_mode():
         batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
         order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(batch))
-    order = np.where(exists, order + np.array([0, lead, 0], np.float32)[:, None, None], np.float32(IMPOSSIBLE))
+    order = np.where(exists, order, np.float32(IMPOSSIBLE))
     sign = geometry.rotation.sign
     order, inside, correction = (np.ascontiguousarray(geometry.rotation.back(m)) for m in (order, inside, correction))
-    return Answers(order if sign > 0 else np.ascontiguousarray(order[::-1]), inside, correction * np.float32(sign))
+    order = order if sign > 0 else np.ascontiguousarray(order[::-1])
+    return with_lead(Answers(order, inside, correction * np.float32(sign)), lead)
 
 
-def decided_order(answers: Answers, scene: Scene) -> NDArray[np.int32]:
-    """The most likely order of every pixel, int32 (h, w)."""
-    return scene.order + np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)]
+def with_lead(answers: Answers, lead: float) -> Answers:
+    """``answers`` with ``lead`` added to the base order's logit."""
+    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
@@ -65,12 +66,10 @@ def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
 
 @dataclass(frozen=True)
 class Levers:
-    """Which of the network's answers are used; False: the measured route's own value stays.
-
-    ``order``, ``mask``, ``phase``; ``shading``: whether network and base order use brightness; ``graph``: weight of
-    smoothness between neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order
-    of each pixel alone; ``bound_rad``: corrections are clipped there, None: the network's own bound.
-    """
+    """Which of the network's answers are used; False: the measured route's own value stays. ``order``, ``mask``,
+    ``phase``; ``shading``: whether network and base order use brightness; ``graph``: weight of smoothness between
+    neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order of each pixel alone;
+    ``bound_rad``: corrections are clipped there, None: the network's own bound."""
 
     order: bool = True
     mask: bool = True

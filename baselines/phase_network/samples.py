@@ -25,11 +25,9 @@ MOST_OBJECTS = 3  # objects in one union, at most
 
 @dataclass(frozen=True)
 class Sample:
-    """An image of a training set: the ``scene`` and its ground truth.
-
-    ``missing_rad`` float16 (h, w): true absolute phase minus that of the base order, 0 outside the object; ``target``:
-    object pixels; ``edges`` int32 (n, 2): rows and columns beside depth edges and silhouettes.
-    """
+    """An image of a training set: the ``scene`` and its ground truth. ``missing_rad`` float16 (h, w): true absolute
+    phase minus that of the base order, 0 outside the object; ``target``: object pixels; ``edges`` int32 (n, 2): rows
+    and columns beside depth edges and silhouettes."""
 
     name: str
     direction: Direction
@@ -51,7 +49,7 @@ def sample_of(image: NDArray[np.uint8], depth_mm: Image, name: str, geometry: Ge
     places = np.argwhere(depth_edges(crop_depth_mm)).astype(np.int32)
     sampled = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
     direction, half = geometry.route.settings.direction, np.nan_to_num(missing).astype(np.float16)
-    return Sample(name, direction, scene.half(), half, target, places[sampled])
+    return Sample(name, direction, scene.single(np.float16, np.int16), half, target, places[sampled])
 
 
 def samples_of(
@@ -73,10 +71,8 @@ def _image(opened: DatasetFolder, name: str, geometry: Geometry) -> NDArray[np.u
 def united(
     images: Sequence[NDArray[np.uint8]], depths_mm: Sequence[NDArray[np.floating]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Image uint8 (H, W) and depth in mm float32 (H, W), 0 = background, of all objects together.
-
-    The nearest surface counts; without one, the first image's background, or another image's where it is in shadow.
-    """
+    """Image uint8 (H, W) and depth in mm float32 (H, W), 0 = background, of all objects together. The nearest surface
+    counts; without one, the first image's background, or another image's where it is in shadow."""
     ranges, stacked = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm]), np.stack(images)
     nearest = ranges.argmin(axis=0)
     depth, image, darkest = of_choice(ranges, nearest), of_choice(stacked, nearest), stacked.min(axis=0)
@@ -87,7 +83,6 @@ def united(
 
 def companions(objects: Mapping[str, str], sample: str, random: np.random.Generator) -> list[str]:
     """One or two samples of objects that differ from that of ``sample`` and from each other; fewer if there are none.
-
     ``objects``: the object of every sample to choose from."""
     members = [sample]
     for _ in range(int(random.integers(1, MOST_OBJECTS))):

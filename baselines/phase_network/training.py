@@ -6,9 +6,9 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -20,36 +20,24 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines.phase_network.inputs import Geometry
+from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Geometry
 from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, decided_order, network_answers
+from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, network_answers, with_lead
 from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of, unions_of
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Variation, Window, draw
 from fpp_ml_bench.baselines.phase_route import TAU, Settings
-from fpp_ml_bench.baselines.training import (
-    CHECKPOINT,
-    Display,
-    NetConfig,
-    Panel,
-    Record,
-    Training,
-    claim_folder,
-    reproducible,
-    training_benchmark,
-)
+from fpp_ml_bench.baselines.training import Panel, Record
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction
 
 WEIGHTS = "phase-net.safetensors"
-SMALL_RAD = 0.05
-"""Error of the phase below which its loss is quadratic."""
-IMPOSSIBLE = -1e4
-"""Logit of an order that puts its pixel out of the working range: finite, for gradients to stay so."""
+SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
+IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
 LARGEST_GRADIENT = 50.0
-VALIDATED_SHARE = 5
-"""Every so many-th validation image is scored during training."""
+VALIDATED_SHARE = 5  # every so many-th validation image is scored during training
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
 LEADS = tuple(float(value) for value in range(8))
@@ -61,12 +49,10 @@ _TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
 @dataclass(frozen=True)
 class Recipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
-
     ``widths`` to ``bound_rad`` make the network; ``directions``: the fringes it learns from, one frame each;
     ``unions``: images that join several objects, made from each sample (see `unions`); ``weight_*``: of the losses;
-    ``averaged``: decay of the weights' moving average, which is what the weights file holds.
-    Raises `RecipeError` for values that train nothing.
-    """
+    ``averaged``: decay of the weights' moving average, which is what the weights file holds. Raises `RecipeError` for
+    values that train nothing."""
 
     name: str = "phase-net"
     steps: int = 5000
@@ -116,8 +102,7 @@ class Recipe:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
-Batch = dict[str, Tensor]
-"""The fields of `Window` with a leading axis B."""
+Batch = dict[str, Tensor]  # the fields of `Window` with a leading axis B
 
 
 def batch_of(windows: list[Window]) -> Batch:
@@ -156,10 +141,9 @@ class WindowObjective:
         self.averaged.update_parameters(self.modules["network"])
 
 
-class PhaseNetTraining(Training):
-    """`Training` in intervals between two validations, on windows drawn from ``samples``, on the processor.
-
-    ``start``: the network whose weights it starts from (None: random ones). ``report`` is given every new record.
+class PhaseNetTraining(training.Training):
+    """Training in intervals between two validations, on windows drawn from ``samples``, on the processor. ``start``:
+    the network whose weights it starts from (None: random ones). ``print_line`` is given a line for every new record.
     Raises `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint of another recipe.
     """
 
@@ -167,12 +151,12 @@ class PhaseNetTraining(Training):
 
     def __init__(
         self, recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry],
-        out: Path, report: Callable[[Record], None] = lambda record: None, start: PhaseNet | None = None,
+        out: Path, start: PhaseNet | None = None, print_line: Callable[[str], None] = lambda line: None,
     ) -> None:  # fmt: skip
         super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
         self.recipe, self.samples, self.validation, self.geometries = recipe, samples, validation, geometries
         self.name = self.title = recipe.name
-        self.report = report
+        self.print_line = print_line
         network = PhaseNet(recipe.widths, recipe.fine, recipe.squeezed, recipe.order_widths, recipe.bound_rad)
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
@@ -236,10 +220,13 @@ class PhaseNetTraining(Training):
         seconds, steps = perf_counter() - began, self._next_validation
         record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
         record |= {f"loss_{name}": value for name, value in losses.items()}
-        return record | (scores(self.network, self.validation, self.geometries) if self.validation else {})
+        if not self.validation:
+            return record
+        answers = answers_of(self.network, self.validation, self.geometries)
+        return record | mean_scores(answers, self.validation, self.geometries)
 
     def recorded(self, record: Record) -> None:
-        self.report(record)
+        self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
 
     def progress(self) -> str:
         return f"step {self.steps_done}/{self.recipe.steps}  phase {self.history[-1]['loss_phase']:.4g}"
@@ -255,27 +242,31 @@ class PhaseNetTraining(Training):
         ]
 
 
-def scores(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> dict[str, float]:
-    """Means of `score` over the samples."""
-    rows = []
+def answers_of(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> Iterator[Answers]:
+    """The network's answers for each sample."""
     for sample in samples:
-        geometry, scene = geometries[sample.direction], sample.scene.single()
-        rows.append(score(network_answers(network, scene, geometry), sample, geometry))
+        yield network_answers(network, sample.scene.single(), geometries[sample.direction])
+
+
+def mean_scores(
+    answers: Iterable[Answers], samples: list[Sample], geometries: dict[Direction, Geometry], threshold: float = 0.0
+) -> dict[str, float]:
+    """Means of `score` over the samples."""
+    pairs = zip(answers, samples, strict=True)
+    rows = [score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs]
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
 
 
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
-    """Scores of one whole image with ``threshold`` on the mask's logit.
-
-    ``object_mae_mm`` counts a missed pixel with its whole depth; ``right_mae_mm`` is the MAE of the pixels with the
-    right order; ``wrong_percent`` and ``missed_percent`` are shares of the object's pixels; ``invented_kpx``:
-    background pixels with a depth, in thousands."""
+    """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
+    its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
+    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
-    order, inside = decided_order(answers, scene), decided_mask(answers, scene, threshold)
+    steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)
     base_residual = layer.residual_phase(scene.phase_rad, scene.order)
     true_mm = layer.depth_of_residual_mm(base_residual + sample.missing_rad)
-    phase_change = TAU * (order - scene.order) + answers.correction_rad
+    phase_change = TAU * steps + answers.correction_rad
     predicted_mm = np.nan_to_num(layer.depth_of_residual_mm(base_residual + phase_change))
     target = sample.target
     phase_error = phase_change - sample.missing_rad
@@ -307,18 +298,10 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
     return THRESHOLDS[int(np.flatnonzero(means < means.min() + _TOLERANCE_MM)[0])]
 
 
-def with_lead(answers: Answers, lead: float) -> Answers:
-    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
-
-
 def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: dict[Direction, Geometry]) -> float:
     """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
-    shares = []
-    for lead in LEADS:
-        pairs = zip(answers, samples, strict=True)
-        rows = [score(with_lead(answer, lead), sample, geometries[sample.direction]) for answer, sample in pairs]
-        shares.append(float(np.mean([row["wrong_percent"] for row in rows])))
-    return LEADS[int(np.argmin(shares))]
+    means = (mean_scores((with_lead(one, lead) for one in answers), samples, geometries) for lead in LEADS)
+    return LEADS[int(np.argmin([mean["wrong_percent"] for mean in means]))]
 
 
 @dataclass(frozen=True)
@@ -339,8 +322,7 @@ def train_phase_net(
     """Train on the dataset's training split, and on that of ``extra``, starting from the weights in ``start`` or from
     random ones; the same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is
     given a line for every validation. Raises `DatasetError` for a dataset without the frames in question,
-    `TrainingError` for a folder of another recipe or dataset.
-    """
+    `TrainingError` for a folder of another recipe or dataset."""
     started = perf_counter()
     opened = DatasetFolder(dataset)
     extra_data = None if extra is None else DatasetFolder(extra)
@@ -349,7 +331,7 @@ def train_phase_net(
     start_weights = None if start is None else load_net(start, folded=False)
     described = recipe.to_dict() | ({} if extra_data is None else {"extra_fingerprint": extra_data.fingerprint})
     described |= {} if start_weights is None else {"start_sha256": start_weights.sha256}
-    claim_folder(out, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
+    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
     weights = out / WEIGHTS
     if weights.exists():
         finished = load_net(weights).config
@@ -358,33 +340,27 @@ def train_phase_net(
     geometries = {direction: Geometry.of(opened.rig, Settings(direction=direction)) for direction in recipe.directions}
     folders = [opened] if extra_data is None else [opened, extra_data]
     samples, validation = _samples(recipe, folders, geometries, show)
-
-    def report(record: Record) -> None:
-        print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
-
-    with reproducible(cpu=True):
+    with training.reproducible(cpu=True):
         scored = validation[::VALIDATED_SHARE]
-        network = None if start_weights is None else start_weights.network
-        training = PhaseNetTraining(recipe, samples, scored, geometries, out, report, network)
-        training.run(started, minutes, show)
-        if not training.over:
-            return Trained(None, training.steps_done, 0.0, {})
-        network = training.network
-        raw_answers = [network_answers(network, s.scene.single(), geometries[s.direction]) for s in validation]
-        threshold = chosen_threshold(raw_answers, validation, opened.size[0] * opened.size[1])
-        lead = chosen_lead(raw_answers, validation, geometries)
-        answers = [with_lead(answer, lead) for answer in raw_answers]
-        rows = [score(a, s, geometries[s.direction], threshold) for a, s in zip(answers, validation, strict=True)]
-    means = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-    name = recipe.name if extra_data is None else f"{recipe.name}-fresh"
-    config = NetConfig(
-        name=name, title="Fringe order, mask and bounded phase correction", options=network.options,
+        first = None if start_weights is None else start_weights.network
+        ongoing = PhaseNetTraining(recipe, samples, scored, geometries, out, first, print_line)
+        ongoing.run(started, minutes, show)
+        if not ongoing.over:
+            return Trained(None, ongoing.steps_done, 0.0, {})
+        network = ongoing.network
+        answers = list(answers_of(network, validation, geometries))
+        threshold = chosen_threshold(answers, validation, opened.size[0] * opened.size[1])
+        lead = chosen_lead(answers, validation, geometries)
+        means = mean_scores((with_lead(one, lead) for one in answers), validation, geometries, threshold)
+    config = training.NetConfig(
+        name=recipe.name if extra_data is None else f"{recipe.name}-fresh",
+        title="Fringe order, mask and bounded phase correction", options=network.options,
         threshold=threshold, lead=lead, period_px={direction: g.route.period_px for direction, g in geometries.items()},
-        dataset_fingerprint=opened.fingerprint, benchmark=training_benchmark(opened.fingerprint), steps=recipe.steps,
-        recipe=described, validation=dict(means),
+        dataset_fingerprint=opened.fingerprint, benchmark=training.training_benchmark(opened.fingerprint),
+        steps=recipe.steps, recipe=described, validation=dict(means),
     )  # fmt: skip
     save_net(weights, network, config)
-    (out / CHECKPOINT).unlink(missing_ok=True)
+    (out / training.CHECKPOINT).unlink(missing_ok=True)
     return Trained(weights, recipe.steps, threshold, means)
 
 
@@ -392,14 +368,14 @@ def _samples(
     recipe: Recipe, folders: list[DatasetFolder], geometries: dict[Direction, Geometry], show: bool
 ) -> tuple[list[Sample], list[Sample]]:
     """Training samples and unions of all ``folders``, and validation samples of the first."""
-    training = [(folder, folder.samples("train")) for folder in folders]
+    train = [(folder, folder.samples("train")) for folder in folders]
     names = folders[0].samples("validation")
-    images = (1 + recipe.unions) * sum(len(of_folder) for _, of_folder in training) + len(names)
+    images = (1 + recipe.unions) * sum(len(of_folder) for _, of_folder in train) + len(names)
     samples: list[Sample] = []
     validation: list[Sample] = []
-    with Display("phase of the samples", images * len(geometries), show) as display:
+    with training.Display("phase of the samples", images * len(geometries), show) as display:
         for geometry in geometries.values():
-            for folder, of_folder in training:
+            for folder, of_folder in train:
                 samples += samples_of(folder, of_folder, geometry, display.advance)
                 samples += unions_of(folder, of_folder, geometry, recipe.unions, recipe.seed, display.advance)
             validation += samples_of(folders[0], names, geometry, display.advance)

@@ -51,11 +51,9 @@ class Candidates:
 @dataclass(frozen=True)
 class CalibrationLayer:
     """Constants of one rig and fringe direction for every pixel: float64 maps of the image's shape, or torch tensors.
-
     ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
     phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
-    ``rad_per_unit``: phase of one normalised projector unit, 2 pi f_p / P.
-    """
+    ``rad_per_unit``: phase of one normalised projector unit, 2 pi f_p / P."""
 
     infinity_rad: Any
     infinity_order: Any
@@ -67,10 +65,8 @@ class CalibrationLayer:
 
     @classmethod
     def of(cls, rig: Rig, direction: Direction, rays: Maps | None = None) -> "CalibrationLayer":
-        """The layer of ``rig`` for ``direction`` at all its camera's pixels, or at normalised ``rays`` (x, y).
-
-        Raises `DecodeError` for an unknown direction.
-        """
+        """The layer of ``rig`` for ``direction`` at all its camera's pixels, or at normalised ``rays`` (x, y). Raises
+        `DecodeError` for an unknown direction."""
         if direction not in DIRECTIONS:
             raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
         where = rig.camera.rays() if rays is None else rays

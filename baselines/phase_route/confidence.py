@@ -64,8 +64,7 @@ def clipped_share(capture: Capture, fit: FringeFit, inside: Mask, window: Window
 
 
 def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
-    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and its part that comes from the order; 0 outside
-    the mask."""
+    """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and the order's part of it; 0 outside the mask."""
     layer = observation.layer
     z = np.maximum(depth_mm, 1.0) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
@@ -81,9 +80,8 @@ def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray
 def reasons(
     observation: Observation, margin: Image, confidence: Image, depth_mm: NDArray, settings: Settings
 ) -> NDArray[np.uint8]:
-    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
-
-    A chooser that corrects the phase can leave the range that its orders were chosen for."""
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted. A chooser
+    that corrects the phase can leave the range that its orders were chosen for."""
     near, far = observation.rig.working_range_mm
     outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
     slopes, period_px = observation.slopes, observation.period_px

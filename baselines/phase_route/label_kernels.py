@@ -12,8 +12,7 @@ from fpp_ml_bench.machine import njit
 
 @njit
 def _send(costs, returned, phases, neighbour_phases, weight, limit, out):  # type: ignore[no-untyped-def]
-    """Message to a neighbour: ``costs`` minus the message ``returned`` by it, over a truncated linear jump; least entry
-    0."""
+    """Message to a neighbour, least entry 0: ``costs`` less the message ``returned``, over a truncated linear jump."""
     count = costs.shape[0]
     least = np.float32(np.inf)
     for b in range(count):

@@ -22,11 +22,9 @@ def least_energy(
     unary: Image, phase_rad: Image, link_x: Image, link_y: Image, limit_rad: float, rounds: int = ROUNDS
 ) -> tuple[NDArray[np.int32], Image]:
     """Index of the chosen candidate, int32 (H, W), and its margin to the second best, float32 (at most `LARGE`).
-
     ``unary`` (K, H, W): costs of K candidates; ``phase_rad`` (K, H, W): residual phase of each; ``link_x`` (H, W - 1)
     and ``link_y`` (H - 1, W): weight of the smoothness between neighbours, 0 where one of them is not object;
-    ``limit_rad``: a jump from which on it costs no more.
-    """
+    ``limit_rad``: a jump from which on it costs no more."""
     if numba_enabled():
         from fpp_ml_bench.baselines.phase_route.label_kernels import decide, iterate
     else:

@@ -84,8 +84,7 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
         [cc, m(by_cosine * sine)],
         [w00 - cc],
     ]
-    right = [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)]
-    answer = solve_symmetric(rows, right)
+    answer = solve_symmetric(rows, [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)])
     return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
 
 

@@ -27,13 +27,10 @@ that it is wrong; these factors correct that."""
 
 
 class PhaseMethod(Method):
-    """Depth from one or more sinusoids of one direction; options are those of `Settings`.
-
-    Raises `PredictionError` for an unknown option or an invalid value.
-    """
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`. Raises `PredictionError` for
+    an unknown option or an invalid value."""
 
     name = "phase"
-    crops = True
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         try:
@@ -129,10 +126,8 @@ def levels_of(steps: int) -> tuple[int, ...]:
 class FewestFrames(Method):
     """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
     third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
-    never read. Further options are those of `Settings`, ``frames`` aside.
-
-    Raises `PredictionError` for an error that is no positive number of mm, and as `PhaseMethod`.
-    """
+    never read. Further options are those of `Settings`, ``frames`` aside. Raises `PredictionError` for an error that is
+    no positive number of mm, and as `PhaseMethod`."""
 
     name = "phase"
     reports = True

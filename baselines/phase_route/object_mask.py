@@ -59,14 +59,11 @@ class Background:
 
 
 class EmptyScene:
-    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase
-    is calibrated, and so is its brightness except for ambient light, the lamp's strength and a slow change of its sheen
-    across the image, which are fitted.
-
-    ``white_grey`` and ``ambient_grey`` are the photometric calibration used where an image shows no background: the
-    grey level of a white pattern on a surface that faces the projector at the near end of the working range, and of a
-    surface in ambient light alone.
-    """
+    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase is
+    calibrated, and so is its brightness except for ambient light, the lamp's strength and a slow change of its sheen
+    across the image, which are fitted. ``white_grey`` and ``ambient_grey`` are the photometric calibration used where
+    an image shows no background: the grey level of a white pattern on a surface that faces the projector at the near
+    end of the working range, and of a surface in ambient light alone."""
 
     def __init__(self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float, ambient_grey: float):
         self.ambient_grey = ambient_grey

@@ -79,12 +79,10 @@ class Watch:
 
 @dataclass(frozen=True)
 class Capture:
-    """Captured fringes around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W).
-
-    ``greys``: float32 grey levels of each frame, whose fringe is shifted by ``shifts_rad``; ``background`` and
-    ``layer``: fit of the empty scene and calibration layer, both of the crop; ``period_px``: of the fringe in the
-    image. An image without an object has a crop of one pixel.
-    """
+    """Captured fringes around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W). ``greys``:
+    float32 grey levels of each frame, whose fringe is shifted by ``shifts_rad``; ``background`` and ``layer``: fit of
+    the empty scene and calibration layer, both of the crop; ``period_px``: of the fringe in the image. An image without
+    an object has a crop of one pixel."""
 
     rig: Rig
     period_px: float
@@ -104,13 +102,10 @@ class Capture:
 
 @dataclass(frozen=True)
 class Observation(Capture):
-    """Everything measured in a capture before the orders are chosen, maps (h, w).
-
-    ``inside``: object; ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in
-    [-pi, pi]; ``slopes``: change of the residual phase in rad a px along x and y; ``uncertainty_rad`` float32: of the
-    phase, order aside; ``clipped_share`` float32: of the window's weight, what is saturated; ``candidates``: the orders
-    that the working range allows.
-    """
+    """Everything measured in a capture before the orders are chosen, maps (h, w). ``inside``: object; ``fit``: phase,
+    not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in [-pi, pi]; ``slopes``: change of the residual
+    phase in rad a px along x and y; ``uncertainty_rad`` float32: of the phase, order aside; ``clipped_share`` float32:
+    of the window's weight, what is saturated; ``candidates``: the orders that the working range allows."""
 
     inside: Mask
     fit: FringeFit
@@ -122,12 +117,11 @@ class Observation(Capture):
 
 
 class Reason(IntEnum):
-    """Why a pixel should not be trusted; of several reasons the lowest.
-
-    BACKGROUND: the empty scene explains it. LOW_MODULATION: too dark for a fringe, in shadow or turned away.
-    SATURATED: clipped grey levels in the window. OUT_OF_RANGE: no order puts it in the working range. THIN: the object
-    is thinner than half a period there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves.
-    AMBIGUOUS: the candidate orders can't be told apart. UNSURE: the expected error alone is too large."""
+    """Why a pixel should not be trusted; of several reasons the lowest. BACKGROUND: the empty scene explains it.
+    LOW_MODULATION: too dark for a fringe, in shadow or turned away. SATURATED: clipped grey levels in the window.
+    OUT_OF_RANGE: no order puts it in the working range. THIN: the object is thinner than half a period there.
+    TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves. AMBIGUOUS: the candidate orders
+    can't be told apart. UNSURE: the expected error alone is too large."""
 
     MEASURED = 0
     BACKGROUND = 1
@@ -142,15 +136,12 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Measurement:
-    """Maps (H, W) of one image; NaN or 0 where there is no object.
-
-    ``wrapped_phase_rad`` float32 in [-pi, pi]; ``modulation_grey`` float32 grey levels; ``order`` int32;
-    ``candidates``: the orders that the working range allows; ``confidence`` float32, 0 to 1, computed from
-    ``expected_error_mm`` float32; ``order_doubt_mm``: the part of that error that comes from the order; ``depth_mm``
-    float32, 0 = background or masked; ``reason`` uint8, a `Reason`, given whether the pixel was masked or not;
-    ``counts``: pixels per reason; ``background_share``: of the image's tiles that calibrated its brightness;
-    ``seconds`` per stage.
-    """
+    """Maps (H, W) of one image; NaN or 0 where there is no object. ``wrapped_phase_rad`` float32 in [-pi, pi];
+    ``modulation_grey`` float32 grey levels; ``order`` int32; ``candidates``: the orders that the working range allows;
+    ``confidence`` float32, 0 to 1, computed from ``expected_error_mm`` float32; ``order_doubt_mm``: the part of that
+    error that comes from the order; ``depth_mm`` float32, 0 = background or masked; ``reason`` uint8, a `Reason`, given
+    whether the pixel was masked or not; ``counts``: pixels per reason; ``background_share``: of the image's tiles that
+    calibrated its brightness; ``seconds`` per stage."""
 
     wrapped_phase_rad: Image
     modulation_grey: Image

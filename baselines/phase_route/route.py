@@ -46,9 +46,7 @@ class PhaseRoute:
 
     def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
         """Depth and the maps behind it, from one captured fringe, uint8 (H, W), or from the frames of ``steps``.
-
-        ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape.
-        """
+        ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape."""
         observation = self.observe(image, mask)
         return self.conclude(observation, *self.choose(observation))
 
@@ -97,7 +95,6 @@ class PhaseRoute:
     def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
         ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
-
         Raises `DecodeError` for shapes that are not the crop's."""
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
@@ -124,18 +121,14 @@ class PhaseRoute:
         counts = np.bincount(reasons.ravel(), minlength=len(Reason))
         measurement = Measurement(
             wrapped_phase_rad=paste(observation.phase_rad, np.float32, np.nan),
-            modulation_grey=paste(observation.fit.brightness, np.float32, 0),
-            order=paste(order, np.int32, 0),
+            modulation_grey=paste(observation.fit.brightness, np.float32, 0), order=paste(order, np.int32, 0),
             candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
-            confidence=paste(sureness, np.float32, 0),
-            expected_error_mm=paste(error_mm, np.float32, 0),
+            confidence=paste(sureness, np.float32, 0), expected_error_mm=paste(error_mm, np.float32, 0),
             order_doubt_mm=paste(doubt_mm, np.float32, 0),
             depth_mm=paste(depth_mm if least == 0 else depth_mm * (sureness >= least), np.float32, 0),
-            reason=reasons,
-            counts={code.name.lower(): int(counts[code]) for code in Reason},
-            background_share=observation.background.share,
-            seconds=watch.seconds,
-        )
+            reason=reasons, counts={code.name.lower(): int(counts[code]) for code in Reason},
+            background_share=observation.background.share, seconds=watch.seconds,
+        )  # fmt: skip
         watch.done("depth")
         return measurement
 

@@ -30,9 +30,8 @@ DARK_SIGMAS = 4.0
 
 
 def steps_of(steps: int, frames: int) -> tuple[int, ...]:
-    """Which of ``steps`` phase shifts ``frames`` of them are: 0 alone, 0 and a third, or `choose_steps`.
-
-    Raises `PredictionError` for a number of frames that can't be had."""
+    """Which of ``steps`` phase shifts ``frames`` of them are: 0 alone, 0 and a third, or `choose_steps`. Raises
+    `PredictionError` for a number of frames that can't be had."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or not 1 <= frames <= steps:
         raise PredictionError(
             f"frames {frames!r}: expected a whole number from 1 to the {steps} sinusoids of a direction that were "
@@ -55,11 +54,9 @@ def pixel_fits(capture: Capture, scene: EmptyScene, mask: Mask | None, window: W
 
 
 def differs(capture: Capture, scene: EmptyScene) -> Mask:
-    """Pixels (h, w) whose grey levels the empty scene does not explain.
-
-    Tested for every pixel, and for means over a small square, which separate the plane from an object that happens to
-    be as bright; pixels that only the square's reach beyond the silhouette adds are removed.
-    """
+    """Pixels (h, w) whose grey levels the empty scene does not explain. Tested for every pixel, and for means over a
+    small square, which separate the plane from an object that happens to be as bright; pixels that only the square's
+    reach beyond the silhouette adds are removed."""
     greys, noise = capture.greys, capture.background.noise_grey**2
     alone, around = np.zeros(greys[0].shape, np.float32), np.zeros(greys[0].shape, np.float32)
     for grey, shift in zip(greys, capture.shifts_rad, strict=True):

@@ -1,9 +1,6 @@
-from .plan import MEAN as MEAN
-from .plan import PREDICTED as PREDICTED
 from .plan import RUNS as RUNS
 from .plan import Folders as Folders
 from .plan import Job as Job
-from .plan import Variant as Variant
 from .plan import planned as planned
 from .plan import variants as variants
 from .scoring import MAIN_KEY as MAIN_KEY

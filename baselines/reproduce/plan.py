@@ -19,6 +19,7 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics import paper_rig
 
 Report = Callable[[str], object]
+DepthRange = Literal["oracle", "predicted", "mean"] | None
 RUNS = Path("runs")
 
 
@@ -35,25 +36,13 @@ class Job:
         return any(row.startswith("multi_frame/") for row in self.rows)
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A way to use a trained network: the end of its row file's name, and the depth range that turns its output into mm
-    (see `fpp_ml_bench.baselines.networks.NetworkMethod`)."""
-
-    suffix: str
-    depth_range: Literal["oracle", "predicted", "mean"] | None
-
-
-METRIC, ORACLE = Variant("", None), Variant("", "oracle")
-PREDICTED, MEAN = Variant("-range-predicted", "predicted"), Variant("-range-mean", "mean")
-
-
-def variants(recipe: Recipe) -> tuple[Variant, ...]:
-    """The rows that a training gives. Individual normalisation is told the test sample's range, as in the paper; its
-    metric twins are not. With the background removed the object's mask is given anyway, and there are no twins."""
+def variants(recipe: Recipe) -> tuple[DepthRange, ...]:
+    """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
+    individual normalisation it is told the test sample's range, as in the paper; its metric twins are not. With the
+    background removed the object's mask is given anyway, and there are no twins."""
     if recipe.normalisation != "individual":
-        return (METRIC,)
-    return (ORACLE,) if recipe.background_removed else (ORACLE, PREDICTED, MEAN)
+        return (None,)
+    return ("oracle",) if recipe.background_removed else ("oracle", "predicted", "mean")
 
 
 @dataclass(frozen=True)
@@ -71,28 +60,21 @@ class Folders:
         """Best weights, with range heads where the normalisation needs them: the file to ship."""
         return self.runs / "weights" / f"{recipe.name}.safetensors"
 
-    def row(self, recipe: Recipe, variant: Variant) -> Path:
-        return self.rows / f"{self.preset}-{recipe.name}{variant.suffix}.json"
+    def row(self, recipe: Recipe, depth_range: DepthRange) -> Path:
+        twin = "" if depth_range in (None, "oracle") else f"-range-{depth_range}"
+        return self.rows / f"{self.preset}-{recipe.name}{twin}.json"
 
     def all_frames(self, recipe: Recipe) -> Path:
         # Not in the folder of the rows: there every .json is a row.
         return self.runs / "all-frames" / f"{self.preset}-{recipe.name}-all-frames.json"
-
-    def result(self, name: str) -> Path:
-        return self.runs / "results" / f"{name}.json"
-
-    def predictions(self, name: str) -> Path:
-        return self.runs / "predictions" / name
 
     def table(self, table: str) -> Path:
         return self.runs / f"{table}.md"
 
 
 def planned(tables: Sequence[str], preset: str) -> list[Job]:
-    """The trainings of ``tables``, each once, in the order of their first row.
-
-    Raises RecipeError for an unknown table, an unsound recipe, or two recipes that differ under one name.
-    """
+    """The trainings of ``tables``, each once, in the order of their first row. Raises RecipeError for an unknown table,
+    an unsound recipe, or two recipes that differ under one name."""
     jobs: dict[str, Job] = {}
     for name in (f"{table}/{row}" for table in tables for row in table_rows(table)):
         recipe = load_recipe(name, preset)
@@ -119,11 +101,9 @@ def default_folder(preset: str, size: int) -> Path:
 
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
     """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none: all 50 objects
-    and 52 frames, which every table shares.
-
-    Raises DatasetError for a dataset of another image size than the preset's, without a frame that a row needs, or
-    another dataset than the trainings in the runs folder; BuildError where it can't be built.
-    """
+    and 52 frames, which every table shares. Raises DatasetError for a dataset of another image size than the preset's,
+    without a frame that a row needs, or another dataset than the trainings in the runs folder; BuildError where it
+    can't be built."""
     sizes = {job.recipe.size: job.recipe.name for job in jobs}
     if len(sizes) != 1:
         raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
@@ -141,9 +121,9 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
             f"{height}; give another --data, or none to have it built, or build it: {command}"
         )
     for job in jobs:
-        if job.recipe.data_config not in opened.configs:
+        if job.recipe.frames not in opened.configs:
             raise DatasetError(
-                f"{folder}: {job.rows[0]} needs the frames of {job.recipe.data_config}, stored are those of "
+                f"{folder}: {job.rows[0]} needs the frames of {job.recipe.frames}, stored are those of "
                 f"{', '.join(opened.configs)}; build it with all frames: {command}"
             )
     _check_same_dataset(opened, folders)
@@ -160,7 +140,7 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
             write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
             return
         recorded = json.loads(record.read_text(encoding="utf-8"))
-        fingerprint, recorded_folder = recorded["fingerprint"], recorded["folder"]
+        fingerprint, folder = recorded["fingerprint"], recorded["folder"]
     except OSError as error:
         raise DatasetError(f"{record}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError):
@@ -170,5 +150,5 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
     if fingerprint != opened.fingerprint:
         raise DatasetError(
             f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
-            f"{str(fingerprint)[:8]} ({recorded_folder}); give that dataset as --data, or another --runs"
+            f"{str(fingerprint)[:8]} ({folder}); give that dataset as --data, or another --runs"
         )

@@ -24,7 +24,7 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.report import write_sheet
-from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_json, write_result
+from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
 from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
 from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
@@ -39,20 +39,19 @@ Scores = dict[str, float | None]
 def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
     """Predict the test split, time the method, score against the decoded depth (as in the paper), draw the picture
     beside the row. Files of an earlier run are replaced at the end: an interrupted run leaves nothing that is taken for
-    finished. Raises what predicting, timing and scoring raise.
-    """
+    finished. Raises what predicting, timing and scoring raise."""
     name = row.stem
-    predictions = folders.predictions(name)
+    predictions, results = folders.runs / "predictions" / name, folders.runs / "results"
     making = predictions.with_name(f"{name}.making")
     shutil.rmtree(making, ignore_errors=True)
     predict_split(opened, method, SPLIT, making)
     write_timing(making / SUBMISSION_FILE, time_method(opened, method, SPLIT, repeats=REPEATS))
     result = evaluate(making, opened, SPLIT, TARGET, mode=method.mode)
-    for folder in (folders.rows, folders.result(name).parent):
+    for folder in (folders.rows, results):
         folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(predictions, ignore_errors=True)
     making.rename(predictions)
-    write_result(result, folders.result(name))
+    write_result(result, results / f"{name}.json")
     write_sheet(result, opened, predictions, row.with_suffix(".png"))
     return result
 
@@ -90,17 +89,12 @@ class AllFrames(StrictModel):
 
 
 def score_all_frames(
-    opened: DatasetFolder,
-    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
-    frames: Sequence[int],
-    scoring: tuple[Units, Mode],
-    about: Mapping[str, str],
-) -> AllFrames:
+    opened: DatasetFolder, predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]], frames: Sequence[int],
+    scoring: tuple[Units, Mode], about: Mapping[str, str],
+) -> AllFrames:  # fmt: skip
     """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out) on every test sample and
-    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network.
-
-    Raises PredictionError for a prediction that is not finite, and what `scored_pair` raises.
-    """
+    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network. Raises PredictionError for a prediction that is
+    not finite, and what `scored_pair` raises."""
     samples = opened.samples(SPLIT)
     scores: dict[tuple[str, int], Scores] = {}
     for sample in samples:
@@ -132,12 +126,6 @@ def _mean(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each headline score over the rows that have it."""
     values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
     return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
-
-
-def write_all_frames(scores: AllFrames, path: Path) -> None:
-    """Write as JSON, complete or not at all. SubmissionError where the file can't be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(scores.model_dump(mode="json"), path)
 
 
 def read_all_frames(path: Path) -> AllFrames:

@@ -19,9 +19,10 @@ import torch
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads, torch_threads
 from fpp_ml_bench.baselines.reproduce import plan, scoring
-from fpp_ml_bench.baselines.reproduce.plan import PREDICTED, Folders, Job, Report, variants
+from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
+from fpp_ml_bench.evaluation.result import write_json
 from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -61,11 +62,9 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     """Do what the tables lack, and write them. After an interruption the same call continues.
 
     A training that diverges, or whose predictions can't be scored, does not keep the others from running
-    (`Outcome.failed`).
-    Raises TrainingError for a training folder of another recipe, or the paper's preset without a GPU; DatasetError for
-    a dataset of another size or fingerprint; BuildError when another process works in the same folder; and what
-    predicting and scoring raise.
-    """
+    (`Outcome.failed`). Raises TrainingError for a training folder of another recipe, or the paper's preset without a
+    GPU; DatasetError for a dataset of another size or fingerprint; BuildError when another process works in the same
+    folder; and what predicting and scoring raise."""
     folders = settings.folders
     jobs = plan.planned(settings.tables, folders.preset)
     check_run_folders(jobs, folders)
@@ -128,14 +127,14 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         _score_all_frames(recipe, model, settings, opened)
     about: dict[str, Setting] = {"recipe_digest": recipe.digest, "epochs_trained": run.epochs}
     about["training_seconds"] = round(run.seconds, 1)
-    for variant in variants(recipe):
-        path = folders.row(recipe, variant)
+    for depth_range in variants(recipe):
+        path = folders.row(recipe, depth_range)
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
         # A network's method sets torch's threads for the whole process; the next training needs its own.
         with torch_threads(torch.get_num_threads()):
-            method = NetworkMethod(model, variant.depth_range, remark=f"{recipe.preset} preset", about=about)
+            method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
             result = scoring.score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
@@ -147,11 +146,12 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     path = settings.folders.all_frames(recipe)
     if settings.only_missing and scoring.all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    frames, about = opened.sequence.config(recipe.data_config), {"recipe": recipe.name, "weights_sha256": model.sha256}
+    frames, about = opened.sequence.config(recipe.frames), {"recipe": recipe.name, "weights_sha256": model.sha256}
     scores = scoring.score_all_frames(
         opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
     )
-    scoring.write_all_frames(scores, path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(scores.model_dump(mode="json"), path)
     settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
 
 
@@ -209,7 +209,7 @@ def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, fo
     if keep and _made_from(target, source):
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    if PREDICTED in variants(recipe):
+    if "predicted" in variants(recipe):
         save_with_heads(run.weights, opened.path, target)
     else:
         write_atomically(target, run.weights.read_bytes())

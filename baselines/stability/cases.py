@@ -7,7 +7,6 @@ case states, never from the measured error.
 """
 
 import math
-import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +26,6 @@ Expects = Literal["number", "refusal", "either"]
 Run = Callable[..., Any]
 """Of a case; gives its `Outcome`, or anything where a refusal is expected."""
 Refusals = type[Exception] | tuple[type[Exception], ...]
-
 Floats = NDArray[np.float64]
 
 U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
@@ -53,12 +51,10 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The measurement of a case at its worst element, which has the largest error / bound.
-
-    ``error`` is None where the code refused to compute; ``note`` then holds its message. ``flagged``: share of elements
-    that were refused; ``may_flag``: largest share that theory allows (default: none where a number is expected, else
-    all). ``condition``: the condition number behind the bound, if any.
-    """
+    """The measurement of a case at its worst element, which has the largest error / bound. ``error`` is None where the
+    code refused to compute; ``note`` then holds its message. ``flagged``: share of elements that were refused;
+    ``may_flag``: largest share that theory allows (default: none where a number is expected, else all). ``condition``:
+    the condition number behind the bound, if any."""
 
     error: float | None
     bound: float = 0.0
@@ -82,12 +78,10 @@ def wrong(note: str = "") -> Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned or extreme case.
-
-    ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts`` describe in a line each what is
-    computed, its reference, and how the bound is derived. ``expects``: a number, a refusal, or either; ``refuses``: the
-    exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and are left out of a quick run.
-    """
+    """An ill-conditioned or extreme case. ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts``
+    describe in a line each what is computed, its reference, and how the bound is derived. ``expects``: a number, a
+    refusal, or either; ``refuses``: the exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and
+    are left out of a quick run."""
 
     group: str
     family: str
@@ -115,12 +109,15 @@ def parameter_text(value: Scalar) -> str:
     return short if float(short) == value or value != value else repr(value)
 
 
+@dataclass
 class Group:
-    """The cases of a group, in the order in which their families are declared."""
+    """The cases of a group, in the order in which their families are declared; ``reference`` and ``predicts`` are those
+    of the families that do not say theirs."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.cases: list[Case] = []
+    name: str
+    reference: str = ""
+    predicts: str = ""
+    cases: list[Case] = field(default_factory=list)
 
     def family(
         self, name: str, unit: str, /, *, about: str = "", expects: Expects | Callable[..., Expects] = "number",
@@ -131,13 +128,13 @@ class Group:
         against its reference; bound: how theory predicts it"."""
 
         def declare(run: Run) -> Run:
-            text = " ".join((about or run.__doc__ or "; against ; bound: ").split())
-            of, against, bound = re.split("; against |; bound: ", text)
+            of, _, bound = " ".join((about or run.__doc__ or "").split()).partition("; bound: ")
+            of, _, against = of.partition("; against ")
+            texts = of, against or self.reference, bound or self.predicts, unit
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
                 expected, call = expects(**given) if callable(expects) else expects, partial(run, **given)
-                rest = call, expected, refuses, heavy(**given)
-                self.cases.append(Case(self.name, name, given, of, against, bound, unit, *rest))
+                self.cases.append(Case(self.name, name, given, *texts, call, expected, refuses, heavy(**given)))
             return run
 
         return declare
@@ -155,10 +152,8 @@ def all_cases(groups: Iterable[str] = tuple(MODULES), quick: bool = False) -> li
 
 @dataclass(frozen=True)
 class Row:
-    """A case with its outcome and verdict; ``against`` is the reason where it failed.
-
-    ``cpu_seconds``: processor time of all threads, so that a busy machine does not show.
-    """
+    """A case with its outcome and verdict; ``against`` is the reason where it failed, ``cpu_seconds`` the processor
+    time of all threads, so that a busy machine does not show."""
 
     case: Case
     outcome: Outcome
@@ -206,10 +201,8 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
     return Verdict.WITHIN, ""
 
 
-def worst(
-    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, may_flag: float | None = None,
-    condition: float | None = None, note: str = "",
-) -> Outcome:  # fmt: skip
+def worst(errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, may_flag: float | None = None,
+          condition: float | None = None, note: str = "") -> Outcome:  # fmt: skip
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)

@@ -3,44 +3,33 @@ the phase methods on images without an object; the training metric."""
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
-from fpp_ml_bench.baselines.networks import build
-from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision
+from fpp_ml_bench.baselines.networks import RECENTRED_FROM, InstanceNorm, build, in_full_precision, torch_threads
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
 from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.evaluation.score import DepthScores
-from fpp_ml_bench.optics import Direction, paper_rig
+from fpp_ml_bench.optics import DIRECTIONS, Direction, paper_rig
 
-NETWORKS = Group("networks")
+NETWORKS = Group("networks", "Richardson's extrapolated differences", "difference of two extrapolations (the next "
+                 "order) + 64 u |f| sqrt(n) / h of rounding")  # fmt: skip
 ALPHA = 0.7
 SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
     "hformer": {"width": 8}, "pix2pix": {"width": 4},
 }  # fmt: skip
-"""Widths of the networks here: small, with the paper's layers."""
+"""Widths of the networks here: small, with the paper's layers. For images of 64 px one thread is faster."""
 _SHAPE = (2, 1, 24, 32)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread, which is faster for images of 64 px."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _seeded(seed: int) -> torch.Generator:
@@ -98,7 +87,7 @@ def _loss_and_gradient(name: str, prediction: Tensor, target: Tensor) -> tuple[f
 
 
 def _finite(*tensors: Tensor) -> bool:
-    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
+    return all(torch.isfinite(tensor).all() for tensor in tensors)
 
 
 @NETWORKS.family("zero residual", "1", name=LOSSES)
@@ -126,18 +115,17 @@ def empty_mask(name: str) -> Outcome:
     return worst(loss - exact, gamma(32, U32) * exact)
 
 
-@NETWORKS.family(
-    "loss magnitude", "1", expects=lambda name, scale: "either" if scale > 1e19 else "number",
-    name=("rmse", "hybrid_l1"), scale=(1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25),
-)  # fmt: skip
+@NETWORKS.family("loss magnitude", "1", expects=lambda name, scale: "either" if scale > 1e19 else "number",
+                 name=("rmse", "hybrid_l1"), scale=(1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25))  # fmt: skip
 def loss_size(name: str, scale: float, dtype: str = "float32") -> Outcome:
     """float32 loss of errors of this size; against exactly rounded sums in float64; bound: 2 (log2 n + 16) u32:
     pairwise sums; beyond 1e19 the square is infinite, and training stops"""
     prediction, target = _scene(scale, getattr(torch, dtype))
     value = float(_loss(name)(prediction, target))
     if not math.isfinite(value):
-        note = "an infinite loss, on which training stops"
-        return Outcome(None, flagged=1.0, note=note if _finite(prediction) else "infinite input gives an infinite loss")
+        finite = _finite(prediction)
+        note = "an infinite loss, on which training stops" if finite else "infinite input gives an infinite loss"
+        return Outcome(None, flagged=1.0, note=note)
     # torch sums in vectors and pairs, log2(n) + 16 roundings, doubled by the square
     exact = _exact_loss(name, prediction, target)
     return worst(value - exact, gamma(2 * (math.log2(prediction.numel()) + 16), U32) * exact)
@@ -151,10 +139,8 @@ NETWORKS.family(
 )(loss_size)  # fmt: skip
 
 
-@NETWORKS.family(
-    "constant input, instance norm", "1", dtype=("float32", "float64"),
-    value=(0.0, 0.1, 1.0, 255.0, 1e4, 1e8, 1e-30),
-)  # fmt: skip
+@NETWORKS.family("constant input, instance norm", "1", dtype=("float32", "float64"),
+                 value=(0.0, 0.1, 1.0, 255.0, 1e4, 1e8, 1e-30))  # fmt: skip
 def constant_input(value: float, dtype: str) -> Outcome:
     """output and gradient of a map without variance; against the bias; bound: d / sqrt(d^2 + eps), d = (log2 n + 16) u
     |value|, or that factor twice: the mean, centred again"""
@@ -211,52 +197,41 @@ def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1
     (gradient,) = torch.autograd.grad(function(inner), inner)
     slope = float((gradient * seed).sum())
     with torch.no_grad():
-        one, two, four = (
-            float(function(x + h * seed) - function(x - h * seed)) / (2 * h) for h in (step, 2 * step, 4 * step)
-        )
+        steps = step, 2 * step, 4 * step
+        one, two, four = (float(function(x + h * seed) - function(x - h * seed)) / (2 * h) for h in steps)
         value = abs(float(function(x)))
     first, second = (4 * one - two) / 3, (4 * two - four) / 3
     rounding = 64 * U64 * max(value, 1e-300) * math.sqrt(x.numel()) / step
     return worst(slope - first, abs(first - second) + abs(one - two) * 1e-3 + rounding)
 
 
-_RICHARDSON = (
-    "; against Richardson's extrapolated differences; bound: difference of two extrapolations (the next order) + 64 u "
-    "|f| sqrt(n) / h of rounding"
-)
-
-
-@NETWORKS.family("loss gradient", "1", about=f"directional derivative in float64{_RICHARDSON}", name=LOSSES)
+@NETWORKS.family("loss gradient", "1", name=LOSSES)
 def loss_gradient(name: str) -> Outcome:
+    """directional derivative in float64"""
     prediction, target = _scene(1.0, torch.float64)
     prediction = target + torch.sign(prediction - target) * (0.05 + (prediction - target).abs())  # away from |.|'s kink
     return directional(lambda x: _loss(name)(x, target), prediction)
 
 
-@NETWORKS.family(
-    "calibration layer gradient", "mm/rad", about=f"directional derivative of depth by phase{_RICHARDSON}",
-    direction=("horizontal", "vertical"),
-)  # fmt: skip
+@NETWORKS.family("calibration layer gradient", "mm/rad", direction=DIRECTIONS)
 def layer_gradient(direction: Direction) -> Outcome:
-    rig = paper_rig(16)
-    exact = CalibrationLayer.of(rig, direction)  # type: ignore[arg-type]
-    layer = exact.tensors(torch.float64)
-    total = torch.from_numpy(exact.absolute_phase(1800.0))
+    """directional derivative of depth by phase"""
+    exact = CalibrationLayer.of(paper_rig(16), direction)
+    layer, total = exact.tensors(torch.float64), torch.from_numpy(exact.absolute_phase(1800.0))
     order = torch.floor(total / (2 * math.pi) + 0.5)
     return directional(lambda phase: layer.depth_mm(phase, order).sum(), total - 2 * math.pi * order)
 
 
-@NETWORKS.family(
-    "network gradient", "1", about=f"directional derivative of the whole network, float64{_RICHARDSON}", name=NAMES
-)
-@one_thread()
+@NETWORKS.family("network gradient", "1", name=NAMES)
+@torch_threads(1)
 def network_gradient(name: str) -> Outcome:
+    """directional derivative of the whole network, float64"""
     network, seed = small_network(name).double().eval(), normal((1, 1, 64, 64), 10)
     return directional(lambda image: (network(image) * seed).sum(), uniform((1, 1, 64, 64), 9), step=1e-7)
 
 
 @NETWORKS.family("network in float32", "1", name=NAMES)
-@one_thread()
+@torch_threads(1)
 def network_single(name: str) -> Outcome:
     """output in float32; against the same weights in float64; bound: 16 x what rounding each weight and pixel once
     (2^-24) does: condition number x unit round-off"""
@@ -271,10 +246,8 @@ def network_single(name: str) -> Outcome:
     with torch.no_grad():
         exact, spread = network(x), torch.zeros(1, dtype=torch.float64)
         for generator in map(_seeded, (20, 21, 22)):
-            *inexact, image = (
-                values * (1 + U32 * (torch.rand(values.shape, generator=generator, dtype=torch.float64) * 2 - 1))
-                for values in (*weights, x)
-            )
+            draw = partial(torch.rand, generator=generator, dtype=torch.float64)
+            *inexact, image = (values * (1 + U32 * (draw(values.shape) * 2 - 1)) for values in (*weights, x))
             spread = torch.maximum(spread, (output(inexact, image) - exact).abs())
         output(weights, x)
         single = network.float()(x.float()).double()
@@ -284,7 +257,7 @@ def network_single(name: str) -> Outcome:
 
 
 @NETWORKS.family("network on a constant image", "count", name=NAMES, value=(0.0, 0.5, 1.0))
-@one_thread()
+@torch_threads(1)
 def network_constant(name: str, value: float) -> Outcome:
     """numbers that are not finite in output and gradients, training mode; against none; bound: exact"""
     network = small_network(name).train()
@@ -295,7 +268,7 @@ def network_constant(name: str, value: float) -> Outcome:
 
 
 @NETWORKS.family("network in half precision", "mm", name=NAMES, dtype=("bfloat16", "float16"))
-@one_thread()
+@torch_threads(1)
 def network_half(name: str, dtype: str) -> Outcome:
     """depth of the last layer under autocast, 1800 mm; against float64 on the same features; bound: 10 u32 x 1810 mm:
     the last layer runs in float32; bfloat16 alone would be 4 mm off"""
@@ -313,24 +286,21 @@ def network_half(name: str, dtype: str) -> Outcome:
     return worst((depth.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
 
 
-@NETWORKS.family(
-    "phase route", "mm", expects="either", refuses=FppBenchError, name=("phase", "phase-net"),
-    image=("black", "white", "constant", "noise", "checkerboard"),
-)  # fmt: skip
-@one_thread()
+@NETWORKS.family("phase route", "mm", expects="either", refuses=FppBenchError, name=("phase", "phase-net"),
+                 image=("black", "white", "constant", "noise", "checkerboard"))  # fmt: skip
+@torch_threads(1)
 def phase_output(name: str, image: str) -> Outcome:
     """depth of an image without an object; against a depth in the working range and its slack of 15 mm, or a reason why
     it is invalid; bound: exact: no other depth may count as measured"""
     rig = paper_rig(480)
     shape = (rig.camera.width, rig.camera.width)
-    levels: ArrayLike = {"black": 0, "white": 255, "constant": 128}.get(image, 0)
-    if image == "noise":
-        levels = np.random.default_rng(1).uniform(0, 256, shape)
-    elif image == "checkerboard":
-        levels = 255 * (np.indices(shape).sum(axis=0) % 2)
+    levels = {
+        "black": 0, "white": 255, "constant": 128, "noise": np.random.default_rng(1).uniform(0, 256, shape),
+        "checkerboard": 255 * (np.indices(shape).sum(axis=0) % 2),
+    }[image]  # fmt: skip
     phase_method = load_method(name, rig)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
-    frames[phase_method.frames_used[0]] = np.broadcast_to(levels, shape).astype(np.uint8)
+    frames[phase_method.frames_used[0]] = np.broadcast_to(np.asarray(levels), shape).astype(np.uint8)
     measurement = phase_method.measure(frames)  # type: ignore[attr-defined]
     near, far = rig.working_range_mm
     slack, depth = Settings().slack_mm * (1 + U32), measurement.depth_mm
@@ -353,9 +323,8 @@ def metric_scale(scale: float) -> Outcome:
     return worst(error, gamma(460) + 2 * 2.0**-1074 / max(exact_mm, 2.0**-1074))
 
 
-@NETWORKS.family(
-    "training metric, not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, 1e200)
-)
+@NETWORKS.family("training metric, not a number", "mm", expects="refusal", refuses=PredictionError,
+                 value=(math.nan, math.inf, 1e200))  # fmt: skip
 def metric_refuses(value: float) -> None:
     """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
     prediction = torch.tensor([[[1800.0, value]]], dtype=torch.float64)

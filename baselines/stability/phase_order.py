@@ -14,8 +14,9 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.machine import numba_enabled
 
-DIRECTIONS: tuple[optics.Direction, ...] = ("vertical", "horizontal")
-PHASE, ORDER = Group("phase"), Group("order")
+PHASE = Group("phase", "the phase that the frames were made from")
+ORDER = Group("order", "the coordinate that the frames were made from",
+              "P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period")  # fmt: skip
 MEAN, MODULATION = 127.5, 100.0
 MODULATIONS = (100.0, 30.0, 10.0, 5.0, 3.0, 1.0, 0.3, 0.1)
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
@@ -45,10 +46,8 @@ def phase_error(frames: NDArray, deltas: NDArray | None = None) -> Floats:
 
 
 def frame_gain(steps: int) -> float:
-    """max over phi of (2/N) sum |sin(phi + delta_n)|: largest change of (C, S) by errors of one grey level per frame.
-
-    2/N times 2 / sin(pi/N) for even N and 1 / sin(pi/2N) for odd N, about 4/pi.
-    """
+    """max over phi of (2/N) sum |sin(phi + delta_n)|: largest change of (C, S) by errors of one grey level per frame;
+    2/N times 2 / sin(pi/N) for even N and 1 / sin(pi/2N) for odd N, about 4/pi."""
     return 2 / steps * (2 / math.sin(math.pi / steps) if steps % 2 == 0 else 1 / math.sin(math.pi / (2 * steps)))
 
 
@@ -72,14 +71,10 @@ def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: i
     return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
-def direction_levels(
-    rig: optics.Rig, coordinate_px: NDArray, direction: optics.Direction = "vertical", mean: float = MEAN,
-    modulation: float = MODULATION,
-) -> Floats:  # fmt: skip
+def direction_levels(rig: optics.Rig, coordinate_px: NDArray, direction: optics.Direction = "vertical",
+                     mean: float = MEAN, modulation: float = MODULATION) -> Floats:  # fmt: skip
     """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,); float64 (N + bits, n).
-
-    A pixel sees one projector pixel's Gray code, the one its coordinate rounds to.
-    """
+    A pixel sees one projector pixel's Gray code, the one its coordinate rounds to."""
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
     waves = sinusoids(2 * np.pi * coordinate_px / pitch, rig.sequence.steps, mean, modulation)[:, 0]
     code = optics.binary_to_gray(optics.cell_of(np.rint(coordinate_px), pitch))
@@ -87,14 +82,13 @@ def direction_levels(
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
 
-def plane_stack(
-    rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
-) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
+def plane_stack(rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN,
+                modulation: float = MODULATION) -> tuple[list[NDArray[np.uint8] | None], NDArray]:  # fmt: skip
     """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
     x, y = rig.camera.rays()
     exact = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
-    for direction, coordinate_px in zip(DIRECTIONS, exact, strict=True):
+    for direction, coordinate_px in zip(optics.AXES, exact, strict=True):
         levels = grey(direction_levels(rig, coordinate_px.ravel(), direction, mean, modulation))
         indices = [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)]
         for index, level in zip(indices, levels, strict=True):
@@ -116,9 +110,8 @@ def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: f
     return worst(error_px, _rounding_px(rig) + rounding_px, flagged)
 
 
-def _decoded_phase(
-    mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
-) -> tuple[Floats, NDArray]:
+def _decoded_phase(mean: float = MEAN, modulation: float = MODULATION, count: int = 2000,
+                   noise_grey: float = 0.0) -> tuple[Floats, NDArray]:  # fmt: skip
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
     rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, count)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
@@ -164,23 +157,20 @@ def _expects(modulation: float, spread: float) -> cases.Expects:
     return "number" if modulation > decoding.MIN_MODULATION else "refusal"
 
 
-@PHASE.family(
-    "modulation, 8-bit frames", "rad", expects=lambda modulation: _expects(modulation, ROUNDING), modulation=MODULATIONS
-)
+@PHASE.family("modulation, 8-bit frames", "rad", modulation=MODULATIONS,
+              expects=lambda modulation: _expects(modulation, ROUNDING))  # fmt: skip
 def modulation_8bit(modulation: float) -> Outcome:
-    """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: asin(g /
-    2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused"""
+    """absolute phase by the decoder, 8-bit frames; bound: asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in
+    every frame; under 5 levels refused"""
     error, flagged = _decoded_phase(modulation=modulation)
     return worst(error, worst_angle(ROUNDING, modulation), flagged)
 
 
-@PHASE.family(
-    "modulation, noise of 1 grey level", "rad", modulation=MODULATIONS,
-    expects=lambda modulation: _expects(modulation, 6 * NOISE),  # up to six sigma off the limit
-)  # fmt: skip
+@PHASE.family("modulation, noise of 1 grey level", "rad", modulation=MODULATIONS,  # up to six sigma off the limit:
+              expects=lambda modulation: _expects(modulation, 6 * NOISE))  # fmt: skip
 def noise(modulation: float) -> Outcome:
-    """rms error of absolute phase, 20,000 pixels; against the phase that the frames were made from; bound: sqrt(2/N)
-    sigma / B with sigma^2 = 1 + 1/12, second order 2 sigma_phi^2, 4 standard errors"""
+    """rms error of absolute phase, 20,000 pixels; bound: sqrt(2/N) sigma / B with sigma^2 = 1 + 1/12, second order 2
+    sigma_phi^2, 4 standard errors"""
     error, flagged = _decoded_phase(modulation=modulation, count=20_000, noise_grey=1.0)
     sigma, unflagged = NOISE / modulation, error[~flagged]
     if not unflagged.size:
@@ -211,8 +201,8 @@ def _clipped(share: float, steps: int, highest: int) -> tuple[float, float, floa
 
 @PHASE.family("saturation, phase alone", "rad", steps=(18, 3), share=SHARES)
 def saturation_phase(share: float, steps: int) -> Outcome:
-    """wrapped phase of frames clipped in a share of the period; against the phase that the frames were made from;
-    bound: asin(sum |c_(kN-1)| + |c_(kN+1)| over c_1): aliased harmonics of a clipped cosine, closed form"""
+    """wrapped phase of frames clipped in a share of the period; bound: asin(sum |c_(kN-1)| + |c_(kN+1)| over c_1):
+    aliased harmonics of a clipped cosine, closed form"""
     highest = 4000
     mean, leak, left = _clipped(share, steps, highest)
     frames = np.minimum(sinusoids(phases(), steps, mean), 255.0)
@@ -220,13 +210,11 @@ def saturation_phase(share: float, steps: int) -> Outcome:
     return worst(phase_error(frames), worst_angle(leak + rest, left) + 100 * U64)
 
 
-@PHASE.family(
-    "saturation, decoder", "rad", share=SHARES,  # clipped are floor(18 share) frames, or one more
-    expects=lambda share: ("number", "number", "either", "refusal")[min(math.floor(18 * share), 3)],
-)  # fmt: skip
+@PHASE.family("saturation, decoder", "rad", share=SHARES,  # clipped are floor(18 share) frames, or one more
+              expects=lambda share: ("number", "number", "either", "refusal")[min(int(18 * share), 3)])  # fmt: skip
 def saturation_decoder(share: float) -> Outcome:
-    """absolute phase by the decoder, 8-bit frames; against the phase that the frames were made from; bound: as above,
-    plus half a grey level; more than 2 clipped frames of 18 must be refused"""
+    """absolute phase by the decoder, 8-bit frames; bound: as above, plus half a grey level; more than 2 clipped frames
+    of 18 must be refused"""
     mean, leak, left = _clipped(share, 18, 500)
     error, flagged = _decoded_phase(mean)
     return worst(error, worst_angle(MODULATION * leak + ROUNDING, MODULATION * left), flagged)
@@ -234,8 +222,8 @@ def saturation_decoder(share: float) -> Outcome:
 
 @PHASE.family("gamma", "rad", steps=(18, 4, 3), gamma=(1.0, 1.5, 2.2, 3.0))
 def gamma_bend(gamma: float, steps: int) -> Outcome:
-    """wrapped phase of frames 255 (I / 255)^gamma; against the phase that the frames were made from; bound: asin(sum of
-    the harmonics kN +- 1 over the first), which N steps alias with the fringe"""
+    """wrapped phase of frames 255 (I / 255)^gamma; bound: asin(sum of the harmonics kN +- 1 over the first), which N
+    steps alias with the fringe"""
     frames = 255.0 * (sinusoids(phases(), steps, MEAN, 120.0) / 255.0) ** gamma
     theta = 2 * np.pi * np.arange(1 << 14) / (1 << 14)
     harmonics = np.abs(np.fft.rfft((0.5 + 120.0 / 255.0 * np.cos(theta)) ** gamma)) / theta.size
@@ -245,8 +233,8 @@ def gamma_bend(gamma: float, steps: int) -> Outcome:
 
 @PHASE.family("quantisation", "rad", steps=(18, 3), bits=(1, 2, 3, 4, 6, 8, 10, 12, 14, 16))
 def quantisation(bits: int, steps: int) -> Outcome:
-    """wrapped phase of frames of this bit depth, B = 100; against the phase that the frames were made from; bound:
-    asin(q g / 2B), q = 255 / (2^bits - 1); pi / N where one bit leaves 2N states or N"""
+    """wrapped phase of frames of this bit depth, B = 100; bound: asin(q g / 2B), q = 255 / (2^bits - 1); pi / N where
+    one bit leaves 2N states or N"""
     levels = 2**bits - 1
     frames = np.rint(sinusoids(phases(), steps) / 255.0 * levels) * (255.0 / levels)
     bound = worst_angle(255.0 / levels / 2 * frame_gain(steps))
@@ -255,15 +243,14 @@ def quantisation(bits: int, steps: int) -> Outcome:
 
 @PHASE.family("few steps", "rad", steps=(3, 4, 5, 6, 7, 9, 12, 18))
 def few_steps(steps: int) -> Outcome:
-    """wrapped phase of 8-bit frames, B = 100; against the phase that the frames were made from; bound: asin(g / 2B), g
-    = max (2/N) sum |sin|"""
+    """wrapped phase of 8-bit frames, B = 100; bound: asin(g / 2B), g = max (2/N) sum |sin|"""
     return worst(phase_error(grey(sinusoids(phases(), steps))), worst_angle(0.5 * frame_gain(steps)))
 
 
 @PHASE.family("unequal steps", "rad", chosen=(3, 4, 5, 7, 8, 11, 13, 17))
 def uneven_steps(chosen: int) -> Outcome:
-    """wrapped phase of this number of 18 steps, 8-bit frames; against the phase that the frames were made from; bound:
-    asin(g' / 2B), g' = max over directions of sum |least-squares weight|"""
+    """wrapped phase of this number of 18 steps, 8-bit frames; bound: asin(g' / 2B), g' = max over directions of sum
+    |least-squares weight|"""
     deltas = 2 * np.pi * np.array(decoding.choose_steps(18, chosen)) / 18
     model = np.stack([np.ones(chosen), np.cos(deltas), np.sin(deltas)], axis=1)
     solve = np.linalg.inv(model.T @ model) @ model.T
@@ -272,10 +259,9 @@ def uneven_steps(chosen: int) -> Outcome:
     return worst(phase_error(grey(sinusoids(phases(), deltas)), deltas), worst_angle(0.5 * float(shift) * (1 + 1e-6)))
 
 
-@PHASE.family(
-    "steps close together", "rad", spread_rad=(1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8), refuses=DecodeError,
-    expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
-)  # fmt: skip
+@PHASE.family("steps close together", "rad", refuses=DecodeError,
+              expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
+              spread_rad=(1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8))  # fmt: skip
 def close_steps(spread_rad: float) -> Outcome:
     """wrapped phase at shifts 0, s, 2 s; against least squares of the same frames in 50 digits; bound: 8 N u cond (A +
     B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused"""
@@ -318,29 +304,25 @@ PHASE.family(
 
 @PHASE.family("repeated frame", "rad", steps=(18, 9, 4))
 def repeated_frame(steps: int) -> Outcome:
-    """wrapped phase where frame 1 is frame 0 again; against the phase that the frames were made from; bound: asin((2/N)
-    2 sin(pi/N)): one frame off by 2 B sin(pi/N) at most"""
+    """wrapped phase where frame 1 is frame 0 again; bound: asin((2/N) 2 sin(pi/N)): one frame off by 2 B sin(pi/N) at
+    most"""
     frames = sinusoids(phases(), steps)
     frames[1] = frames[0]
     return worst(phase_error(frames), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
 
 
-@PHASE.family(
-    "pitch", "px", pitch_px=(2.5, 3.9, 4.0, 5.3, 9.0, 18.0, 36.7, 100.0, 456.0, 912.0, 1000.0), refuses=RigError,
-    expects=lambda pitch_px: "number" if 4 <= pitch_px <= 912 else "refusal",
-)  # fmt: skip
+@PHASE.family("pitch", "px", refuses=RigError, expects=lambda pitch_px: "number" if 4 <= pitch_px <= 912 else "refusal",
+              pitch_px=(2.5, 3.9, 4.0, 5.3, 9.0, 18.0, 36.7, 100.0, 456.0, 912.0, 1000.0))  # fmt: skip
 def pitch(pitch_px: float) -> Outcome:
     """projector coordinate by the decoder, 8-bit frames; against the coordinate of the pixel; bound: P / 2 pi asin(g /
     2B) over the whole pattern; under 4 px or beyond the pattern refused"""
-    rig = coded_rig(pitch_px)
-    positions_px = np.linspace(2.0, 909.0, 20_000)
+    rig, positions_px = coded_rig(pitch_px), np.linspace(2.0, 909.0, 20_000)
     return _decoded(rig, direction_levels(rig, positions_px), positions_px)
 
 
 @ORDER.family("on a Gray edge", "px", pitch_px=(4.0, 18.0, 37.3), blend=(0.0, 0.25, 0.5, 0.75, 1.0))
 def edge_blend(pitch_px: float, blend: float) -> Outcome:
-    """coordinate of pixels that see both cells, at every edge of the code; against the coordinate that the frames were
-    made from; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
+    """coordinate of pixels that see both cells, at every edge of the code"""
     rig = coded_rig(pitch_px)
     cells = optics.cell_count(rig.pattern_length("vertical"), pitch_px)
     edges = np.ceil(np.arange(1, cells) * (pitch_px / 2))
@@ -353,8 +335,7 @@ def edge_blend(pitch_px: float, blend: float) -> Outcome:
 
 @ORDER.family("phase at +-pi", "px", pitch_px=(4.0, 18.0, 100.0), bit_noise=(0.0, 0.7))
 def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
-    """coordinate of pixels in the middle of every period; against the coordinate that the frames were made from; bound:
-    P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
+    """coordinate of pixels in the middle of every period"""
     rig = coded_rig(pitch_px)
     periods = int(rig.pattern_length("vertical") / pitch_px) - 1
     positions_px = (np.arange(periods) + 0.5) * pitch_px  # where the sign of the sine is arbitrary
@@ -363,11 +344,8 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
     return _decoded(rig, levels, positions_px)
 
 
-@ORDER.family(
-    "order of a phase at the wrap", "rad", phase_rad=(
-        -math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2,
-    ),
-)  # fmt: skip
+@ORDER.family("order of a phase at the wrap", "rad", phase_rad=(
+    -math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2))  # fmt: skip
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
@@ -409,7 +387,7 @@ def order_range() -> Outcome:
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 
-@ORDER.family("flipped bit, both directions", "mm", expects="either", direction=DIRECTIONS, bit=range(7))
+@ORDER.family("flipped bit, both directions", "mm", expects="either", direction=optics.AXES, bit=range(7))
 def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
     """depth of a plane with one Gray bit inverted in the whole image; against the plane, 1800 mm; bound: 8-bit frames,
     by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line"""
@@ -425,7 +403,7 @@ def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
 @ORDER.family("flipped bit, one direction", "px", expects="either", bit=range(7))
 def flipped_bit_alone(bit: int) -> Outcome:
     """coordinate with one bit inverted, and the flagged pixels; against integer arithmetic on the misread cell: error
-    in whole periods, or refused; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period"""
+    in whole periods, or refused"""
     rig, pitch = coded_rig(), 18.0
     positions_px = np.arange(3.0, 909.0, 0.25)
     levels, row = direction_levels(rig, positions_px), rig.sequence.steps + bit
@@ -465,8 +443,8 @@ def cell_off_pattern(cell: int) -> Outcome:
 
 @ORDER.family("code length", "px", bits=(1, 2, 7, 10, 13, 15))
 def code_length(bits: int) -> Outcome:
-    """coordinate in every cell of a full code, pitch 4 px, 3 steps; against the coordinate that the frames were made
-    from; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period plus 8 u w"""
+    """coordinate in every cell of a full code, pitch 4 px, 3 steps; bound: P / 2 pi asin(g / 2B): 8-bit frames alone; a
+    slip would be a whole period plus 8 u w"""
     # 15 bits fill the compiled decoder's 16-bit integers.
     rig = coded_rig(4.0, steps=3, length=min(65536, 2**bits * 2))
     positions_px = np.arange(2**bits) * 2 + 0.5

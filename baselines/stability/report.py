@@ -69,12 +69,10 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
         part = [row for row in rows if group in (row.case.group, "all")]
-        groups[group] = {
-            "cases": len(part),
-            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
-            "largest_ratio": number(largest_ratio(part)),
-            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
-        }
+        verdicts = {verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict}
+        cpu_s = round(sum(row.cpu_seconds for row in part), 2)
+        ratio = number(largest_ratio(part))
+        groups[group] = {"cases": len(part), **verdicts, "largest_ratio": ratio, "cpu_seconds": cpu_s}
     return groups
 
 
@@ -92,29 +90,22 @@ def row_content(row: Row) -> dict[str, Any]:
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """The whole run as JSON values."""
     return {
-        "schema_version": "1.0.0",
-        "summary": summary(rows),
-        "compiled_decoder": numba_enabled(),
-        "environment": environment().model_dump(mode="json"),
-        "cases": [row_content(row) for row in rows],
-    }
+        "schema_version": "1.0.0", "summary": summary(rows), "compiled_decoder": numba_enabled(),
+        "environment": environment().model_dump(mode="json"), "cases": [row_content(row) for row in rows],
+    }  # fmt: skip
 
 
-def level(row: Row) -> str:
-    """Which of `LEVELS` a case has."""
-    *within, refused, failed = LEVELS
-    if row.verdict is not Verdict.WITHIN:
-        return failed if row.verdict is Verdict.FAIL else refused
-    return within[1 + bisect_right(_LIMITS, row.outcome.ratio) if row.outcome.ratio else 0]
-
-
-def row_text(row: Row) -> str:
-    """A case and its result in a line."""
+def square_of(row: Row) -> tuple[str, str]:
+    """Colour of a case's square, and the case and its result in a line."""
     outcome, result = row.outcome, row.outcome.note
+    *within, refused, failed = LEVELS.values()
+    colour = failed if row.verdict is Verdict.FAIL else refused
+    if row.verdict is Verdict.WITHIN:
+        colour = within[1 + bisect_right(_LIMITS, outcome.ratio) if outcome.ratio else 0]
     if outcome.error is not None:
         result = f"error {short(outcome.error)} {row.case.unit}, bound {short(outcome.bound)}"
         result += f", {outcome.flagged:.0%} masked" if outcome.flagged else ""
-    return f"{row.case.name}: {row.verdict.value}, {result}"
+    return colour, f"{row.case.name}: {row.verdict.value}, {result}"
 
 
 def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
@@ -138,11 +129,11 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
             axes.text(left + _LABEL - 0.4, y + 0.5, family, fontsize=8, va="center", ha="right", color="#333333")
             for place, row in enumerate(members):
                 down, across = divmod(place, _ACROSS)
-                corner = left + _LABEL + across, y + down
-                axes.add_patch(Rectangle(corner, *_FILLED, color=LEVELS[level(row)], lw=0))
+                corner, (colour, text) = (left + _LABEL + across, y + down), square_of(row)
+                axes.add_patch(Rectangle(corner, *_FILLED, color=colour, lw=0))
                 opposite = corner[0] + _FILLED[0], corner[1] + _FILLED[1]
                 pixels = (f"{px * _SQUARE_PX:.0f},{line * _LINE_PX:.0f}" for px, line in (corner, opposite))
-                squares.append((",".join(pixels), row_text(row)))
+                squares.append((",".join(pixels), text))
             y += down + 1
         ends[column] = y + 0.4
     axes.set_xlim(0, 2 * _COLUMN)
@@ -156,8 +147,11 @@ def heat_maps(rows: Sequence[Row]) -> tuple[bytes, list[tuple[str, str]]]:
     return stream.getvalue(), squares
 
 
-def report_page(rows: Sequence[Row], content: dict[str, Any], picture: bytes, squares: list[tuple[str, str]]) -> str:
-    """The page as HTML without external resources."""
+def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write the page (HTML without external resources), the data and the picture into ``folder``, which is made; their
+    paths. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    content, (picture, squares) = document(rows), heat_maps(rows)
     machine, hardware = content["environment"], content["environment"]["hardware"]
     about = [hardware["cpu"], f"{hardware['cores']} cores", f"Python {machine['python']}"]
     about += [f"{name} {version}" for name, version in machine["packages"].items()]
@@ -167,15 +161,8 @@ def report_page(rows: Sequence[Row], content: dict[str, Any], picture: bytes, sq
         short=short, parameter_text=parameter_text, largest_ratio=largest_ratio,
         counts=lambda members: Counter(row.verdict.value for row in members),
     )  # fmt: skip
-    return page("Numerical stability", body, style=_STYLE)
-
-
-def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write the page, the data and the picture into ``folder``, which is made; their paths. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    content, (picture, squares) = document(rows), heat_maps(rows)
     files = {
-        folder / "index.html": report_page(rows, content, picture, squares).encode("utf-8"),
+        folder / "index.html": page("Numerical stability", body, style=_STYLE).encode("utf-8"),
         folder / "stability.json": (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"),
         folder / "stability.png": picture,
     }

@@ -33,15 +33,13 @@ def rays_of(hits: render.Hits) -> tuple[Floats, ...]:
 
 def image(hits: render.Hits) -> Floats:
     """Depth (H, W) in metres, 0 = nothing."""
-    depth = np.zeros(RIG.camera.width * RIG.camera.height)
-    depth[hits.pixels] = hits.depth_m
-    return depth.reshape(RIG.camera.height, RIG.camera.width)
+    depth = np.zeros((RIG.camera.height, RIG.camera.width))
+    depth.flat[hits.pixels] = hits.depth_m
+    return depth
 
 
-@SCENES.family(
-    "wall edge-on", "m", expects=lambda off_deg: "number" if off_deg >= 1 else "either",
-    off_deg=(90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0),
-)  # fmt: skip
+@SCENES.family("wall edge-on", "m", expects=lambda off_deg: "number" if off_deg >= 1 else "either",
+               off_deg=(90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0))  # fmt: skip
 def edge_on(off_deg: float) -> Outcome:
     """depth of a wall at this angle to the line of sight; against ray and plane in 80-bit arithmetic; bound: 264 u
     kappa, kappa = sum |n d| over |n . d|; never beyond the wall's own extent"""
@@ -56,9 +54,8 @@ def edge_on(off_deg: float) -> Outcome:
     if not len(hits.pixels):
         # The whole wall is then thinner than the gap between two pixel columns.
         width_px = float(abs(corners[0][0] / corners[0][2] - corners[1][0] / corners[1][2]) * RIG.camera.fx)
-        if width_px < 1:
-            return Outcome(None, flagged=1.0, note=f"no pixel sees it: it is {width_px:.2g} px wide")
-        return wrong("a wall of a pixel's width is not seen")
+        unseen = Outcome(None, flagged=1.0, note=f"no pixel sees it: it is {width_px:.2g} px wide")
+        return unseen if width_px < 1 else wrong("a wall of a pixel's width is not seen")
     x, y = rays_of(hits)
     wide = np.asarray(corners, dtype=np.longdouble)
     normal = np.cross(wide[1] - wide[0], wide[2] - wide[0])
@@ -97,11 +94,9 @@ def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[Floats, NDArra
     return np.asarray(mesh.vertices) + AHEAD_M, np.asarray(mesh.faces, np.int32)
 
 
-@SCENES.family(
-    "broken mesh", "m",
-    kind=("degenerate triangles", "collinear triangles", "flipped triangles", "every triangle twice",
-          "non-manifold fin", "loose vertices", "open back"),
-)  # fmt: skip
+@SCENES.family("broken mesh", "m", kind=(
+    "degenerate triangles", "collinear triangles", "flipped triangles", "every triangle twice", "non-manifold fin",
+    "loose vertices", "open back"))  # fmt: skip
 def broken(kind: str) -> Outcome:
     """outline, depth and normals of a ball with this defect; against the ball without it; bound: same outline; depth 64
     u x 1.8 m x condition of the most oblique facet"""
@@ -203,12 +198,10 @@ def misplaced(name: str) -> None:
     render.place(mesh, "A0", RIG, "fixed", 0)
 
 
-SCENES.family(
-    "behind the camera",
-    "m",
-    expects="refusal",
-    about="pixels of a wall behind the camera; against none; bound: must see nothing",
-)(lambda: worst(0, flagged=not seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).pixels.size))
+@SCENES.family("behind the camera", "m", expects="refusal")
+def behind_camera() -> Outcome:
+    """pixels of a wall behind the camera; against none; bound: must see nothing"""
+    return worst(0, flagged=not seen([[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]).pixels.size)
 
 
 @SCENES.family("light at distance 0", "grey")

@@ -13,7 +13,9 @@ from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mas
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import score
 
-NORMALISATION, METRICS = Group("normalisation"), Group("metrics")
+NORMALISATION = Group("normalisation")
+METRICS = Group("metrics", "exact sums", "6 sqrt(9600) u: a block of 9600 px in float64, random roundings; blocks are "
+                "added exactly")  # fmt: skip
 NAMES = ("raw", "global", "individual")
 STORED = ("float64", "float32")
 SPANS = (1e-6, 1e-3, 1.0, 200.0, 1e3, 1e6)
@@ -28,9 +30,8 @@ _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
 def depth_map(kind: str, low_mm: float, span_mm: float) -> Floats:
     """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm + span_mm``."""
     depth = np.zeros((24, 24))
-    inside = {"one pixel": np.s_[7:8, 11:12], "flat plane": np.s_[4:20, 4:20], "full frame": np.s_[:, :],
-              "part": np.s_[3:21, 5:19], "empty": np.s_[:0, :0]}[kind]  # fmt: skip
-    part = depth[inside]
+    part = depth[{"one pixel": np.s_[7:8, 11:12], "flat plane": np.s_[4:20, 4:20], "full frame": np.s_[:, :],
+                  "part": np.s_[3:21, 5:19], "empty": np.s_[:0, :0]}[kind]]  # fmt: skip
     sloped = kind in ("full frame", "part")
     part[...] = low_mm + (span_mm * np.linspace(0, 1, part.size).reshape(part.shape) if sloped else 0.0)
     return depth
@@ -46,31 +47,25 @@ def round_trip(name: Normalisation, kind: str, low_mm: float, span_mm: float, st
     2 u32 D else; 4 u D for the way back"""
     depth = depth_map(kind, low_mm, span_mm).astype(stored)
     low, high = _range(depth)
-    representation = normalise(depth, name, low, high)
-    inside = object_mask(depth)
-    individual = name == "individual"
+    representation, inside, individual = normalise(depth, name, low, high), object_mask(depth), name == "individual"
     between = (representation >= 0) & (representation <= 1)
     if not (np.isfinite(representation) & (inside | (representation == 0)) & (between | (not individual))).all():
         return wrong("a representation that is not finite, not 0 outside or not in [0, 1]")
     if not inside.any():
         return worst(representation)
     exact = depth[inside].astype(np.float64)
+    bound = 2 * U32 * exact + 2 * U64 * exact + _TINY * (1000.0 if name == "global" else 1.0)
     if individual:
         bound = 4 * U32 * (exact - low) + 4 * U64 * exact + _TINY * (high - low)
-    else:
-        bound = 2 * U32 * exact + 2 * U64 * exact + _TINY * (1000.0 if name == "global" else 1.0)
     return worst(denormalise(representation, name, low, high)[inside] - exact, bound)
 
 
-_GRID = {"name": NAMES, "kind": ("part",), "low_mm": (1700.0,), "stored": STORED}
-_KINDS = ("flat plane", "one pixel", "full frame", "empty")
-for _family, _grid in {
-    "range": {**_GRID, "span_mm": SPANS},
-    "depth_min = 0": {**_GRID, "kind": ("full frame",), "low_mm": (0.0,), "span_mm": (1e-30, 1e-6, 1.0, 1e6)},
-    "shape of the object": {"name": NAMES, "low_mm": (1700.0,), "span_mm": (200.0,), "stored": ("float32",),
-                            "kind": _KINDS},
-}.items():  # fmt: skip
-    NORMALISATION.family(_family, "mm", **_grid)(round_trip)  # type: ignore[arg-type]
+NORMALISATION.family("range", "mm", name=NAMES, kind=("part",), low_mm=(1700.0,), stored=STORED,
+                     span_mm=SPANS)(round_trip)  # fmt: skip
+NORMALISATION.family("depth_min = 0", "mm", name=NAMES, kind=("full frame",), low_mm=(0.0,), stored=STORED,
+                     span_mm=(1e-30, 1e-6, 1.0, 1e6))(round_trip)  # fmt: skip
+NORMALISATION.family("shape of the object", "mm", name=NAMES, low_mm=(1700.0,), span_mm=(200.0,), stored=("float32",),
+                     kind=("flat plane", "one pixel", "full frame", "empty"))(round_trip)  # fmt: skip
 
 
 @NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
@@ -90,12 +85,8 @@ NORMALISATION.family(
     "range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3), about="individual depth with a range "
     "that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value",
 )(forward)  # fmt: skip
-NORMALISATION.family(
-    "subnormal range", "mm", name=("individual",), kind=("full frame",), low_mm=(0.0,), stored=("float64",),
-    span_mm=(1e-40, 1e-60, 1e-300),
-)(round_trip)  # fmt: skip
-
-
+NORMALISATION.family("subnormal range", "mm", name=("individual",), kind=("full frame",), low_mm=(0.0,),
+                     stored=("float64",), span_mm=(1e-40, 1e-60, 1e-300))(round_trip)  # fmt: skip
 NORMALISATION.family(
     "impossible range", "1", expects="refusal", refuses=ValueError,
     about="depth with an invalid range; against there is no such representation; bound: must be refused",
@@ -103,11 +94,9 @@ NORMALISATION.family(
 )(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))  # fmt: skip
 
 
-@NORMALISATION.family(
-    "scored", "mm", refuses=DatasetError,
-    expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either",
-    mode=("standard", "paper-individual"), kind=("part", "full frame", "flat plane", "one pixel", "empty"),
-)  # fmt: skip
+@NORMALISATION.family("scored", "mm", refuses=DatasetError, mode=("standard", "paper-individual"),
+                      kind=("part", "full frame", "flat plane", "one pixel", "empty"),
+                      expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either")  # fmt: skip
 def scored(kind: str, mode: str) -> Outcome:
     """normalised predictions as the evaluator scores them; against the affine map, closed form; bound: 4 u D; no range
     to go back through is refused"""
@@ -149,14 +138,13 @@ def _scored(errors: Floats, operations: float = RANDOM) -> Outcome:
 
 @METRICS.family("streamed pixels", "relative", scale_mm=(1e-30, 1.0, 1e30), pixels=(1e6, 1e8, 1e10))
 def streamed(pixels: float, scale_mm: float) -> Outcome:
-    """MAE and RMSE of merged states of 10^6 px, 20 kinds of block; against exact sums; bound: 6 sqrt(9600 + 6 merges)
-    u: random roundings, 6 a merge, since a state is a rounded mean"""
+    """MAE and RMSE of merged states of 10^6 px, 20 kinds of block; bound: 6 sqrt(9600 + 6 merges) u: random roundings,
+    6 a merge, since a state is a rounded mean"""
     # Each kind of block is summed once, for it would give the same state every time, and its state is merged as often
     # as it comes: what grows with the number of pixels is the merging, all of it done here.
-    rng = np.random.default_rng(11)
+    rng, blocks = np.random.default_rng(11), round(pixels / _STREAM_BLOCK)
     levels = scale_mm * rng.lognormal(0, 3, 64)
     kinds = [levels[rng.integers(0, 64, _STREAM_BLOCK)] for _ in range(_STREAM_KINDS)]
-    blocks = round(pixels / _STREAM_BLOCK)
     states = [score.stats_of(kind) for kind in kinds]
     total = reduce(score.combine, (states[number % _STREAM_KINDS] for number in range(blocks)), score.EMPTY)
     times = [blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)]
@@ -165,43 +153,35 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
     return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(score.BLOCK + 6 * blocks))
 
 
-@METRICS.family(
-    "magnitude", "relative", refuses=PredictionError,
-    expects=lambda scale_mm: "number" if scale_mm <= 1e140 else "either",
-    scale_mm=(1.0, 1e-30, 1e30, 1e-130, 1e140, 1e-160, 5e-324, 1e-310, 1e200, 1e306),
-)  # fmt: skip
+@METRICS.family("magnitude", "relative", refuses=PredictionError,
+                expects=lambda scale_mm: "number" if scale_mm <= 1e140 else "either",
+                scale_mm=(1.0, 1e-30, 1e30, 1e-130, 1e140, 1e-160, 5e-324, 1e-310, 1e200, 1e306))  # fmt: skip
 def magnitude(scale_mm: float) -> Outcome:
-    """MAE and RMSE of 20,000 errors up to 999 x scale_mm; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
-    in float64, random roundings; blocks are added exactly; squares above 1e308 refused"""
-    errors = scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000).astype(np.float64)
-    return _scored(errors)
+    """MAE and RMSE of 20,000 errors up to 999 x scale_mm; bound: 6 sqrt(9600) u: a block of 9600 px in float64, random
+    roundings; blocks are added exactly; squares above 1e308 refused"""
+    return _scored(scale_mm * np.random.default_rng(3).integers(-999, 1000, 20_000).astype(np.float64))
 
 
 @METRICS.family("mixed magnitudes", "relative", low_mm=(1e-30, 1e-6), high_mm=(1e-5, 1.0, 1e30))
 def mixed(low_mm: float, high_mm: float) -> Outcome:
-    """MAE and RMSE of magnitudes from low_mm to high_mm; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
-    in float64, random roundings; blocks are added exactly"""
+    """MAE and RMSE of magnitudes from low_mm to high_mm"""
     levels = np.logspace(math.log10(low_mm), math.log10(high_mm), 300)
-    errors = np.random.default_rng(4).choice(levels, 30_000)
-    return _scored(errors)
+    return _scored(np.random.default_rng(4).choice(levels, 30_000))
 
 
 @METRICS.family("one large error", "relative", large_mm=(1.0, 1.7e7, 1e8, 1e12, 1e16))
 def one_large(large_mm: float) -> Outcome:
-    """MAE and RMSE of 10^7 errors, all but this one 1 mm; against exact sums; bound: 9600 u: one float64 block's worst
-    case; blocks are added exactly"""
+    """MAE and RMSE of 10^7 errors, all but this one 1 mm; bound: 9600 u: one float64 block's worst case; blocks are
+    added exactly"""
     errors = np.ones(10_000_000)  # summed naively in float32 the small ones vanish from 2^24 on
     errors[0] = large_mm
     return _scored(errors, score.BLOCK)
 
 
-@METRICS.family(
-    "sample", "relative", refuses=PredictionError, stored=("float32", "float64"),
-    scale_mm=(1.0, 1e-30, 1e30, 1e-43, 1e-160, 1e-300),
-)  # fmt: skip
+@METRICS.family("sample", "relative", refuses=PredictionError, stored=("float32", "float64"),
+                scale_mm=(1.0, 1e-30, 1e30, 1e-43, 1e-160, 1e-300))  # fmt: skip
 def sample(scale_mm: float, stored: str) -> Outcome:
-    """object and background MAE and RMSE of 100 x 100 px; against exact sums; bound: 6 sqrt(9600) u: a block of 9600 px
-    in float64, random roundings; blocks are added exactly"""
+    """object and background MAE and RMSE of 100 x 100 px"""
     errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (100, 100))
     target = np.zeros((100, 100), stored)
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
@@ -226,10 +206,8 @@ def distribution(scale_mm: float) -> Outcome:
     measured = score.score_sample(prediction, target).distribution
     exact = np.sort((prediction - target).ravel())
     size, last = np.sort(np.abs(exact)), exact.size - 1
-    median, middle, p95 = (
-        float(np.interp(level * last, np.arange(last + 1), values))
-        for values, level in ((exact, 0.5), (size, 0.5), (size, 0.95))
-    )
+    parts = (exact, 0.5), (size, 0.5), (size, 0.95)
+    median, middle, p95 = (float(np.interp(share * last, np.arange(last + 1), part)) for part, share in parts)
     means = (math.fsum(values.tolist()) / exact.size for values in (exact, np.abs(exact - median)))
     expected = np.array([middle, p95, size[-1], *means])
     computed = [measured[f"object_{name}_mm"] for name in ("median", "p95", "max", "bias", "shift_free_mae")]
@@ -258,10 +236,8 @@ def merged(order: str) -> Outcome:
     sized = [10.0 ** rng.uniform(-30, 30) * rng.uniform(0.5, 1, int(rng.integers(1, 2000))) for _ in range(200)]
     parts = [score.stats_of(errors) for errors in sized]
     whole = score.combine(*parts)
-    if order == "one by one":
-        total = reduce(score.combine, parts, score.EMPTY)
-    else:
-        level = parts[::-1]
+    total, level = reduce(score.combine, parts, score.EMPTY), parts[::-1]
+    if order == "as a tree, backwards":
         while len(level) > 1:
             level = [score.combine(*level[i : i + 2]) for i in range(0, len(level), 2)]
         total = level[0]

@@ -15,12 +15,14 @@ from fpp_ml_bench import decoding, optics
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability import cases
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, difference, wide, worst
-from fpp_ml_bench.baselines.stability.phase_order import DIRECTIONS, plane_stack
+from fpp_ml_bench.baselines.stability.phase_order import plane_stack
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.loaders.render import Lighting, light_surface
 
-TRIANGULATION, RIG = Group("triangulation"), Group("rig")
+RIG = Group("rig")
+TRIANGULATION = Group("triangulation", "the closed form on the same float64 inputs in 50 digits", "u (8 kappa + 5 "
+    "kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running error analysis")  # fmt: skip
 BASELINES = (160.0, 50.0, 10.0, 1.0, 0.1, 0.01)
 PAPER = optics.paper_rig(24)
 _TURN = optics.rotation_matrix((0.05, -0.09, 0.12))
@@ -76,17 +78,13 @@ def relative(depth_mm: NDArray, exact: NDArray[np.object_]) -> Floats:
 
 def depth_of(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> Floats:
     """The benchmark's depth in mm."""
-    return decoding.depth_from_coordinate(RAYS, coordinate, rig, DIRECTIONS[axis])
+    return decoding.depth_from_coordinate(RAYS, coordinate, rig, optics.AXES[axis])
 
 
-def conditioning(
-    coordinate: NDArray, rig: optics.Rig, axis: int = 0, rays: optics.Maps = RAYS
-) -> tuple[Floats, Floats]:
+def conditioning(coordinate: NDArray, rig: optics.Rig, axis: int = 0, rays: optics.Maps = RAYS) -> tuple[Floats, ...]:
     """Bound of the closed form's relative error, and its condition number: sum of magnitudes over |a - x_p a_2|.
-
     Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of magnitudes; the difference and the top
-    cancel; 4 more for the last quotient and the change to mm.
-    """
+    cancel; 4 more for the last quotient and the change to mm."""
     (x, y), (focal, centre), t = rays, _device(rig), rig.t
     ideal = (coordinate - centre[axis]) / focal[axis]
     size = [np.abs(row[0]) * np.abs(x) + np.abs(row[1]) * np.abs(y) + np.abs(row[2]) for row in rig.R]
@@ -96,42 +94,33 @@ def conditioning(
     return U64 * (8 * condition + 5 * above + 4), condition
 
 
-def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct: ArrayLike = False) -> Outcome:
+def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct: NDArray | bool = False) -> Outcome:
     """The outcome of depths from one coordinate; the ``indistinct`` ones may be masked."""
     exact, depth_mm = exact_depth_mm(coordinate, rig, axis), depth_of(coordinate, rig, axis)
     bound, condition = conditioning(coordinate, rig, axis)
     # Where the bound exceeds half of the depth, the number is round-off and must be as behind the camera.
     nothing = ~(bound < 0.5) | ~(exact.astype(float) > 0)
-    error = np.where(nothing, np.inf, relative(depth_mm, exact))
-    return worst(
-        error, bound, np.isnan(depth_mm), float(np.mean(nothing | np.asarray(indistinct))), float(condition.max())
-    )
+    error, may_flag = np.where(nothing, np.inf, relative(depth_mm, exact)), float(np.mean(nothing | indistinct))
+    return worst(error, bound, np.isnan(depth_mm), may_flag, float(condition.max()))
 
 
 def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Direction, turned: bool = False) -> Outcome:
-    rig, axis = scaled_baseline(baseline_mm, 0.3 if turned else 0.0, turned), DIRECTIONS.index(direction)
+    rig, axis = scaled_baseline(baseline_mm, 0.3 if turned else 0.0, turned), optics.AXES.index(direction)
     return closed_form(exact_coordinates(range_m, rig)[axis], rig, axis)
 
 
-_CLOSED = (
-    "; against the closed form on the same float64 inputs in 50 digits; bound: u (8 kappa + 5 kappa_top + 4), kappa = "
-    "sum of magnitudes over |a - x_p a_2|: running error analysis"
-)
 for _name, _of, _grid in (
-    ("baseline", " at 1.8 m", {"direction": DIRECTIONS, "range_m": (1.8,), "baseline_mm": BASELINES}),
-    ("range", "", {"direction": DIRECTIONS, "baseline_mm": (160.0,), "range_m": (0.3, 1.0, 1.8, 5.0, 20.0, 100.0)}),
+    ("baseline", " at 1.8 m", {"direction": optics.AXES, "range_m": (1.8,), "baseline_mm": BASELINES}),
+    ("range", "", {"direction": optics.AXES, "baseline_mm": (160.0,), "range_m": (0.3, 1.0, 1.8, 5.0, 20.0, 100.0)}),
     ("short baseline and long range", "",
      {"direction": ("vertical",), "baseline_mm": (1.0, 0.01), "range_m": (20.0, 100.0)}),
     ("turned projector ahead of the camera", ", general pose",
-     {"direction": DIRECTIONS, "range_m": (0.3, 1.8, 100.0), "baseline_mm": (160.0, 0.01), "turned": (1,)}),
+     {"direction": optics.AXES, "range_m": (0.3, 1.8, 100.0), "baseline_mm": (160.0, 0.01), "turned": (1,)}),
 ):  # fmt: skip
-    about = f"depth from one coordinate{_of}{_CLOSED}"
-    TRIANGULATION.family(_name, "relative", about=about, **_grid)(one_coordinate)  # type: ignore[arg-type]
+    TRIANGULATION.family(_name, "relative", about=f"depth from one coordinate{_of}", **_grid)(one_coordinate)  # type: ignore[arg-type]
 
 
-def _least_squares(
-    measured_px: NDArray, rig: optics.Rig, rays: optics.Maps
-) -> tuple[NDArray[np.object_], Floats, Floats]:
+def _least_squares(measured_px: NDArray, rig: optics.Rig, rays: optics.Maps) -> tuple[NDArray, Floats, Floats]:
     """Depth mm that minimises the weighted misfit, by Newton in 50 digits; contraction of Gauss-Newton; its start's
     relative error."""
     focal, centre = _device(rig)
@@ -149,10 +138,8 @@ def _least_squares(
     return 1000 / w, np.abs(bend / square).astype(float), np.abs((first - w) / w).astype(float)
 
 
-@TRIANGULATION.family(
-    "both directions", "relative", expects="either", noise_px=(0.0, 0.5), ahead=(0.0, 0.3, 1.0),
-    baseline_mm=BASELINES[:4],
-)  # fmt: skip
+@TRIANGULATION.family("both directions", "relative", expects="either", noise_px=(0.0, 0.5), ahead=(0.0, 0.3, 1.0),
+                      baseline_mm=BASELINES[:4])  # fmt: skip
 def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outcome:
     """depth by weighted least squares of both coordinates; against the minimum, by Newton's method in 50 digits; bound:
     8 x the closed form's bound + start error x (Gauss-Newton contraction + 4 start error)^3"""
@@ -168,13 +155,13 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     return worst(error, bound, np.isnan(depth_mm), float(np.mean(~in_front)), float(np.max(conditions)))
 
 
-@TRIANGULATION.family("noise law", "1", direction=DIRECTIONS, baseline_mm=BASELINES)
+@TRIANGULATION.family("noise law", "1", direction=optics.AXES, baseline_mm=BASELINES)
 def noise_law(baseline_mm: float, direction: optics.Direction) -> Outcome:
     """rms depth error over sigma_u Z^2 / (f_p b), minus 1; or the share without depth, minus Phi; against rig.md's law;
     where noise is over a fifth of the depth, the normal law of inverse depth; bound: 4 standard errors of 20,000 draws,
     and 8 (sigma_Z / Z)^2 of second order"""
     rig, count, modulation, axis = scaled_baseline(baseline_mm), 20_000, 60.0, np.zeros(20_000)
-    coordinate = exact_coordinates(1.8, rig, (axis[:1], axis[:1]))[DIRECTIONS.index(direction)][0]
+    coordinate = exact_coordinates(1.8, rig, (axis[:1], axis[:1]))[optics.AXES.index(direction)][0]
     sigma_px = rig.pitch(direction) * math.sqrt(2 / 18) / modulation / (2 * math.pi)
     noisy = coordinate + sigma_px * np.random.default_rng(8).standard_normal(count)
     depths_mm = decoding.depth_from_coordinate((axis, axis), noisy, rig, direction)
@@ -189,11 +176,9 @@ def noise_law(baseline_mm: float, direction: optics.Direction) -> Outcome:
     return Outcome(abs(float(np.isnan(depths_mm).mean()) - nowhere), bound, condition=1 / share)
 
 
-@TRIANGULATION.family(
-    "nearly parallel rays", "relative", expects="either", about=f"depth of a projector plane this many px from "
-    f"parallel{_CLOSED}; masked where it lies behind",
-    shift_px=(10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0),
-)  # fmt: skip
+@TRIANGULATION.family("nearly parallel rays", "relative", expects="either",
+    about=f"depth of a projector plane this many px from parallel; bound: {TRIANGULATION.predicts}; masked where it "
+    "lies behind", shift_px=(10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0))  # fmt: skip
 def near_parallel(shift_px: float) -> Outcome:
     focal, centre = PAPER.projector.fx, PAPER.projector.cx
     coordinate = focal * RAYS[0] + centre + shift_px  # depth f b / shift, up to a point at infinity
@@ -238,9 +223,8 @@ def lit_from_behind() -> Outcome:
     return worst(lit.gain, 0.0, lit.gain == 0)
 
 
-@TRIANGULATION.family(
-    "float32 coordinate", "relative", expects="either", range_m=(0.3, 1.8, 100.0), baseline_mm=BASELINES
-)
+@TRIANGULATION.family("float32 coordinate", "relative", expects="either", range_m=(0.3, 1.8, 100.0),
+                      baseline_mm=BASELINES)  # fmt: skip
 def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     """depth from a coordinate rounded to float32; against depth from the float64 coordinate, 50 digits; bound: 2^-24
     kappa, kappa = u_p / (u_p - u_infinity); not checked where that is over 1/2"""
@@ -252,9 +236,8 @@ def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     return _rounded_input(error, slope * U32, slope, np.isnan(depth_mm), 1.001)
 
 
-def _rounded_input(
-    error: Floats, rounding: Floats, condition: Floats, flagged: ArrayLike = False, slack: float = 1.0
-) -> Outcome:
+def _rounded_input(error: Floats, rounding: Floats, condition: Floats, flagged: ArrayLike = False,
+                   slack: float = 1.0) -> Outcome:  # fmt: skip
     """The outcome of numbers with this relative error by rounding, which is not checked where that is over 1/2."""
     useless = rounding >= 0.5
     bound = slack * np.where(useless, 1.0, rounding / (1 - np.minimum(rounding, 0.5)))
@@ -280,9 +263,7 @@ def single_layer(baseline_mm: float, range_m: float) -> Outcome:
     return _rounded_input(depth_mm / (range_m * MM_PER_M) - 1, condition * U32 + 6 * U32, condition)
 
 
-@TRIANGULATION.family(
-    "impossible coordinates", "mm", expects="either", value=(1e308, -1e308, 1e16, float("inf"), float("nan"))
-)
+@TRIANGULATION.family("impossible coordinates", "mm", expects="either", value=(1e308, -1e308, 1e16, math.inf, math.nan))
 def overflowing(value: float) -> Outcome:
     """depth from coordinates that no projector has; against finite and positive, or masked; bound: must be masked where
     there is no depth"""
@@ -309,23 +290,17 @@ def intrinsics(focal_px: float, centre_px: float) -> Outcome:
 
 
 _BACK = "pixel to ray and back; against the pixel; bound: 3 u (|u - c| + |c|) + u |u|; refused from a condition number "
-RIG.family(
-    "intrinsic matrix", "px", about=f"{_BACK}of 2^26 on, half of the digits", refuses=RigError,
-    expects=lambda focal_px, centre_px: "number" if 1e-3 <= focal_px <= 1e8 else "either",
-    centre_px=(479.5,), focal_px=(2e3, 1.0, 1e-3, 1e-6, 1e-8, 1e-12, 1e-300, 5e-324, 1e8, 1e12, 1e300),
-)(intrinsics)  # fmt: skip
-RIG.family(
-    "far principal point", "px", about=f"{_BACK}of 2^26 on", refuses=RigError,
-    expects=lambda focal_px, centre_px: "number" if centre_px <= 1e6 else "either",
-    focal_px=(2e3,), centre_px=(1e3, 1e6, 1e12, 1e16),
-)(intrinsics)  # fmt: skip
+RIG.family("intrinsic matrix", "px", about=f"{_BACK}of 2^26 on, half of the digits", refuses=RigError,
+           expects=lambda focal_px, centre_px: "number" if 1e-3 <= focal_px <= 1e8 else "either", centre_px=(479.5,),
+           focal_px=(2e3, 1.0, 1e-3, 1e-6, 1e-8, 1e-12, 1e-300, 5e-324, 1e8, 1e12, 1e300))(intrinsics)  # fmt: skip
+RIG.family("far principal point", "px", about=f"{_BACK}of 2^26 on", refuses=RigError, focal_px=(2e3,),
+           expects=lambda focal_px, centre_px: "number" if centre_px <= 1e6 else "either",
+           centre_px=(1e3, 1e6, 1e12, 1e16))(intrinsics)  # fmt: skip
 
 
-@RIG.family(
-    "rotation off orthonormal", "relative", refuses=RigError,
-    expects=lambda kind, off: "number" if off < 1e-6 else "refusal",
-    kind=("scaled", "sheared"), off=(0.0, 1e-9, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 1e-2),
-)  # fmt: skip
+@RIG.family("rotation off orthonormal", "relative", refuses=RigError, kind=("scaled", "sheared"),
+            off=(0.0, 1e-9, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 1e-2),
+            expects=lambda kind, off: "number" if off < 1e-6 else "refusal")  # fmt: skip
 def off_orthonormal(off: float, kind: str) -> Outcome:
     """depth through this matrix; against depth through the rotation, 1800 mm; bound: 2 |R R^T - I| kappa + round-off;
     over 1e-6 a rig is refused"""
@@ -340,10 +315,8 @@ def off_orthonormal(off: float, kind: str) -> Outcome:
     return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), np.isnan(depth_mm), condition=float(condition.max()))
 
 
-@RIG.family(
-    "rotation vector", "1", refuses=RigError, expects=lambda angle_rad: "number" if angle_rad <= 1e8 else "either",
-    angle_rad=(0.0, 1e-300, 1e-12, 1e-4, 1.0, 3.141592653589793, 6.283185307179586, 1e3, 1e8, 1e12, 1e15),
-)  # fmt: skip
+@RIG.family("rotation vector", "1", angle_rad=(0.0, 1e-300, 1e-12, 1e-4, 1.0, math.pi, math.tau, 1e3, 1e8, 1e12, 1e15),
+            refuses=RigError, expects=lambda angle_rad: "number" if angle_rad <= 1e8 else "either")  # fmt: skip
 def rotation_vector(angle_rad: float) -> Outcome:
     """rotation matrix by Rodrigues' formula; against the same formula in 50 digits; bound: 8 u (1 + angle): the angle
     carries its own rounding; refused where that is over 1e-6"""
@@ -462,11 +435,9 @@ def impossible_rig(change: str) -> None:
 def file_round_trip(suffix: str) -> Outcome:
     """a rig of awkward numbers, written and read; against the rig; bound: exact"""
     awkward = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
-    rig = replace(
-        PAPER, camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
-        translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
-        rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(), pitch_vertical_px=18 + 2**-48,
-    )  # fmt: skip
+    rig = replace(PAPER, camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
+                  translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300), pitch_vertical_px=18 + 2**-48,
+                  rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist())  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
         optics.save_rig(rig, path)

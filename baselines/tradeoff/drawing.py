@@ -33,17 +33,14 @@ that fits here fits everywhere."""
 _NAME_GAP, _NUMBER_GAPS = 5.0, (3.0, 12.0, 22.0, 34.0, 48.0)
 """From the mark to its name and its number, in points; from the second number's on a thin line joins them."""
 _DIRECTIONS = 16
-
 Place = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Mark:
     """A mark of ``radius`` points at a cost ``x`` and an error ``y``, both above 0, with the intervals of both.
-
     ``colour``: of `COLOURS` or of matplotlib. ``number``: unique in a drawing, ``name`` explains it in the key. For a
-    page: ``title`` under the mouse, ``css`` classes, ``row``: id of the row that it belongs to, ``url``: its page.
-    """
+    page: ``title`` under the mouse, ``css`` classes, ``row``: id of the row that it belongs to, ``url``: its page."""
 
     x: float
     y: float
@@ -106,8 +103,7 @@ class Scatter:
         px = axes.figure.dpi / 72
         size = matplotlib.rcParams["font.size"] * px
         at = axes.transData.transform([(mark.x, mark.y) for mark in self.marks])
-        radii = [mark.radius * px for mark in self.marks]
-        taken = [Bbox([place - radius, place + radius]) for place, radius in zip(at, radii, strict=True)]
+        taken = [Bbox([xy - mark.radius * px, xy + mark.radius * px]) for mark, xy in zip(self.marks, at, strict=True)]
         places = {mark.number: place for mark, place in zip(self.marks, at, strict=True)}
         numbered = []
         for mark in self.labelled:
@@ -131,11 +127,9 @@ class Scatter:
         return numbered
 
     def svg(self, width: int, height: int, css: str, about: str) -> tuple[str, list[Mark]]:
-        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks shown by number.
-
-        It is styled by attributes and by the page, which forbids style of its own. ``css``, its classes, and ``about``,
-        its description, tell it from other pictures of the page.
-        """
+        """An ``svg`` element of ``width`` by ``height`` px in the page's colours, and the marks shown by number. It is
+        styled by attributes and by the page, which forbids style of its own. ``css``, its classes, and ``about``, its
+        description, tell it from other pictures of the page."""
         text = io.StringIO()
         with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
             figure = Figure(figsize=(width / 72, height / 72), dpi=72)

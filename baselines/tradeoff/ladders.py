@@ -63,19 +63,19 @@ def package_ladders(rig: Rig, quick: bool = False, more: Iterable[Ladder] = ()) 
         "decode: triangulate from both (NumPy)": _triangulate, "phase route": _phase_route, "score a view": _score,
     }  # fmt: skip
     sizes, steps, three = _QUICK_SIZES if quick else _SIZES, _QUICK_STEPS if quick else _STEPS, 3 if quick else None
-    row_objects = _QUICK_ROW_OBJECTS if quick else _ROW_OBJECTS
+    row_objects, pixel_sizes = (_QUICK_ROW_OBJECTS, (64, 128, 256)) if quick else (_ROW_OBJECTS, _SIZES)
     return [
         Ladder("build a dataset", "objects", _FEW if quick else (1, 2, 4, 8), partial(_build, rig)),
         Ladder("open and read a frame of each row", "rows", row_objects, _read_rows),
-        Ladder("read a row", "frames", (4, 13, 26, 52)[:three], _read_frames),
-        Ladder("read a row", "pixels", (64, 128, 256) if quick else _SIZES, _read_pixels),
+        Ladder("read a row", "frames", (4, 13, 26, 52)[:three], lambda n, own: Rung(n, _reading(own, READ_SIZE, n))),
+        Ladder("read a row", "pixels", pixel_sizes, lambda n, own: Rung(n * n, _reading(own, n))),
         Ladder("score a folder of predictions", "rows", _FEW if quick else _ROW_OBJECTS[:3], _evaluate),
         *more,
         Ladder("render a view", "frames", steps, partial(_frame_rung, rig, _render)),
         Ladder("decode", "frames", steps, partial(_frame_rung, rig, _decode)),
         *(Ladder(stage, "pixels", sizes, partial(_pixel_rung, rig, make)) for stage, make in over_pixels.items()),
-        Ladder("UNet width 8, untrained", "pixels", _NETWORK_SIZES[:three], _network),
-        Ladder("UNet width 8, untrained", "rows", _BATCHES[:three], _network_batch),
+        Ladder("UNet width 8, untrained", "pixels", _NETWORK_SIZES[:three], lambda n, _: Rung(n * n, _network(n))),
+        Ladder("UNet width 8, untrained", "rows", _BATCHES[:three], lambda n, _: Rung(n, _network(BATCH_SIZE, n))),
     ]
 
 
@@ -89,45 +89,42 @@ def _frame_rung(rig: Rig, make: Callable[[Rig], Work], steps: int, folder: Path)
     return Rung(len(sequence), make(replace(rig.scaled(FRAMES_SIZE), sequence=sequence)))
 
 
-def _captured(rig: Rig) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32]]:
-    """Frames and depth of the ladder's view."""
-    row = _render(rig)()
-    return [row.frames[index] for index in range(len(rig.sequence))], row.depth_mm
-
-
 def _render(rig: Rig) -> Callable[[], Row]:
     return partial(Studio(BuildSettings(rig, (OBJECT,))).photograph, solid_mesh(OBJECT), VIEW)
 
 
+def _captured(rig: Rig) -> list[NDArray[np.uint8]]:
+    row = _render(rig)()
+    return [row.frames[index] for index in range(len(rig.sequence))]
+
+
 def _decode(rig: Rig) -> Work:
-    return partial(decode_stack, _captured(rig)[0], rig)
+    return partial(decode_stack, _captured(rig), rig)
 
 
 def _phase(rig: Rig) -> Work:
     """On the whole image at once."""
-    frames, _ = _captured(rig)
-    plan = plan_direction(rig, "vertical", rig.sequence.steps, Limits())
+    frames, plan = _captured(rig), plan_direction(rig, "vertical", rig.sequence.steps, Limits())
     return partial(decode_direction, np.stack([frames[index].reshape(-1) for index in plan.frames]), plan, Limits())
 
 
 def _triangulate(rig: Rig) -> Work:
-    rays = rig.camera.rays()
-    depth_m = 1.8 + 0.1 * rays[0]
-    u, v = rig.project(np.stack([rays[0] * depth_m, rays[1] * depth_m, depth_m], axis=-1))
-    return partial(depth_from_both, rays, u, v, rig)
+    x, y = rays = rig.camera.rays()
+    depth_m = 1.8 + 0.1 * x
+    return partial(depth_from_both, rays, *rig.project(np.stack([x * depth_m, y * depth_m, depth_m], axis=-1)), rig)
 
 
 def _phase_route(rig: Rig) -> Work:
-    frames, method = _captured(rig)[0], PhaseMethod(rig)
+    frames, method = _captured(rig), PhaseMethod(rig)
     return lambda: method.measure(frames).seconds
 
 
 def _score(rig: Rig) -> Work:
-    _, depth_mm = _captured(rig)
+    depth_mm = _render(rig)().depth_mm
     return partial(score_sample, depth_mm + np.float32(1.5) * (depth_mm > 0), depth_mm)
 
 
-def _network(size: int, folder: Path, batch: int = 1) -> Rung:
+def _network(size: int, batch: int = 1) -> Work:
     import torch
 
     from fpp_ml_bench.baselines.networks import build as build_network
@@ -135,12 +132,7 @@ def _network(size: int, folder: Path, batch: int = 1) -> Rung:
     torch.manual_seed(0)
     network = build_network("unet", width=8).eval().requires_grad_(False)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    run = torch.inference_mode()(partial(network, torch.rand(batch, 1, size, size)))
-    return Rung(size * size, run)
-
-
-def _network_batch(batch: int, folder: Path) -> Rung:
-    return replace(_network(BATCH_SIZE, folder, batch), amount=batch)
+    return torch.inference_mode()(partial(network, torch.rand(batch, 1, size, size)))
 
 
 def _build(rig: Rig, objects: int, folder: Path) -> Rung:
@@ -149,15 +141,12 @@ def _build(rig: Rig, objects: int, folder: Path) -> Rung:
     write_ply(solid_mesh("cork"), first)
     mesh = single_mesh(first)
     meshes = tuple(replace(mesh, name=f"object_{number:02d}") for number in range(objects))
-    names = tuple(named.name for named in meshes)
+    names, numbers = tuple(named.name for named in meshes), count()
     settings = BuildSettings(rig.scaled(BUILT_SIZE), names, stored="single_shot", user_meshes=meshes)
-    numbers = count()
     return Rung(objects, lambda: build(folder / f"dataset-{next(numbers)}", settings, workers=1))
 
 
-def written_dataset(
-    folder: Path, objects: int, size: int, stored: str = "single_shot", views: int = 6
-) -> DatasetFolder:
+def _dataset(folder: Path, objects: int, size: int, stored: str = "single_shot", views: int = 6) -> DatasetFolder:
     """A dataset of grey noise below ``folder``: ``objects`` of test with ``views`` rows each, ``size`` px square."""
     target, scratch = folder / "dataset", folder / "scratch"
     scratch.mkdir(parents=True)
@@ -181,7 +170,7 @@ def written_dataset(
 
 
 def _read_rows(objects: int, folder: Path) -> Rung:
-    path = written_dataset(folder, objects, ROW_SIZE).path
+    path = _dataset(folder, objects, ROW_SIZE).path
 
     def run() -> None:
         opened = DatasetFolder(path)
@@ -191,23 +180,15 @@ def _read_rows(objects: int, folder: Path) -> Rung:
     return Rung(objects * len(VIEWS), run)
 
 
-def _read_frames(frames: int, folder: Path) -> Rung:
-    return _reading(frames, folder, READ_SIZE, frames)
-
-
-def _read_pixels(size: int, folder: Path) -> Rung:
-    return _reading(size * size, folder, size, len(PAPER_SEQUENCE))
-
-
-def _reading(amount: int, folder: Path, size: int, frames: int) -> Rung:
+def _reading(folder: Path, size: int, frames: int = len(PAPER_SEQUENCE)) -> Work:
     """The first ``frames`` frames of a dataset's only row."""
-    opened = written_dataset(folder, 1, size, "all", views=1)
+    opened = _dataset(folder, 1, size, "all", views=1)
     (sample,) = opened.samples("test")
-    return Rung(amount, lambda: [frame.max() for frame in opened.frames(sample, range(frames))])
+    return lambda: [frame.max() for frame in opened.frames(sample, range(frames))]
 
 
 def _evaluate(objects: int, folder: Path) -> Rung:
-    opened = written_dataset(folder, objects, ROW_SIZE)
+    opened = _dataset(folder, objects, ROW_SIZE)
     predictions = folder / "predictions"
     predictions.mkdir()
     for sample in opened.samples("test"):

@@ -10,7 +10,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -19,7 +19,7 @@ from platform import python_version
 from statistics import median
 from textwrap import shorten
 from time import perf_counter, process_time
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -54,10 +54,8 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 @dataclass(frozen=True)
 class Rules:
     """Timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used up, after ``warm_up`` runs.
-
     ``clock``: wall-clock time, or the time that processors worked for this process. For one thread that waits for
-    nothing both agree on an idle machine; on a shared machine only processor time stays the same.
-    """
+    nothing both agree on an idle machine; on a shared machine only processor time stays the same."""
 
     clock: Literal["wall", "processor"] = "wall"
     threads: int = 1
@@ -65,11 +63,6 @@ class Rules:
     least: int = 3
     limit_s: float = 3.0
     warm_up: int = 2
-
-    @classmethod
-    def of(cls, settings: TradeoffSettings) -> Self:
-        rules = cls(settings.clock, settings.threads)
-        return replace(rules, runs=5, limit_s=1.0) if settings.quick else rules
 
     def timed(self, call: Callable[[], T]) -> tuple[float, T]:
         """Seconds of a single run of ``call``, and what it returned."""
@@ -90,10 +83,8 @@ def measured(setting: Setting, rules: Rules) -> Point:
     """The point of ``setting``. An error of the package (a frame is not stored, a package is missing) becomes its
     ``failed``, and the run goes on."""
     about: dict[str, Any] = {name: getattr(setting, name) for name in ("key", "group", "title", "note")}
-    try:
+    with suppress(OSError):  # where the system does not provide it
         about["load"] = round(os.getloadavg()[0], 2)
-    except OSError:
-        about["load"] = None  # the system does not provide it
     pace_before = pace_ms(rules)
     try:
         figures = _figures(setting, rules)
@@ -117,11 +108,9 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         run_s, depth = rules.timed(predict)
         seconds.append(run_s)
         if setting.scored:
-            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name)
-            of_sample = score_sample(*pair)
-            pixels = of_sample.object.pixels
-            missing_share = of_sample.missing / pixels if pixels else 0.0
-            scores.append((of_sample.object.mae_mm, of_sample.valid.mae_mm, missing_share))
+            sample = score_sample(*scored_pair(depth, views.target_mm(name), method.units, method.mode, name))
+            missing_share = sample.missing / max(sample.object.pixels, 1)
+            scores.append((sample.object.mae_mm, sample.valid.mae_mm, missing_share))
     # A run longer than the limit is not repeated.
     while len(seconds) < rules.runs and (len(seconds) < rules.least or sum(seconds) < rules.limit_s):
         if min(seconds) > rules.limit_s:
@@ -130,9 +119,8 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
     low, middle, high = (float(f"{float(np.percentile(seconds, q)):.4g}") for q in (5, 50, 95))
     given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
     figures: dict[str, Any] = {
-        "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds),
-        "seconds": middle, "seconds_p5": low, "seconds_p95": high,
-        "parameters": method.parameters, "given": " and ".join(given) or None,
+        "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds), "seconds": middle,
+        "seconds_p5": low, "seconds_p95": high, "parameters": method.parameters, "given": " and ".join(given) or None,
     }  # fmt: skip
     if scores:
         object_mae, valid_mae, missing = zip(*scores, strict=True)
@@ -150,11 +138,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
-    """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first.
-
-    Runs time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage
-    counts where every rung has it, with a time that a clock can tell from 0.
-    """
+    """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first. Runs
+    time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage counts
+    where every rung has it, with a time that a clock can tell from 0."""
     least: list[dict[str, float]] = [{} for _ in ladder.steps]
     with tempfile.TemporaryDirectory(prefix="fpp-bench-costs-") as folder:
         rungs = []
@@ -176,18 +162,16 @@ def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
             if number + 1 >= LEAST_ROUNDS and total_s > LIMIT_S * rules.limit_s / Rules.limit_s:
                 break
     amounts = [rung.amount for rung in rungs]
-    stages_of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
-    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in stages_of_all]
+    of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
+    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in of_all]
     return sorted(growths, key=lambda stage_growth: -stage_growth.seconds[-1])
 
 
 def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[float]) -> Growth:
     """The power p of seconds = c amount^p by least squares of the logarithms, its 95% interval by Student's t over the
     residuals, and the power over the largest amounts alone (``tail``), where a fixed cost no longer hides a steep term.
-
     A power above `LINEAR_LIMIT` is flagged, over all amounts or over the largest. Where the interval includes the
-    limit, the flag says that the times do not prove it.
-    """
+    limit, the flag says that the times do not prove it."""
     x, y = np.log(amounts), np.log(seconds)
     (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
     half = stdtrit(len(x) - 2, 0.5 + CONFIDENCE / 2) * np.sqrt(covariance[0, 0])
@@ -207,12 +191,11 @@ def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[fl
 
 def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], object] = lambda key: None) -> Tradeoff:
     """Measure what ``settings.out`` lacks of ``plan``, calling ``progress`` with the key of each setting and ladder
-    before it is measured.
-
-    Raises BuildError when another process works in the same folder, SubmissionError for a folder with a run of other
-    rules or of another machine.
-    """
-    rules, hardware, views = Rules.of(settings), describe_hardware(), list(plan.views.names)
+    before it is measured. Raises BuildError when another process works in the same folder, SubmissionError for a folder
+    with a run of other rules or of another machine."""
+    fewer: dict[str, Any] = {"runs": 5, "limit_s": 1.0} if settings.quick else {}
+    rules = Rules(settings.clock, settings.threads, **fewer)
+    hardware, views = describe_hardware(), list(plan.views.names)
     # What two sittings of a run must share. Their groups may differ: a later sitting can add a group.
     about = {
         "tradeoff": 1, "package": __version__, "dataset": plan.opened.fingerprint, "views": views,
@@ -234,21 +217,17 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
                 journal.growth[ladder.key] = time_ladder(ladder, rules)
                 journal.write(path)
     per_object = max(Counter(split_sample_name(name)[0] for name in views).values())
+    versions = {}
+    for package in ("numpy", "numba", "torch", "onnxruntime"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
     return Tradeoff(
         created=datetime.now(UTC).isoformat(timespec="seconds"), dataset=plan.opened.path.resolve().name,
         fingerprint=plan.opened.fingerprint, image_size=list(plan.opened.size), target=plan.views.target, views=views,
         settings={**asdict(rules), "quick": settings.quick, "views_an_object": per_object},
         hardware=HardwareInfo.model_validate(hardware.to_dict()),
-        software={"fpp_ml_bench": __version__, "python": python_version(), **_versions()}, sittings=journal.sittings,
+        software={"fpp_ml_bench": __version__, "python": python_version(), **versions}, sittings=journal.sittings,
         # Everything in this folder, so that a group measured on its own adds to the earlier ones.
         points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
         growth=[growth for growths in journal.growth.values() for growth in growths],
     )  # fmt: skip
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for package in ("numpy", "numba", "torch", "onnxruntime"):
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    return versions

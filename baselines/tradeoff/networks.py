@@ -9,9 +9,11 @@ of ``pip install "fpp-ml-bench[onnx]"``.
 
 import importlib.util
 import logging
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -43,10 +45,9 @@ _VNNI_FLAGS = {"avx512_vnni", "avx_vnni", "asimddp"}
 
 def _cpu_flags() -> set[str]:
     """Words of /proc/cpuinfo, empty where there is none."""
-    try:
+    with suppress(OSError):
         return set(Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").split())
-    except OSError:
-        return set()
+    return set()
 
 
 def bf16_note() -> str | None:
@@ -73,11 +74,9 @@ def network_settings(views: StoredViews, run: TradeoffSettings) -> Iterator[Sett
     """Every trained network of the views' image size in every precision, the phase route with a learned order, then
     untrained UNets of several widths."""
     torch.set_num_threads(run.threads)
-    height, width = views.opened.size
-    precisions = PRECISIONS[:2] if run.quick else PRECISIONS
-    notes = {"bf16": bf16_note()}
+    precisions, notes = PRECISIONS[:2] if run.quick else PRECISIONS, {"bf16": bf16_note()}
     seen: Counter[str] = Counter()
-    for weights in trained_weights((height, width), run.runs):
+    for weights in trained_weights(views.opened.size, run.runs):
         name = weights.config.name
         seen[name] += 1
         repeat = f" #{seen[name]}" if seen[name] > 1 else ""
@@ -91,7 +90,7 @@ def network_settings(views: StoredViews, run: TradeoffSettings) -> Iterator[Sett
             key = f"network-{name}-{weights.sha256[:8]}-{depth_range or 'mm'}-{precision}"
             yield Setting(key, "networks", title, make, views, note=notes.get(precision))
     yield Setting("phase-net", "networks", "phase-net", partial(load_method, "phase-net", views.rig), views)
-    default_widths = QUICK_WIDTHS if run.quick or height * width > LARGE_PX else WIDTHS
+    default_widths = QUICK_WIDTHS if run.quick or math.prod(views.opened.size) > LARGE_PX else WIDTHS
     for unet_width, precision in product(default_widths if run.widths is None else run.widths, precisions):
         emulated = notes.get(precision)
         if not emulated or unet_width <= EMULATED_WIDTH:
@@ -130,8 +129,7 @@ class Untrained(Method):
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """The network's output float32 (H, W)."""
-        image = frames[0]
-        if image is None:
+        if (image := frames[0]) is None:
             raise PredictionError("frame 0 was not captured")
         batch = fringe_batch([image], (image.shape[0], image.shape[1]), self.name)
         with torch.inference_mode():
@@ -141,30 +139,21 @@ class Untrained(Method):
 def calibration(views: StoredViews, frame: int, count: int = 8) -> NDArray[np.float32]:
     """Fringes (n, 1, H, W) in [0, 1] of train samples, spread over the split, as int8 is calibrated on."""
     opened = views.opened
-    samples = opened.samples("train") if "train" in opened.splits else []
-    if not samples:
+    if not (samples := opened.samples("train") if "train" in opened.splits else []):
         raise PredictionError(f"{opened.path}: int8 is calibrated on train samples, and it has none")
     chosen = [opened.frame(sample, frame) for sample in samples[:: max(1, len(samples) // count)][:count]]
     return fringe_batch(chosen, opened.size, "the calibration").numpy()
 
 
-def set_precision(
-    network: FringeNetwork, precision: str, examples: Callable[[], NDArray[np.float32]], threads: int
-) -> None:
+def set_precision(network: FringeNetwork, precision: str, examples_of: Callable[[], NDArray], threads: int) -> None:
     """Run ``network`` in ``precision`` (of `PRECISIONS`) from now on; what is around it stays as it is, in float32.
-
-    ``examples`` float32 (n, 1, H, W) give the size for onnxruntime, and int8 is calibrated on them. Raises
-    `FppBenchError` where onnx or onnxruntime is not installed.
-    """
+    Examples, float32 (n, 1, H, W), give the size for onnxruntime, and int8 is calibrated on them. Raises
+    `FppBenchError` where onnx or onnxruntime is not installed."""
     if precision == "bf16":
         network.forward = torch.autocast("cpu", dtype=torch.bfloat16)(network.forward)  # type: ignore[method-assign]
-    elif precision.startswith("onnx"):
-        session = _session(network, examples(), threads, precision == "onnx-int8")
-        name = session.get_inputs()[0].name
-        network.forward = lambda fringe: torch.from_numpy(session.run(None, {name: fringe.numpy()})[0])  # type: ignore[method-assign]
-
-
-def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int, quantised: bool) -> Any:
+    if not precision.startswith("onnx"):
+        return
+    examples = examples_of()
     for package in ("onnx", "onnxruntime"):
         if importlib.util.find_spec(package) is None:
             raise FppBenchError(f'{package} is not installed: pip install "fpp-ml-bench[onnx]"')
@@ -174,10 +163,12 @@ def _session(network: FringeNetwork, examples: NDArray[np.float32], threads: int
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3
     with tempfile.TemporaryDirectory(prefix="fpp-bench-onnx-") as folder:
-        path = networks.export_onnx(network, Path(folder) / "network.onnx", examples.shape[2:])  # type: ignore[arg-type]
-        if quantised:
+        path = networks.export_onnx(network, Path(folder) / "network.onnx", examples.shape[2:])
+        if precision == "onnx-int8":
             path = _quantised(path, examples)
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    name = session.get_inputs()[0].name
+    network.forward = lambda fringe: torch.from_numpy(session.run(None, {name: fringe.numpy()})[0])  # type: ignore[method-assign]
 
 
 def _quantised(path: Path, examples: NDArray[np.float32]) -> Path:

@@ -31,11 +31,9 @@ TRADEOFF_FILE, JOURNAL = "tradeoff.json", "measured.json"
 
 class Point(StrictModel):
     """A setting: ``seconds`` per view (median, 5th, 95th percentile over ``runs``), errors in mm as means over views.
-
     ``interval_mm``: 95% interval of ``object_mae_mm``, from a bootstrap over objects. ``given``: what the method was
     told about the views that it is scored on. ``failed``: why there is no measurement; there are no numbers then.
-    ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's one-minute load average then.
-    """
+    ``pace_ms``: time of a fixed piece of work measured beside it, ``load``: the system's one-minute load average."""
 
     key: Text
     group: Group
@@ -79,11 +77,8 @@ class Growth(StrictModel):
 
 
 class Tradeoff(StrictModel):
-    """A whole run: the data, the rules and options (``settings``), the machine, and the results.
-
-    ``sittings``: how often the run was started or continued; times of different sittings may differ by more than the
-    pace shows.
-    """
+    """A whole run: the data, the rules and options (``settings``), the machine, and the results. ``sittings``: how
+    often it was started or continued; times of different sittings may differ by more than the pace shows."""
 
     tradeoff_schema_version: Literal["1.0.0"] = "1.0.0"
     created: Text
@@ -120,11 +115,9 @@ class Tradeoff(StrictModel):
         return point.pace_ms is not None and point.pace_ms > SLOWED * paces[len(paces) // 2]
 
     def comparable(self, error: ErrorKey = "object_mae_mm") -> list[Point]:
-        """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing.
-
-        The precisions repeat the classical method's arithmetic and are left out; for the error over measured pixels,
-        so are points that leave out more than `MOST_LEFT_OUT` of the object: that must not gain them anything.
-        """
+        """Points that may be on a front: measured on the dataset's own views, with an error above 0, told nothing. The
+        precisions repeat the classical method's arithmetic and are left out; for the error over measured pixels, so are
+        points that leave out more than `MOST_LEFT_OUT` of the object: that must not gain them anything."""
         points = [point for point in self.points if point.group not in ("precision", "sizes") and not point.given]
         if error == "measured_mae_mm":
             points = [point for point in points if (point.missing_share or 0) <= MOST_LEFT_OUT]
@@ -175,9 +168,8 @@ class Journal(StrictModel):
         try:
             earlier: Journal = validate(cls, read_json(path), path, "journal of a trade-off")
         except SubmissionError as error:
-            raise SubmissionError(
-                f"{error}; expected what a run of fpp-bench tradeoff left: give another --out"
-            ) from None
+            expected = "expected what a run of fpp-bench tradeoff left: give another --out"
+            raise SubmissionError(f"{error}; {expected}") from None
         first = earlier.about
         if differs := sorted(key for key in {**first, **about} if first.get(key) != about.get(key)):
             key = differs[0]

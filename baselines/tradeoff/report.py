@@ -9,17 +9,9 @@ import matplotlib
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from fpp_ml_bench.baselines.tradeoff import points as results
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, log_axes
-from fpp_ml_bench.baselines.tradeoff.points import (
-    COST_KEYS,
-    SLOWED,
-    TRADEOFF_FILE,
-    Cost,
-    ErrorKey,
-    Growth,
-    Point,
-    Tradeoff,
-)
+from fpp_ml_bench.baselines.tradeoff.points import COST_KEYS, Cost, ErrorKey, Growth, Point, Tradeoff
 from fpp_ml_bench.baselines.tradeoff.settings import Plan
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import write_json
@@ -38,17 +30,14 @@ FAMILIES = (
     ("network", "networks", "tab:purple", "^"),
 )
 """Start of the keys, name, colour and mark of each family; a point belongs to the first family that fits."""
-_POINT_FIELDS = tuple(name for name in Point.model_fields if name != "interval_mm")
 
 
-def scatter(
-    tradeoff: Tradeoff, cost: Cost, error: ErrorKey = "object_mae_mm", all_named: bool = False
-) -> Scatter | None:
+def scatter(run: Tradeoff, cost: Cost, error: ErrorKey = "object_mae_mm", all_named: bool = False) -> Scatter | None:
     """``error`` against ``cost`` (ms or frames) of every setting on the dataset's own views, hollow where it was told
     something of the view. The settings on the front are labelled; with ``all_named`` those off it too, as far as there
     is room, and none by a number. None where no setting has both figures."""
-    front = tradeoff.front(cost, error)
-    points = [point for point in tradeoff.points if point.group != "sizes" and point.seconds and getattr(point, error)]
+    front = run.front(cost, error)
+    points = [point for point in run.points if point.group != "sizes" and point.seconds and getattr(point, error)]
     points = [*front, *(point for point in points if point not in front)]
     marks, named, named_last = [], [], []
     for number, point in enumerate(points, start=1):
@@ -57,14 +46,14 @@ def scatter(
         title = f"{point.title}: {y:.3g} mm, {ms:.3g} ms, {point.frames} frames"
         x, span = (ms, (low, high)) if cost == "seconds" else (float(point.frames), None)
         marks.append(Mark(x, y, number, _short(point), colour, shape, 3.5, bool(point.given), span, None, title))
-        if point.group == "networks" and not _is_float32(point):
+        if _other_precision(point):
             # A network's other precisions differ from its float32 in time: they are named in that panel, last.
             named_last += [marks[-1]] if cost == "seconds" else []
         elif point.group != "classical" or point.title.startswith(("classical N=3,", "classical N=18,")):
             named.append(marks[-1])
     if not marks:
         return None
-    across = f"milliseconds per view ({tradeoff.clock})" if cost == "seconds" else "frames captured"
+    across = f"milliseconds per view ({run.clock})" if cost == "seconds" else "frames captured"
     on_front = marks[: len(front)]
     if not all_named:
         return Scatter(marks, on_front, across, on_front)
@@ -76,12 +65,13 @@ def _family(point: Point) -> tuple[str, str, str, str]:
     return next((each for each in FAMILIES if point.key.startswith(each[0])), FAMILIES[-1])
 
 
-def _is_float32(point: Point) -> bool:
-    return point.title.endswith(", fp32") or ", " not in point.title
+def _other_precision(point: Point) -> bool:
+    """Whether it is a network in another precision than float32."""
+    return point.group == "networks" and ", " in point.title and not point.title.endswith(", fp32")
 
 
 def _short(point: Point) -> str:
-    if point.group == "networks" and not _is_float32(point):
+    if _other_precision(point):
         return point.title.rsplit(", ", 1)[-1]
     short = point.title.removeprefix("phase ").removeprefix("classical ")
     return short.replace(", fp32", "").replace("predicted range", "predicted")
@@ -179,8 +169,8 @@ def write_report(tradeoff: Tradeoff, out: Path) -> list[Path]:
     """Write everything into folder ``out``; returns the files. SubmissionError where one can't be written."""
     content = tradeoff.model_dump(mode="json")
     content["points"] = [point.model_dump(mode="json", exclude_none=True) for point in tradeoff.points]
-    write_json(content, out / TRADEOFF_FILE)
-    written = [out / TRADEOFF_FILE]
+    written = [out / results.TRADEOFF_FILE]
+    write_json(content, written[0])
     texts = {"tradeoff.csv": points_csv(tradeoff), "costs.csv": growth_csv(tradeoff.growth)}
     try:
         for name, text in texts.items():
@@ -200,22 +190,21 @@ def write_report(tradeoff: Tradeoff, out: Path) -> list[Path]:
 def points_csv(tradeoff: Tradeoff) -> str:
     """A line for each setting; ``front_seconds`` and ``front_frames``: on the front of object MAE; ``slowed``: the
     machine was busier at that time than in the run's median."""
-    fronts = [{point.key for point in tradeoff.front(cost)} for cost in COST_KEYS]
-    head = [*_POINT_FIELDS, "interval_low_mm", "interval_high_mm", "front_seconds", "front_frames", "slowed"]
+    fronts = [tradeoff.front(cost) for cost in COST_KEYS]
+    names = [name for name in Point.model_fields if name != "interval_mm"]
+    head = [*names, "interval_low_mm", "interval_high_mm", "front_seconds", "front_frames", "slowed"]
     return _csv(head, (
-        [*(getattr(point, name) for name in _POINT_FIELDS), *(point.interval_mm or (None, None)),
-         *(point.key in front for front in fronts), tradeoff.slowed(point)]
+        [*(getattr(point, name) for name in names), *(point.interval_mm or (None, None)),
+         *(point in front for front in fronts), tradeoff.slowed(point)]
         for point in tradeoff.points
     ))  # fmt: skip
 
 
 def growth_csv(growths: Iterable[Growth]) -> str:
     """A line for each stage and amount, with the stage's fitted power."""
-    head = ["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"]
-    return _csv(head, (
+    return _csv(["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"], (
         [line.stage, line.over, amount, seconds, line.exponent, line.low, line.high, line.tail, line.flag]
-        for line in growths
-        for amount, seconds in zip(line.amounts, line.seconds, strict=True)
+        for line in growths for amount, seconds in zip(line.amounts, line.seconds, strict=True)
     ))  # fmt: skip
 
 
@@ -257,11 +246,9 @@ def front_table(tradeoff: Tradeoff) -> Table:
     for cost in COST_KEYS:
         for point in tradeoff.front(cost):
             ms, low, high = point.ms
-            table.add_row(
-                cost, point.title, f"{ms:.3g}", f"{low:.3g}-{high:.3g}", str(point.frames),
-                *("-" if mae is None else f"{mae:.3g}" for mae in (point.object_mae_mm, point.measured_mae_mm)),
-                "-" if point.missing_share is None else f"{100 * point.missing_share:.3g}%",
-            )  # fmt: skip
+            maes = ("-" if mae is None else f"{mae:.3g}" for mae in (point.object_mae_mm, point.measured_mae_mm))
+            missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.3g}%"
+            table.add_row(cost, point.title, f"{ms:.3g}", f"{low:.3g}-{high:.3g}", str(point.frames), *maes, missing)
         table.add_section()
     return table
 
@@ -272,11 +259,10 @@ def growth_table(growths: Sequence[Growth]) -> Table:
     table = _table("Costs that grow: seconds = c amount^power", ("Stage", "Over"), numbers)
     table.add_column("Flag", overflow="fold")
     for growth in growths:
-        table.add_row(
-            growth.stage, growth.over, f"{growth.amounts[0]:,.0f}", f"{growth.amounts[-1]:,.0f}",
-            f"{1000 * growth.seconds[-1]:.3g}", f"{growth.exponent:.2f}",
-            f"{growth.low:.2f} to {growth.high:.2f}", f"{growth.tail:.2f}", growth.flag or "",
-        )  # fmt: skip
+        amounts = f"{growth.amounts[0]:,.0f}", f"{growth.amounts[-1]:,.0f}"
+        powers = f"{growth.exponent:.2f}", f"{growth.low:.2f} to {growth.high:.2f}", f"{growth.tail:.2f}"
+        ms = f"{1000 * growth.seconds[-1]:.3g}"
+        table.add_row(growth.stage, growth.over, *amounts, ms, *powers, growth.flag or "")
     return table
 
 
@@ -289,11 +275,10 @@ def remarks(tradeoff: Tradeoff) -> list[str]:
             f"Load of the machine: {loads[0]:g} to {loads[-1]:g} on {tradeoff.hardware.cores} cores; its pace (a fixed "
             f"piece of work): {paces[0]:.3g} to {paces[-1]:.3g} ms, median {paces[len(paces) // 2]:.3g}."
         )
-    slow = sum(map(tradeoff.slowed, tradeoff.points))
-    if slow:
+    if slow := sum(map(tradeoff.slowed, tradeoff.points)):
         lines.append(
-            f"{slow} of {len(tradeoff.points)} settings ran while the machine was over {SLOWED} times slower than in "
-            "the median (column slowed of tradeoff.csv): their times are too long."
+            f"{slow} of {len(tradeoff.points)} settings ran while the machine was over {results.SLOWED} times slower "
+            "than in the median (column slowed of tradeoff.csv): their times are too long."
         )
     if tradeoff.sittings > 1:
         lines.append(f"Measured in {tradeoff.sittings} sittings: compare times of different sittings with care.")

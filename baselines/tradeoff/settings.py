@@ -4,6 +4,7 @@ has the networks, `ladders` the costs that grow."""
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,11 +16,12 @@ from fpp_ml_bench.baselines.method import Frames, Method, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
-from fpp_ml_bench.constants import MM_PER_M, TEST_OBJECTS, split_sample_name
+from fpp_ml_bench.constants import MM_PER_M, sample_name, split_sample_name
 from fpp_ml_bench.decoding import MIN_MODULATION, Directions, Limits, plan_direction
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig, decode_cells
 
@@ -77,31 +79,27 @@ def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") ->
 
 @dataclass
 class PhotographedViews:
-    """Objects of the benchmark in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
+    """`SIZE_OBJECTS` in one view each, rendered into memory as ``build`` would, at ``rig``'s size."""
 
     rig: Rig
-    objects: tuple[str, ...]
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{name}_{SIZE_VIEW}" for name in self.objects]
+    names = tuple(sample_name(name, SIZE_VIEW) for name in SIZE_OBJECTS)
 
     def frames(self, method: Method, name: str) -> Frames:
-        return [f if index in method.frames_used else None for index, f in enumerate(self._captures[name][0])]
+        frames = self._rows[name].frames
+        return [frames[i] if i in method.frames_used else None for i in range(len(self.rig.sequence))]
 
     def target_mm(self, name: str) -> NDArray[np.float32]:
-        return self._captures[name][1]
+        row = self._rows[name]
+        return np.where(object_mask(row.depth_mm), np.asarray(row.depth_exact_mm), np.float32(0))
 
     @cached_property
-    def _captures(self) -> dict[str, tuple[list[NDArray[np.uint8]], NDArray[np.float32]]]:
-        captures = {}
-        for name, object_name in zip(self.names, self.objects, strict=True):
+    def _rows(self) -> dict[str, Row]:
+        rows = {}
+        for name in SIZE_OBJECTS:
             # A studio of its own for each view: the frames are its memory, which the next view would overwrite.
-            row = Studio(BuildSettings(self.rig, self.objects)).photograph(solid_mesh(object_name), SIZE_VIEW)
-            exact = np.zeros_like(row.depth_mm) if row.depth_exact_mm is None else row.depth_exact_mm
-            frames = [row.frames[index] for index in range(len(self.rig.sequence))]
-            captures[name] = frames, np.where(object_mask(row.depth_mm), exact, np.float32(0))
-        return captures
+            row = Studio(BuildSettings(self.rig, SIZE_OBJECTS)).photograph(solid_mesh(name), SIZE_VIEW)
+            rows[row.sample] = row
+        return rows
 
 
 @dataclass(frozen=True)
@@ -154,10 +152,9 @@ def _phase(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
     for direction in DIRECTIONS:
         yield setting(direction, direction, direction=direction)
         yield setting(f"{direction}-no-shading", f"{direction}, no shading", direction=direction, shading=False)
-    for direction in DIRECTIONS:
-        for count in QUICK_FRAMES if run.quick else FEW_FRAMES:
-            if count <= views.rig.sequence.steps:
-                yield setting(f"{direction}-{count}", f"{direction}, {count} frames", direction=direction, frames=count)
+    for direction, count in product(DIRECTIONS, QUICK_FRAMES if run.quick else FEW_FRAMES):
+        if count <= views.rig.sequence.steps:
+            yield setting(f"{direction}-{count}", f"{direction}, {count} frames", direction=direction, frames=count)
     if run.quick:
         return
     note = "assumes objects near the rig's standoff distance, which holds for fixed placement"
@@ -178,10 +175,9 @@ def _networks(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
 def _precision(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
     """The decoder's arithmetic in float32 and in float64, for few and for all steps."""
     most = views.rig.sequence.steps
-    for steps in (most,) if run.quick else (3, most):
-        for dtype in ("float32", "float64"):
-            make = partial(DecodeInType, views.rig, "vertical", steps, dtype=dtype)
-            yield Setting(f"precision-{steps:02d}-{dtype}", "precision", f"NumPy {dtype}, N={steps}", make, views)
+    for steps, dtype in product((most,) if run.quick else (3, most), ("float32", "float64")):
+        make = partial(DecodeInType, views.rig, "vertical", steps, dtype=dtype)
+        yield Setting(f"precision-{steps:02d}-{dtype}", "precision", f"NumPy {dtype}, N={steps}", make, views)
 
 
 def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
@@ -193,7 +189,7 @@ def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
             scaled.check_sampling()
         except FppBenchError:
             continue  # coarser than the fringes allow: no dataset of this rig has such a size
-        photographed = PhotographedViews(scaled, tuple(name for name in SIZE_OBJECTS if name in TEST_OBJECTS))
+        photographed = PhotographedViews(scaled)
         for direction, steps in choices:
             make = partial(ClassicalMethod, scaled, direction, steps, run.threads)
             title = f"classical N={steps}, {direction}"
@@ -203,13 +199,11 @@ def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
 
 
 class DecodeInType(ClassicalMethod):
-    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``.
-
-    The package decodes in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from
-    one projector coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous
-    code, or lies outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is
-    iterated in float64.
-    """
+    """The classical decoder's formulas for one direction in plain NumPy, every array in ``dtype``. The package decodes
+    in float64. This is the same arithmetic (paper Eqs. 1 and 2, fringe order, triangulation from one projector
+    coordinate), so that two runs differ only in the type. A pixel that is too dark, has an ambiguous code, or lies
+    outside the working range gets 0. Raises `DecodeError` for a distorted projector, whose inverse is iterated in
+    float64."""
 
     def __init__(self, rig: Rig, direction: Direction, steps: int, dtype: str) -> None:
         super().__init__(rig, direction, steps)
@@ -225,7 +219,7 @@ class DecodeInType(ClassicalMethod):
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         plan, number, dtype = self.plan, self.number, self.rays[0].dtype
-        grey = [frame for frame in (frames[index] for index in plan.frames) if frame is not None]
+        grey = [frame for index in plan.frames if (frame := frames[index]) is not None]
         if len(grey) != len(plan.frames):
             raise DecodeError(f"expected the {len(plan.frames)} frames {plan.frames}, {len(grey)} were captured")
         sums = np.zeros((3, *grey[0].shape), dtype)
@@ -240,17 +234,14 @@ class DecodeInType(ClassicalMethod):
         phase = -np.arctan2(sine, cosine)
         centre = plan.centres_rad.astype(dtype)[np.minimum(cells, len(plan.centres_rad) - 1)]
         absolute = phase + turn * np.floor((centre - phase) / turn + number(0.5))
-        return self._depth(absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION))
-
-    def _depth(self, coordinate_px: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        number, axis, device, t_m = self.number, self.axis, self.rig.projector, self.rig.t
+        coordinate_px, valid = absolute * number(plan.pitch_px / (2 * np.pi)), trusted & (modulation >= MIN_MODULATION)
+        axis, device, t_m = self.axis, self.rig.projector, self.rig.t
         ideal = (coordinate_px - number((device.cx, device.cy)[axis])) / number((device.fx, device.fy)[axis])
         across, forward = self.rays
+        near, far = self.rig.working_range_mm
         with np.errstate(all="ignore"):
             depth_mm = (ideal * number(t_m[2]) - number(t_m[axis])) / (across - ideal * forward) * number(MM_PER_M)
-            near, far = self.rig.working_range_mm
-            valid = valid & (depth_mm >= near) & (depth_mm <= far)
-        return np.where(valid, depth_mm, 0).astype(np.float32)
+            return np.where(valid & (depth_mm >= near) & (depth_mm <= far), depth_mm, 0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -262,16 +253,10 @@ class Plan:
     settings: list[Setting]
     ladders: list[Ladder]
 
-    def __len__(self) -> int:
-        return len(self.settings) + len(self.ladders)
-
 
 def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
-    """The plan of a run; ``more_ladders`` are measured with this room's own. Nothing is measured yet.
-
-    Raises DatasetError for a folder that is no dataset or has no test split, WeightsError for a ``runs`` that is no
-    folder.
-    """
+    """The plan of a run; ``more_ladders`` are measured with this room's own. Nothing is measured yet. Raises
+    DatasetError for a folder that is no dataset or has no test split, WeightsError for a ``runs`` that is no folder."""
     opened = DatasetFolder(run.dataset)
     views = choose_views(opened, run.views or (QUICK_VIEWS if run.quick else VIEWS_AN_OBJECT))
     makers: dict[Group, Callable[[StoredViews, TradeoffSettings], Iterator[Setting]]] = {

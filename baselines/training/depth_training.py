@@ -61,17 +61,14 @@ def train(
     recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
 ) -> TrainingRun:
     """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
-
     ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
-    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named).
-    """
+    dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named)."""
     out, started = Path(out), perf_counter()
     data, validation = open_data(recipe, Path(dataset))
     with PartialState().local_main_process_first():
         claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
-    finished = finished_run(out)
-    if finished is not None:
+    if (finished := finished_run(out)) is not None:
         return finished
     with reproducible(recipe.precision):
         training = DepthTraining(recipe, data, validation, out)
@@ -116,13 +113,12 @@ class DepthTraining(Training):
         else:
             self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha)
         self.bare = dict(self.objective.modules)
-        on_gpu = self.accelerator.device.type == "cuda"
-        if on_gpu:
+        modules: dict[str, Any] = dict(self.bare)
+        if on_gpu := self.accelerator.device.type == "cuda":
             for module in self.bare.values():
                 module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        modules: dict[str, Any] = dict(self.bare)
-        if on_gpu and recipe.compile:
-            modules = {name: torch.compile(module) for name, module in modules.items()}
+            if recipe.compile:
+                modules = {name: torch.compile(module) for name, module in modules.items()}
         rule = recipe.optimizer
         self.optimizers = {
             name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
@@ -132,10 +128,9 @@ class DepthTraining(Training):
         self.sampler = EpochSampler(len(data), recipe.pairs_per_epoch, recipe.seed)
         loader = training_loader(data, self.sampler, recipe.batch, pin=on_gpu)
         self.loader: DataLoader = self.accelerator.prepare(loader)
-        for name in modules:
-            self.objective.modules[name], self.optimizers[name] = self.accelerator.prepare(
-                modules[name], self.optimizers[name]
-            )
+        for name, module in modules.items():
+            prepared = self.accelerator.prepare(module, self.optimizers[name])
+            self.objective.modules[name], self.optimizers[name] = prepared
         self.resume()
 
     @property
@@ -232,9 +227,8 @@ class DepthTraining(Training):
         self.schedule.step(record["validation_loss"])
         if self.best is record and self.accelerator.is_main_process:
             scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
-            network, fingerprint = self.bare["network"], self.data.source.fingerprint
-            config = model_config(self.recipe, network, fingerprint, record["epoch"], scores)
-            save_weights(self.out / WEIGHTS, network, config)
+            network, data = self.bare["network"], self.data.source.fingerprint
+            save_weights(self.out / WEIGHTS, network, model_config(self.recipe, network, data, record["epoch"], scores))
 
     def state(self) -> dict[str, Any]:
         return {"schedule": self.schedule.state()}
@@ -244,30 +238,25 @@ class DepthTraining(Training):
 
     def progress(self) -> str:
         record = self.history[-1]
-        score = record["object_mae_mm"]
-        return (
-            f"epoch {record['epoch']}/{self.epochs}  loss {record['training_loss']:.4g} / "
-            f"{record['validation_loss']:.4g}  object {'-' if score is None else f'{score:.1f} mm'}  rate "
-            f"{record['learning_rate']:.1e}"
-        )
+        score, losses = record["object_mae_mm"], (record["training_loss"], record["validation_loss"])
+        shown, rate = "-" if score is None else f"{score:.1f} mm", record["learning_rate"]
+        epoch = f"epoch {record['epoch']}/{self.epochs}"
+        return f"{epoch}  loss {losses[0]:.4g} / {losses[1]:.4g}  object {shown}  rate {rate:.1e}"
 
     def panels(self) -> list[Panel]:
-        labels = {"training_loss": "training", "validation_loss": "validation"}
+        labels, kept = {"training_loss": "training", "validation_loss": "validation"}, self.best["epoch"]
         losses = Panel.of("loss", self.history, "epoch", labels, log=True)
-        kept = self.best["epoch"]
         losses.lines[f"kept: epoch {kept}"] = ([kept], [self.best["validation_loss"]])
         object_mae = Panel.of("validation object MAE, mm", self.history, "epoch", {"object_mae_mm": "_"})
         return [losses, object_mae, Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True)]
 
 
-def model_config(
-    recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: dict[str, Any]
-) -> ModelConfig:
+def model_config(recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: Record) -> ModelConfig:
     """Configuration for the weights file."""
     return ModelConfig(
         name=recipe.name, title=recipe.title, network=recipe.network,
         options=dict(network.options),  # type: ignore[arg-type, call-overload]
         normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=fingerprint,
-        benchmark=training_benchmark(fingerprint), data_config=recipe.data_config,
+        benchmark=training_benchmark(fingerprint), data_config=recipe.frames,
         background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
     )  # fmt: skip

@@ -21,19 +21,9 @@ from accelerate.utils import broadcast_object_list, gather_object, set_seed
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from fpp_ml_bench.baselines.training import records
 from fpp_ml_bench.baselines.training.losses import Objective
-from fpp_ml_bench.baselines.training.records import (
-    CURVE_FILE,
-    Display,
-    Panel,
-    Record,
-    draw_curves,
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    save_checkpoint,
-    write_log,
-)
+from fpp_ml_bench.baselines.training.records import Display, Panel, Record
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.machine import keep_freed_memory
@@ -47,10 +37,8 @@ DIVERGED = 1e6
 
 class Training(ABC):
     """A training's state and loop; a subclass says what is trained on what, at which rate, and how it is validated.
-
     ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, not compiled or
-    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share.
-    """
+    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share."""
 
     name: str
     title: str
@@ -59,12 +47,10 @@ class Training(ABC):
     bare: dict[str, nn.Module]
     largest_gradient: float | None = None
 
-    def __init__(
-        self, out: Path, identity: Mapping[str, Any], seed: int, precision: str = "fp32", cpu: bool = False
-    ) -> None:
+    def __init__(self, out: Path, identity: Record, seed: int, precision: str = "fp32", cpu: bool = False) -> None:
         self.out, self.identity = out, dict(identity)
-        mixed_precision = "no" if precision == "fp32" else precision
-        self.accelerator = Accelerator(mixed_precision=mixed_precision, cpu=cpu, gradient_accumulation_steps=1)
+        mixed = "no" if precision == "fp32" else precision
+        self.accelerator = Accelerator(mixed_precision=mixed, cpu=cpu, gradient_accumulation_steps=1)
         set_seed(seed)
         self.history: list[Record] = []
         self.first_loss: float | None = None
@@ -143,14 +129,14 @@ class Training(ABC):
                 self.recorded(record)
                 if self.accelerator.is_main_process:
                     self._save()
-                    write_log(self.out, self.history)
+                    records.write_log(self.out, self.history)
                 self.accelerator.wait_for_everyone()
                 display.update(self.steps_done, self.progress())
                 last_interval_s = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process and self.history:
-            write_log(self.out, self.history)
-            draw_curves(self.out / CURVE_FILE, self.title, self.panels())
+            records.write_log(self.out, self.history)
+            records.draw_curves(self.out / records.CURVE_FILE, self.title, self.panels())
         return seconds
 
     def step(self, batch: Any) -> dict[str, Tensor]:
@@ -161,25 +147,23 @@ class Training(ABC):
                 optimizer = self.optimizers[name]
                 optimizer.zero_grad(set_to_none=True)
                 self.accelerator.backward(loss)
-                if self.largest_gradient is not None:
-                    parameters = self.objective.modules[name].parameters()
-                    self.accelerator.clip_grad_norm_(parameters, self.largest_gradient)
+                if (largest := self.largest_gradient) is not None:
+                    self.accelerator.clip_grad_norm_(self.objective.modules[name].parameters(), largest)
                 optimizer.step()
                 logged |= values
         return logged
 
     def resume(self) -> None:
         """Continue from the checkpoint, where there is one. Call it when all modules and optimisers are made."""
-        path = self.out / CHECKPOINT
-        if path.exists():
-            tensors, state = read_checkpoint(path)
+        if (path := self.out / CHECKPOINT).exists():
+            tensors, state = records.read_checkpoint(path)
             if any(state.get(key) != value for key, value in self.identity.items()):
                 raise TrainingError(f"{path}: belongs to another recipe or dataset; give a new folder")
             for name, module in self.bare.items():
                 prefix = f"module.{name}."
                 module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
             for name, optimizer in self.optimizers.items():
-                restore_optimizer(optimizer, tensors, f"optimizer.{name}")
+                records.restore_optimizer(optimizer, tensors, f"optimizer.{name}")
             self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
             self.resumed_at = len(self.history)
             self.restore(state)
@@ -189,12 +173,11 @@ class Training(ABC):
 
     def _train_interval(self, display: Display) -> dict[str, float]:
         """One pass over `batches`; the mean over them of everything the objective logs."""
-        batches = self.batches()
+        batches, count = self.batches(), 0
         for module in self.objective.modules.values():
             module.train()
         unchecked: list[tuple[int, Any, dict[str, Tensor]]] = []
         sums: dict[str, float] = {}
-        count = 0
         for batch in batches:
             for optimizer in self.optimizers.values():
                 for group in optimizer.param_groups:
@@ -229,10 +212,10 @@ class Training(ABC):
         for name, module in self.bare.items():
             tensors |= {f"module.{name}.{key}": value for key, value in module.state_dict().items()}
         for name, optimizer in self.optimizers.items():
-            tensors |= optimizer_tensors(optimizer, f"optimizer.{name}")
+            tensors |= records.optimizer_tensors(optimizer, f"optimizer.{name}")
         seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
         state = {"history": self.history, "first_loss": self.first_loss, "seconds": seconds}
-        save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
+        records.save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
 
 
 def claim_folder(out: Path, content: dict[str, Any]) -> None:

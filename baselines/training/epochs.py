@@ -82,7 +82,7 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
     """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
     datasets = []
     for split in ("train", "validation"):
-        data = FringeDepthDataset(dataset, split, recipe.data_config, recipe.normalisation, recipe.background_removed)
+        data = FringeDepthDataset(dataset, split, recipe.frames, recipe.normalisation, recipe.background_removed)
         if data.source.size != (recipe.size, recipe.size):
             height, width = data.source.size
             raise TrainingError(

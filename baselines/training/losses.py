@@ -33,11 +33,9 @@ EPSILON = 1e-8
 
 def loss_function(name: str, alpha: float | None = None) -> Callable[[Tensor, Tensor], Tensor]:
     """The training loss ``name`` as a function of ``prediction`` and ``target``, each (B, 1, H, W), any float dtype, to
-    a 0-d tensor, float32 (float64 for float64 input). ``alpha`` in [0, 1] is for the hybrids, and needed there.
-
-    Raises `RecipeError` for an unknown name or an ``alpha`` that is missing, out of range, or of no use. The function
-    raises ``ValueError`` for tensors that are not of one shape (B, 1, H, W), empty, or not of floats.
-    """
+    a 0-d tensor, float32 (float64 for float64 input). ``alpha`` in [0, 1] is for the hybrids, and needed there. Raises
+    `RecipeError` for an unknown name or an ``alpha`` that is missing, out of range, or of no use. The function raises
+    ``ValueError`` for tensors that are not of one shape (B, 1, H, W), empty, or not of floats."""
     check_loss(name, alpha)
     return partial(_loss, name, alpha, per_sample=False)
 
@@ -91,10 +89,8 @@ def scores_against(answers: Features, real: bool) -> Tensor:
 
 
 def feature_matching(generated: Features, real: Features) -> Tensor:
-    """Mean absolute difference of each layer's features but the scores', summed over layers, averaged over scales.
-
-    The real image's features are taken as they are: no gradient flows into them.
-    """
+    """Mean absolute difference of each layer's features but the scores', summed over layers, averaged over scales. The
+    real image's features are taken as they are: no gradient flows into them."""
     scales = []
     for ours, theirs in zip(generated, real, strict=True):
         pairs = zip(ours[:-1], theirs[:-1], strict=True)
@@ -109,19 +105,15 @@ def l1(prediction: Tensor, target: Tensor) -> Tensor:
 
 def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean absolute difference of the steps to the next pixel, to the right plus downwards; (B, 1, H, W), H and W > 1.
-
-    The step of a difference is the difference of the steps, so a constant offset costs nothing.
-    """
+    The step of a difference is the difference of the steps, so a constant offset costs nothing."""
     difference = _wide(prediction) - _wide(target)
     return difference.diff(dim=-1).abs().mean() + difference.diff(dim=-2).abs().mean()
 
 
 def scale_invariant_log(prediction: Tensor, target: Tensor) -> Tensor:
     """mean g^2 - lambda (mean g)^2 of g = log p - log t over each sample's object (t > 0), averaged over the samples.
-
     ``prediction`` and ``target`` (B, 1, H, W) in [0, 1]; `LOG_FLOOR` is added to both, and a prediction below 0 counts
-    as 0. Never negative; 0 for a sample without an object. NaN anywhere makes it NaN.
-    """
+    as 0. Never negative; 0 for a sample without an object. NaN anywhere makes it NaN."""
     prediction, target = _wide(prediction), _wide(target)
     mask = target > 0
     # Products, not selections, so that a NaN in the background is not hidden.
@@ -140,12 +132,10 @@ Step = tuple[str, Tensor, dict[str, Tensor]]
 
 
 class Objective(Protocol):
-    """What is minimised: it owns its networks and gives the engine the losses, one by one.
-
-    Every call goes through ``modules``: the engine may put wrapped networks (several processes, mixed precision,
-    compiled) there. The weights file holds ``modules["network"]``. An objective of depth also has
-    ``validation_losses(prediction, batch)``, (B,), of which rate schedule and choice of weights see the mean.
-    """
+    """What is minimised: it owns its networks and gives the engine the losses, one by one. Every call goes through
+    ``modules``: the engine may put wrapped networks (several processes, mixed precision, compiled) there. The weights
+    file holds ``modules["network"]``. An objective of depth also has ``validation_losses(prediction, batch)``, (B,), of
+    which rate schedule and choice of weights see the mean."""
 
     modules: dict[str, nn.Module]
 
@@ -171,11 +161,9 @@ class Regression:
 
 @dataclass(frozen=True)
 class AdversarialSettings:
-    """Weights of the generator's terms; the defaults are those of the paper's pix2pixHD baseline.
-
-    ``l1`` and ``gradient_l1`` weigh differences in [-1, 1], ``scale_invariant_log`` logarithms of depths in [0, 1].
-    Raises `RecipeError` for a weight that is negative or not finite.
-    """
+    """Weights of the generator's terms; the defaults are those of the paper's pix2pixHD baseline. ``l1`` and
+    ``gradient_l1`` weigh differences in [-1, 1], ``scale_invariant_log`` logarithms of depths in [0, 1]. Raises
+    `RecipeError` for a weight that is negative or not finite."""
 
     adversarial: float = 1.0
     feature_matching: float = 10.0
@@ -191,11 +179,9 @@ class AdversarialSettings:
 
 class Adversarial:
     """A generator against a discriminator that is trained too: least squares GAN, feature matching, depth terms.
-
     ``generator`` maps a fringe image to depth, both in [0, 1]; ``discriminator`` takes (B, 2, H, W), fringe and depth,
     each in [-1, 1], to lists of features, the scores last. It learns first; the generator, run forward once for both,
-    is then judged by the updated one.
-    """
+    is then judged by the updated one."""
 
     def __init__(
         self, generator: nn.Module, discriminator: nn.Module, settings: AdversarialSettings | None = None

@@ -3,6 +3,7 @@ Resolved with a preset, which sets what depends on the machine, it is every numb
 
 import hashlib
 import json
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -69,11 +70,9 @@ class Loss(StrictModel):
 
 
 class Recipe(StrictModel):
-    """Everything that a training depends on.
-
-    ``size``: the image's width and height in px. ``pairs_per_epoch`` are drawn for each epoch, ``validation_pairs``
-    evenly over the validation split; null takes all. ``options`` go to `networks.build`.
-    """
+    """Everything that a training depends on. ``size``: the image's width and height in px. ``pairs_per_epoch`` are
+    drawn for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``frames``: those that
+    are training pairs of their own, one of `CONFIGS`. ``options`` go to `networks.build`."""
 
     preset: Text
     size: Annotated[int, Field(ge=16)]
@@ -107,11 +106,6 @@ class Recipe(StrictModel):
         if self.network == "pix2pix" and self.normalisation != "individual":
             raise ValueError("network pix2pix answers in [0, 1], so its normalisation must be individual")
         return self
-
-    @property
-    def data_config(self) -> str:
-        """Which frames are training pairs of their own, one of `CONFIGS`."""
-        return self.frames
 
     @property
     def name(self) -> str:
@@ -180,8 +174,6 @@ def _recipe_path(name_or_path: str | Path) -> Path:
         return path
     path = RECIPES / f"{text}.yaml"
     if ".." in Path(text).parts or Path(text).is_absolute() or not path.is_file():
-        from difflib import get_close_matches
-
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
         closest = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
         raise RecipeError(

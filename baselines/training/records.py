@@ -11,6 +11,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from rich import progress as bar
+from rich.console import Console
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -56,10 +58,8 @@ def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no mapping
-    except (SafetensorError, OSError, ValueError) as error:
-        raise TrainingError(
-            f"{path}: expected a checkpoint of this package, it can't be read ({error}){cure}"
-        ) from None
+    except (SafetensorError, OSError, ValueError) as why:
+        raise TrainingError(f"{path}: expected a checkpoint of this package, it can't be read ({why}){cure}") from None
     if metadata.get("format") != _FORMAT:
         raise TrainingError(f"{path}: expected {_FORMAT!r}, got {metadata.get('format')!r}{cure}")
     if metadata.get("sha256") != _seal(tensors, metadata.get("state", "")):
@@ -95,8 +95,8 @@ class Panel:
         """The values of the keys ``labels`` over those of ``x``, where there are some."""
         lines: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
         for key, label in labels.items():
-            points = [(record[x], record[key]) for record in history if record.get(key) is not None]
-            lines[label] = ([at for at, _ in points], [value for _, value in points])
+            known = [record for record in history if record.get(key) is not None]
+            lines[label] = [record[x] for record in known], [record[key] for record in known]
         return cls(title, x, lines, log)
 
 
@@ -125,34 +125,24 @@ class Display:
     """A rich progress bar on standard error over at most ``steps`` steps; silent when ``show`` is False."""
 
     def __init__(self, name: str, steps: int, show: bool) -> None:
-        self.name, self.steps = name, steps
-        self.progress: Any = None
-        if not show:
-            return
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self.progress = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[state]}"),
-            TimeElapsedColumn(), TextColumn("left at most"), TimeRemainingColumn(), console=Console(stderr=True),
+        self.progress = bar.Progress(
+            bar.TextColumn("{task.description}"), bar.BarColumn(bar_width=20), bar.TextColumn("{task.fields[state]}"),
+            bar.TimeElapsedColumn(), bar.TextColumn("left at most"), bar.TimeRemainingColumn(),
+            console=Console(stderr=True, quiet=not show), disable=not show,
         )  # fmt: skip
+        self.task = self.progress.add_task(name, total=steps, state="")
 
     def __enter__(self) -> "Display":
-        if self.progress is not None:
-            self.progress.start()
-            self.task = self.progress.add_task(self.name, total=self.steps, state="")
+        self.progress.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self.progress is not None:
-            self.progress.stop()
+        self.progress.stop()
 
     def advance(self, steps: int = 1) -> None:
         """So many more steps are done."""
-        if self.progress is not None:
-            self.progress.advance(self.task, steps)
+        self.progress.advance(self.task, steps)
 
     def update(self, steps_done: int, state: str) -> None:
         """All steps so far, now or by an earlier call, and words on where they led."""
-        if self.progress is not None:
-            self.progress.update(self.task, completed=steps_done, state=state)
+        self.progress.update(self.task, completed=steps_done, state=state)

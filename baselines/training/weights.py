@@ -58,8 +58,7 @@ class ModelConfig:
     ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is what it puts out, ``image_size``
     (H, W) in px the only size it is meant for. ``data_config`` names the frames it was trained on,
     ``background_removed`` says that its input is 0 outside the object. ``benchmark`` is None for a dataset of the
-    user's own, and in older files; ``recipe`` the resolved recipe, ``validation`` the scores of these weights.
-    """
+    user's own, and in older files; ``recipe`` the resolved recipe, ``validation`` the scores of these weights."""
 
     name: Text
     title: Text
@@ -82,11 +81,10 @@ class ModelConfig:
 
 @checked_dataclass(frozen=True, config=_STRICT)
 class NetConfig:
-    """What a phase network is, how its answers are used, and what it was trained on.
-
-    ``options``: arguments of `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added
-    to the logit of the base order, both chosen on the validation split; ``period_px``: image px per fringe period of
-    the training images, by direction; ``steps`` trained; the others as in `ModelConfig`."""
+    """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
+    `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
+    order, both chosen on the validation split; ``period_px``: image px per fringe period of the training images, by
+    direction; ``steps`` trained; the others as in `ModelConfig`."""
 
     name: Text
     title: Text
@@ -136,11 +134,9 @@ class WeightsFile:
 def save_weights(
     path: str | Path, network: "nn.Module", config: ModelConfig, heads: "Mapping[str, Tensor] | None" = None
 ) -> None:
-    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all.
-
-    Raises `WeightsError` for tensors that are not finite, that do not fit the network that ``config`` builds, and for
-    a path that can't be written.
-    """
+    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all. Raises `WeightsError`
+    for tensors that are not finite, that do not fit the network that ``config`` builds, and for a path that can't be
+    written."""
     path = Path(path)
     if path.suffix != SUFFIX:
         raise _fault(path, f": expected a name that ends in {SUFFIX}; weights are saved as nothing else")
@@ -228,11 +224,9 @@ def write_file(path: Path, family: Family, config: ModelConfig | NetConfig, tens
 
 
 def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]":
-    """The checked configuration, the tensors as they are, and the SHA-256 of a file of ``family``.
-
-    Raises `WeightsError`, naming file, expectation, finding and cure, for a file that is absent, damaged, a pickle or
-    of another kind or version, or has unknown or missing keys in its configuration.
-    """
+    """The checked configuration, the tensors as they are, and the SHA-256 of a file of ``family``. Raises
+    `WeightsError`, naming file, expectation, finding and cure, for a file that is absent, damaged, a pickle or of
+    another kind or version, or has unknown or missing keys in its configuration."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 

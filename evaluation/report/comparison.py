@@ -1,8 +1,6 @@
 """Two results of the same samples, sample by sample: the paired difference, its interval, and a sentence about it.
-
 Samples that are hard for both methods cancel in the difference. A comparison can therefore tell two methods apart whose
-own intervals overlap.
-"""
+own intervals overlap."""
 
 import statistics
 from operator import attrgetter
@@ -32,8 +30,7 @@ class PairedSample(StrictModel):
 class Difference(StrictModel):
     """Mean of second minus first in mm over the ``samples`` that both have, its 95% interval over ``objects``.
 
-    ``lower`` and ``higher`` count the samples in which the second's error is smaller and larger.
-    """
+    ``lower`` and ``higher`` count the samples in which the second's error is smaller and larger."""
 
     mean_mm: float | None
     interval_mm: Interval

@@ -170,10 +170,8 @@ def sheet_png(rows: list[list[Panel]]) -> bytes:
 
 
 def _tile(panel: Panel) -> NDArray[np.uint8]:
-    """The panel's indices into the common palette at the tile's size, with the gap right of it and below.
-
-    Pixels are left out or repeated, never averaged.
-    """
+    """The panel's indices into the common palette at the tile's size, with the gap right of it and below. Pixels are
+    left out or repeated, never averaged."""
     height, width = panel.indices.shape
     side = max(height, width)
     rows, columns = (np.arange(n * TILE_PX // side) * side // TILE_PX for n in (height, width))

@@ -1,8 +1,6 @@
-"""Writing HTML pages in which text from a submission stays text, and which load nothing; how numbers are written.
-
-A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
-the given hashes: the page sends no request, and an injected script can't run.
-"""
+"""Writing HTML pages in which text from a submission stays text, and which load nothing; how numbers are written. A
+page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with the
+given hashes: the page sends no request, and an injected script can't run."""
 
 import hashlib
 import html
@@ -71,11 +69,9 @@ def _base_style() -> str:
 
 
 def render(package: str, template: str, **values: object) -> str:
-    """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped.
-
-    A template may include or import those of this package's own ``templates`` too. Filters: ``printable``, and the
-    numbers of this module. Wrap only HTML that this package made in ``markupsafe.Markup``.
-    """
+    """HTML from ``templates/TEMPLATE`` of ``package`` by Jinja2, with every value escaped. A template may include or
+    import those of this package's own ``templates`` too. Filters: ``printable``, and the numbers of this module. Wrap
+    only HTML that this package made in ``markupsafe.Markup``."""
     return _environment(package).get_template(template).render(values)
 
 

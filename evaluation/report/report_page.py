@@ -20,26 +20,16 @@ _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.
 """The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
 _ON_SHEET = ("Best", "Median", "Worst")
 _TITLES = {
-    "object_mae_mm": "Object MAE",
-    "object_rmse_mm": "Object RMSE",
-    "overall_mae_mm": "Overall MAE",
-    "overall_rmse_mm": "Overall RMSE",
-    "background_mae_mm": "Background MAE",
-    "background_rmse_mm": "Background RMSE",
-    "object_median_mm": "Object, median error",
-    "object_p95_mm": "Object, 95th percentile",
-    "object_max_mm": "Object, largest error",
-    "object_within_1mm_share": "Object within 1 mm",
-    "object_within_2mm_share": "Object within 2 mm",
-    "object_within_5mm_share": "Object within 5 mm",
-    "object_within_10mm_share": "Object within 10 mm",
-    "object_bias_mm": "Object, signed bias",
+    "object_mae_mm": "Object MAE", "object_rmse_mm": "Object RMSE", "overall_mae_mm": "Overall MAE",
+    "overall_rmse_mm": "Overall RMSE", "background_mae_mm": "Background MAE", "background_rmse_mm": "Background RMSE",
+    "object_median_mm": "Object, median error", "object_p95_mm": "Object, 95th percentile",
+    "object_max_mm": "Object, largest error", "object_within_1mm_share": "Object within 1 mm",
+    "object_within_2mm_share": "Object within 2 mm", "object_within_5mm_share": "Object within 5 mm",
+    "object_within_10mm_share": "Object within 10 mm", "object_bias_mm": "Object, signed bias",
     "object_valid_bias_mm": "Object where predicted, signed bias",
     "object_shift_free_mae_mm": "Object MAE without one offset",
-    "object_interior_mae_mm": "Object away from edges, MAE",
-    "object_interior_rmse_mm": "Object away from edges, RMSE",
-    "object_edge_mae_mm": "Object along edges, MAE",
-    "object_edge_rmse_mm": "Object along edges, RMSE",
+    "object_interior_mae_mm": "Object away from edges, MAE", "object_interior_rmse_mm": "Object away from edges, RMSE",
+    "object_edge_mae_mm": "Object along edges, MAE", "object_edge_rmse_mm": "Object along edges, RMSE",
     "object_valid_mae_mm": "Object where predicted, MAE",
     "object_interior_valid_mae_mm": "Object where predicted, away from edges, MAE",
     "object_missing_share": "Object not predicted",
@@ -48,25 +38,21 @@ _TITLES = {
     "object_wide_band_mae_mm": "Object within 8 px of edges, MAE",
     "object_wide_interior_mae_mm": "Object 8 px or more from edges, MAE",
     "object_wide_band_share": "Object within 8 px of edges, share of pixels",
-}
+}  # fmt: skip
 """Every key of `METRICS` in the order of the page."""
 
 
 def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str | Path, out: str | Path) -> Path:
-    """Write ``out/index.html`` for a result and the predictions it was made from, and return its path.
-
-    The page is self-contained and loads nothing. Pixels of at most five samples are read, so memory does not grow with
-    the number of samples.
-
-    Raises DatasetError when ``dataset`` is not the dataset that was scored, PredictionError for a prediction that can't
-    be read any more, and SubmissionError where the page can't be written.
-    """
+    """Write ``out/index.html`` for a result and the predictions it was made from, and return its path. The page is
+    self-contained and loads nothing. Pixels of at most five samples are read, so memory does not grow with the number
+    of samples. Raises DatasetError when ``dataset`` is not the dataset that was scored, PredictionError for a
+    prediction that can't be read any more, and SubmissionError where the page can't be written."""
     errors = [row.object_mae_mm for row in result.per_sample if row.object_mae_mm is not None]
     body = render(
         __package__,
         "report.html",
         result=result,
-        samples=_chosen_panels(result, dataset, Path(predictions_folder)),
+        samples=_panels(result, dataset, Path(predictions_folder)),
         bars=histogram(errors, statistics.fmean(errors), "object MAE of a sample") if errors else None,
         score_table=Markup(score_table(result)),
         sample_table=Markup(sample_table(result)),
@@ -78,7 +64,7 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
 
 def write_sheet(result: Result, dataset: DatasetFolder, predictions_folder: str | Path, path: Path) -> None:
     """One PNG of the best, the median and the worst sample, five panels each. Raises what `write_report` raises."""
-    chosen = _chosen_panels(result, dataset, Path(predictions_folder))
+    chosen = _panels(result, dataset, Path(predictions_folder))
     sheet = sheet_png([panels for place, _, panels in chosen if place in _ON_SHEET])
     write_file(sheet, path, new_folder=True)
 
@@ -98,9 +84,7 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
     return row.object_mae_mm or 0.0, row.sample
 
 
-def _chosen_panels(
-    result: Result, dataset: DatasetFolder, folder: Path
-) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
+def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
     """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
     if dataset.fingerprint != result.dataset.fingerprint:
         difference = f"fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was scored"

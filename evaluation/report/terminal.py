@@ -1,7 +1,5 @@
-"""What `fpp-eval` prints: a result's pixel sets and samples of largest error, and the comparison of two results.
-
-Every text from a submission is shown as plain text, never as markup.
-"""
+"""What `fpp-eval` prints: a result's pixel sets and samples of largest error, and the comparison of two results. Every
+text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 

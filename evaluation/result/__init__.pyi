@@ -9,7 +9,7 @@ from .file import write_file as write_file
 from .file import write_json as write_json
 from .file import write_result as write_result
 from .model import Result as Result
-from .model import mean_over_samples as mean_over_samples
+from .model import over_samples as over_samples
 from .model import result_from_rows as result_from_rows
 from .model import same as same
 from .parts import PART_TITLES as PART_TITLES

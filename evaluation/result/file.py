@@ -112,10 +112,8 @@ def _refuse_constant(name: str) -> None:
 
 
 def json_schema(name: str) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``.
-
-    It lists the keys and what each may hold. Whether averages follow from the samples is checked on reading.
-    """
+    """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``. It lists the keys and what each may
+    hold. Whether averages follow from the samples is checked on reading."""
     models: dict[str, type[pydantic.BaseModel]] = {
         "result": Result, "submission": submission.Submission, "comparison": report.Comparison,
     }  # fmt: skip
@@ -145,10 +143,8 @@ def environment() -> Environment:
 
 
 def checkout_commit(folder: Path) -> str | None:
-    """The commit of the checkout in ``folder``, read from its ``.git``; None where there is none.
-
-    No ``git`` is run: starting it would take as long as scoring several samples, and it need not be installed.
-    """
+    """The commit of the checkout in ``folder``, read from its ``.git``; None where there is none. No ``git`` is run:
+    starting it would take as long as scoring several samples, and it need not be installed."""
 
     def text_of(path: Path) -> str:
         return path.read_text(encoding="utf-8").strip()

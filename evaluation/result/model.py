@@ -1,8 +1,6 @@
-"""``result.json``: the scores of a submission on a split, as a strict model that checks itself.
-
-A result that was edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample
-scores whenever a file is read, and overall is checked against object and background in every sample.
-"""
+"""``result.json``: the scores of a submission on a split, as a strict model that checks itself. A result that was
+edited by hand contradicts itself: averages, objects and intervals are recomputed from the per-sample scores whenever a
+file is read, and overall is checked against object and background in every sample."""
 
 import math
 import statistics
@@ -103,7 +101,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     outside = combine(*(row.stats("background") for row in per_sample))
     intervals = intervals_over_objects(rows, objects, protocol.HEADLINE)
     return {
-        "metrics": mean_over_samples(rows),
+        "metrics": over_samples(rows),
         "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
         "median": over_samples(rows, statistics.median),
         "pooled": pooled(inside, outside),
@@ -113,7 +111,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
             {
                 "object": name,
                 "samples": len(views := [row for row, owner in zip(rows, objects, strict=True) if owner == name]),
-                "metrics": mean_over_samples(views),
+                "metrics": over_samples(views),
                 "spread": over_samples(views, _deviation),
             }
             for name in dict.fromkeys(objects)
@@ -128,13 +126,8 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     }
 
 
-def mean_over_samples(rows: Sequence[Scores]) -> Scores:
-    """Plain mean of each metric over the samples that have it (paper Section 5.3.2); None where no sample has."""
-    return over_samples(rows, statistics.fmean)
-
-
-def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None]) -> Scores:
-    """A statistic of each metric over the samples that have it; None where no sample has."""
+def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None] = statistics.fmean) -> Scores:
+    """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it; None if none has."""
     columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 

@@ -92,9 +92,6 @@ class Intervals(StrictModel):
     background_mae_mm: Interval
     background_rmse_mm: Interval
 
-    def __getitem__(self, key: str) -> list[float | None]:
-        return getattr(self, key)  # type: ignore[no-any-return]
-
     def of(self, key: str) -> tuple[float, float] | None:
         """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
         return ends(getattr(self, key, (None, None)))
@@ -120,8 +117,7 @@ class DatasetInfo(SparseModel):
     """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
 
     ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version that this package knows
-    with another fingerprint, or a fingerprint that it knows under another name or version, is refused.
-    """
+    with another fingerprint, or a fingerprint that it knows under another name or version, is refused."""
 
     SPARSE = ("benchmark",)
 
@@ -173,8 +169,7 @@ class Environment(StrictModel):
     """Where and with what the scores were computed (not where the predictions were made: see ``submission``).
 
     ``git`` is the commit of the checkout this package ran from, null for an installed package. ``code_sha256`` covers
-    the source of the scoring, so an edited checkout differs from its commit.
-    """
+    the source of the scoring, so an edited checkout differs from its commit."""
 
     python: Text
     packages: dict[Text, Text] = Field(max_length=100)
@@ -190,8 +185,7 @@ class Timing(StrictModel):
     ``repeats`` runs, in ms. Throughput is in images per second with ``batch`` images at once (``batched`` says whether
     the method takes them together or one after another). ``peak_memory_mib`` is the largest resident set of the whole
     process, ``working_memory_mib`` what predicting one image adds to it, ``gpu_memory_mib`` the most that was allocated
-    on the GPU; null where unknown. ``frames`` is the number of captures that one depth map costs.
-    """
+    on the GPU; null where unknown. ``frames`` is the number of captures that one depth map costs."""
 
     provenance: Literal["measured", "self-reported"]
     latency_median_ms: Positive
@@ -232,8 +226,7 @@ class RelianceParts(StrictModel):
     ``change_*``: how much the answer changes, relative to the change that the phase asks for: with another outline
     (part of the score), without fringes inside or outside the object, with fringes of the other direction or of
     another pitch. ``answered_*``: share of the object's pixels that have an answer in that case. ``order_free_*``:
-    the same, allowing whole periods.
-    """
+    the same, allowing whole periods."""
 
     follows_phase: Annotated[Share | None, "follows the phase, within the object, brightness unchanged"]
     follows_light: Annotated[Share | None, "follows the brightness, phase unchanged"]
@@ -258,8 +251,7 @@ class Reliance(StrictModel):
     """The phase-reliance score in [0, 1] with its 95% interval (bootstrap over objects; nulls below two objects).
 
     ``order_free_score`` allows whole periods and is null where the answer is not in mm. ``units`` are those of the
-    answer that was held against the truth; ``weights_sha256`` of a network is that of its weights file.
-    """
+    answer that was held against the truth; ``weights_sha256`` of a network is that of its weights file."""
 
     version: RelianceVersion
     score: Share

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,25 +31,11 @@ Outcome = tuple[list[str], list[dict[str, Any]]]
 """Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
 
 
-class Rules(NamedTuple):
-    """How predictions are read and scored."""
-
-    target: str
-    units: Units
-    png_mm_per_level: float | None
-    mode: Mode
-    edge_band_px: int
-
-
 def evaluate(
-    folder: str | Path,
-    dataset: DatasetFolder,
-    split: str = "test",
-    target: str = "depth",
-    edge_band_px: int = protocol.EDGE_BAND_PX,
-    mode: str = "standard",
+    folder: str | Path, dataset: DatasetFolder, split: str = "test", target: str = "depth",
+    edge_band_px: int = protocol.EDGE_BAND_PX, mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
-) -> result.Result:
+) -> result.Result:  # fmt: skip
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
@@ -58,8 +44,7 @@ def evaluate(
     score: a command uses it to import what it needs afterwards.
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
-    and DatasetError for a target that is not a depth map.
-    """
+    and DatasetError for a target that is not a depth map."""
     folder = Path(folder)
     samples = _samples(folder, dataset, split, target, mode)
     content, description_error = None, None
@@ -73,13 +58,16 @@ def evaluate(
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
-    rules = Rules(target, units, level_mm, mode, edge_band_px)  # type: ignore[arg-type]
-    problems, rows = list(listing.problems), []
-    outcomes = _scored(folder, listing, rules, dataset) if units in get_args(Units) else ()
+    problems: list[str] = list(listing.problems)
+    rows: list[dict[str, Any]] = []
+    outcomes: Iterable[Outcome] = ()
+    if units in get_args(Units):
+        reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
+        outcomes = _scored(reader, listing.present, dataset, target, units, mode, edge_band_px)
     description = None
     if content is not None:
         try:
-            description = _checked_submission(folder, content, len(dataset.sequence), listing.form, mode)
+            description = _checked(folder, content, len(dataset.sequence), listing.form, mode)
         except SubmissionError as error:
             description_error = error
         result.environment  # noqa: B018  imported while the threads score
@@ -130,9 +118,7 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     return samples
 
 
-def _checked_submission(
-    folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str
-) -> submission.Submission:
+def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> submission.Submission:
     """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
     description = submission.check_submission(folder, content)
     outside = [index for index in description.frames_used if index >= frames]
@@ -151,27 +137,26 @@ def _checked_submission(
     raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
 
 
-def _scored(folder: Path, listing: submission.Listing, rules: Rules, dataset: DatasetFolder) -> Iterator[Outcome]:
-    """Problems and row of each sample that has a prediction, in order.
-
-    Work begins with this call, in threads, before the first outcome is taken from the iterator.
-    """
-    reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, rules.png_mm_per_level)
+def _scored(
+    reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units, mode: Mode,
+    edge_band_px: int,
+) -> Iterable[Outcome]:  # fmt: skip
+    """Problems and row of each sample that has a prediction, in order. Work begins with this call, in threads, before
+    the first outcome is taken from the iterator."""
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = dataset.target_mm(sample, rules.target)
+            target = dataset.target_mm(sample, target_name)
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
         try:
             values, digest = reader.read(sample)
-            problems = value_problems(values, target, high, rules.units)
+            problems = value_problems(values, target, high, units)
             if not problems:
-                pair = scored_pair(values, target, rules.units, rules.mode, sample)
-                scores = score_sample(*pair, rules.edge_band_px)
+                scores = score_sample(*scored_pair(values, target, units, mode, sample), edge_band_px)
         except PredictionError as error:
             problems = [str(error)]
         with dataset_lock:
@@ -181,7 +166,7 @@ def _scored(folder: Path, listing: submission.Listing, rules: Rules, dataset: Da
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
         return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 
-    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, listing.present)
+    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
@@ -190,10 +175,8 @@ _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
 
 def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> list[str]:
     """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
-
     Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
-    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute.
-    """
+    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute."""
     if scored.protocol_version != protocol.PROTOCOL_VERSION:
         raise SubmissionError(
             f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
@@ -225,17 +208,13 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
 def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
     exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
-    object_mae_mm = recomputed.object_mae_mm or 0.0
     for key in protocol.METRICS:
         # Signed means and the error without an offset are small differences of large numbers.
-        rounding_mm = 1e-9 * object_mae_mm if "bias" in key or "shift_free" in key else 0.0
+        rounding_mm = 1e-9 * (recomputed.object_mae_mm or 0.0) if "bias" in key or "shift_free" in key else 0.0
         if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
             keys.append(key)
-    return [
-        f"{recomputed.sample}: {key}: {_value_text(getattr(stored, key))} in the result, "
-        f"{_value_text(getattr(recomputed, key))} recomputed"
-        for key in keys
-    ]
+    texts = {key: [_value_text(getattr(row, key)) for row in (stored, recomputed)] for key in keys}
+    return [f"{recomputed.sample}: {key}: {a} in the result, {b} recomputed" for key, (a, b) in texts.items()]
 
 
 def _value_text(value: object) -> str:
@@ -244,9 +223,7 @@ def _value_text(value: object) -> str:
 
 def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
     """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
-
-    Reads the split's targets again.
-    """
+    Reads the split's targets again."""
     samples, (height, width) = dataset.samples(split), dataset.size
     boxes = {}
     for sample in samples:

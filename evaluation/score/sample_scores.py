@@ -66,7 +66,7 @@ def stats_of(errors: Errors) -> ErrorStats:
     blocks = [errors[start : start + BLOCK] for start in range(0, errors.size, BLOCK)]
     squares = [float(block.dot(block)) for block in blocks]
     absolute = [float(np.abs(block).sum()) for block in blocks]
-    return _stats_of_sums(errors.size, absolute, squares, lambda: errors)
+    return _from_sums(errors.size, absolute, squares, lambda: errors)
 
 
 def mean_of(errors: Errors) -> float | None:
@@ -76,13 +76,9 @@ def mean_of(errors: Errors) -> float | None:
     return math.fsum(float(errors[i : i + BLOCK].sum()) for i in range(0, errors.size, BLOCK)) / errors.size
 
 
-def _stats_of_sums(
-    pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]
-) -> ErrorStats:
+def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors: Callable[[], Errors]) -> ErrorStats:
     """Statistics from the sums of the blocks; ``errors`` gives the errors (n,), needed where the squares underflow.
-
-    Raises PredictionError where a sum is not finite.
-    """
+    Raises PredictionError where a sum is not finite."""
     if pixels == 0:
         return EMPTY
     try:
@@ -99,10 +95,8 @@ def _stats_of_sums(
 
 
 def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> ErrorStats:
-    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0.
-
-    Not overall minus object: that would leave rounding errors where the background is perfect.
-    """
+    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0. Not
+    overall minus object: that would leave rounding errors where the background is perfect."""
     pixels = prediction.size - index.size
     if pixels == 0:
         return EMPTY
@@ -131,7 +125,7 @@ def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> 
         outside = ~object_mask(target)
         return prediction[outside].astype(np.float64) - target[outside]
 
-    return _stats_of_sums(pixels, absolute, squares, errors_outside)
+    return _from_sums(pixels, absolute, squares, errors_outside)
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
@@ -149,10 +143,8 @@ def _zones(bits: int, value: int) -> property:
 @dataclass(frozen=True, slots=True)
 class SampleScores:
     """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
-
     A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones.
-    """
+    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones."""
 
     background: ErrorStats
     zones: dict[int, ErrorStats]
@@ -193,7 +185,7 @@ def _share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-@np.errstate(over="ignore")  # an overflow is no warning here: `_stats_of_sums` refuses it
+@np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
 def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BAND_PX) -> SampleScores:
     """Score one depth map against its target.
 
@@ -248,10 +240,8 @@ def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float
 
 
 def _quantiles(values: Errors, *levels: float) -> list[float]:
-    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``.
-
-    One partition per quantile: NumPy's partition is vectorised for a single position, not for several.
-    """
+    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``. One partition per quantile:
+    NumPy's partition is vectorised for a single position, not for several."""
     quantiles, first = [], 0
     for level in levels:
         position = level * (values.size - 1)

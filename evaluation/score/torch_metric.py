@@ -33,8 +33,7 @@ class DepthScores(Metric):
     without these pixels are left out of the mean and never count as 0.
 
     The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
-    tolerance. ``half()`` and ``float()`` leave the state in float64.
-    """
+    tolerance. ``half()`` and ``float()`` leave the state in float64."""
 
     is_differentiable = False
     higher_is_better = False

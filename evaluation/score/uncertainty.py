@@ -21,10 +21,8 @@ Interval = tuple[float, float]
 
 def object_interval(values: Sequence[float | None], objects: Sequence[Hashable]) -> Interval | None:
     """The 95% interval of the mean of ``values`` (one per sample, None left out), resampled over ``objects``.
-
     Deterministic: fixed seed, and a generator whose stream does not change between versions of NumPy. Objects count in
-    the order in which they first appear. None with fewer than two objects that have a value.
-    """
+    the order in which they first appear. None with fewer than two objects that have a value."""
     sums: dict[Hashable, list[float]] = {}
     for value, name in zip(values, objects, strict=True):
         if value is not None:
@@ -57,11 +55,9 @@ def _levels(objects: int) -> tuple[float, float]:
 
 
 def _student_quantile(level: float, freedom: int) -> float:
-    """Quantile of Student's t for a whole number of degrees of freedom, by halving an interval around it.
-
-    SciPy has it too, but its last digits differ, which would move intervals, and importing it takes longer than scoring
-    a test split.
-    """
+    """Quantile of Student's t for a whole number of degrees of freedom, by halving an interval around it. SciPy has it
+    too, but its last digits differ, which would move intervals, and importing it takes longer than scoring a test
+    split."""
     low, high = 0.0, 1e4
     for _ in range(200):
         middle = (low + high) / 2
@@ -84,10 +80,8 @@ def _student_cdf(t: float, freedom: int) -> float:
 
 def caution(objects: int) -> str | None:
     """A warning about an interval over so few objects that resampling can't cover the truth in 95% of cases, or None.
-
     An interval of resampled means is between the smallest and the largest object; the truth (the median, for a
-    symmetric spread) is outside of all n objects in 2^(1 - n) of cases.
-    """
+    symmetric spread) is outside of all n objects in 2^(1 - n) of cases."""
     if objects < 2 or (reach := 1 - 2.0 ** (1 - objects)) >= 0.9:
         return None
     return f"With {objects} objects an interval can cover the truth in at most {100 * reach:.0f}% of cases."

@@ -17,10 +17,8 @@ MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
 
 
 def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, units: Units) -> list[str]:
-    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list.
-
-    ``target_max_mm`` is the largest value of ``target_mm`` (H, W).
-    """
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``target_max_mm`` is
+    the largest value of ``target_mm`` (H, W)."""
     low, high = float(prediction.min()), float(prediction.max())
     problems = []
     if not np.isfinite([low, high]).all():  # min and max carry NaN through
@@ -40,11 +38,9 @@ def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, un
 
 
 def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
-    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can.
-
-    Where mm are declared, the largest value shows whether the values are metres or shares of the range. Where m or
-    normalised depth is declared, a single stray pixel must not decide, so the median over the object is compared.
-    """
+    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can. Where mm are
+    declared, the largest value shows whether the values are metres or shares of the range. Where m or normalised depth
+    is declared, a single stray pixel must not decide, so the median over the object is compared."""
     if units == "mm":
         if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
             reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm:.0f} mm"
@@ -79,8 +75,7 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and subtracting
     1.7 m. Only for normalised values.
 
-    Raises DatasetError where the target has no range to normalise by.
-    """
+    Raises DatasetError where the target has no range to normalise by."""
     if units == "mm":
         return values, target_mm
     if units == "m":

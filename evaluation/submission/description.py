@@ -19,8 +19,7 @@ class Submission(SparseModel):
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
     on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
     black outside the object); false is never written, so that files without this key stay as they are.
-    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it.
-    """
+    ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
     SPARSE = ("uses_ground_truth_mask",)
 

@@ -1,8 +1,8 @@
 """Reading .mat, Arrow and Parquet in a process of its own, one for a folder: a damaged file can end only that process.
 
-The libraries that read these forms trust the lengths in a file. Some damaged .mat files end the process that reads them
-(segmentation fault, SciPy 1.17), and a compressed page or buffer may state any unpacked size. So the process has an
-upper limit of memory, and is ended when it takes too long.
+The libraries that read these forms (HDF5, Arrow) trust the lengths in a file: a damaged one may end the process that
+reads it, and a compressed page or buffer may state any unpacked size. So the process has an upper limit of memory, and
+is ended when it takes too long.
 """
 
 import os

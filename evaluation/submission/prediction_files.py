@@ -34,9 +34,7 @@ def read_plain(folder: Path) -> dict[Any, Any]:
 
 def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
     """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
-
-    SubmissionError names the file, what is wrong with it and what to do.
-    """
+    SubmissionError names the file, what is wrong with it and what to do."""
     file = printable(str(path), 500)
     try:
         with path.open("rb") as stream:
@@ -71,9 +69,7 @@ class Listing(NamedTuple):
 
 def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> Listing:
     """What ``folder`` holds for ``samples``: the form of most of its files, and every entry that is missing or extra.
-
-    ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split.
-    """
+    ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split."""
     try:
         names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
@@ -105,11 +101,9 @@ MapAndHash = tuple[NDArray[Any], str]
 
 
 class Reader(NamedTuple):
-    """``read(sample)`` gives a map (H, W), valid until the same thread reads again, and the SHA-256 of its file.
-
-    It may be called from several threads, and raises PredictionError, without the file's name, for a file that is
-    refused. ``named(sample)`` is the name of the sample's prediction in messages: its file.
-    """
+    """``read(sample)`` gives a map (H, W), valid until the same thread reads again, and the SHA-256 of its file. It may
+    be called from several threads, and raises PredictionError, without the file's name, for a file that is refused.
+    ``named(sample)`` is the name of the sample's prediction in messages: its file."""
 
     read: Callable[[str], MapAndHash]
     named: Callable[[str], str]
@@ -124,23 +118,20 @@ def reader_for(
 
         maps = depth_maps(folder / form, samples, size)
         return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
-    memory = local()
-    read = _mat_reader(size) if form == ".mat" else {
+    memory, largest_mat = local(), size[0] * size[1] * 8 + _MAT_SPARE_BYTES
+    if form == ".mat":
+        from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
+
+        matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest_mat)
+
+    def read_mat(path: Path) -> MapAndHash:
+        content = read_bounded(path, largest_mat)
+        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
+
+    read = {
         ".npy": lambda path: read_npy(path, size, memory),
         ".npz": lambda path: read_npz(path, size),
         ".png": lambda path: read_png(path, size, png_mm_per_level),
-    }[form]  # fmt: skip
+        ".mat": read_mat,
+    }[form]
     return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
-
-
-def _mat_reader(size: tuple[int, int]) -> Callable[[Path], MapAndHash]:
-    from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess  # needs multiprocessing
-
-    largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
-    matrix_as_npy = ReadingProcess(f"{__package__}.mat", largest)
-
-    def read_mat(path: Path) -> MapAndHash:
-        content = read_bounded(path, largest)
-        return parse_npy(matrix_as_npy(content), size), hashlib.sha256(content).hexdigest()
-
-    return read_mat

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import LayoutError, PredictionError
 from fpp_ml_bench.files import fill, opened, printable, read_bounded
+from fpp_ml_bench.loaders.published import png_chunks
 
 HEADER_BYTES = 16384
 # NumPy parses a header through `ast`, whose recursion counter all threads share (CPython 3.11): two at once may fail.
@@ -27,12 +28,10 @@ _Layout = tuple[np.dtype[Any], bool, int]
 
 
 def read_npy(path: Path, size: tuple[int, int], memory: local) -> tuple[NDArray[Any], str]:
-    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored.
-
-    ``size`` is the expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until
-    its next read. Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a
-    real float dtype.
-    """
+    """The array in ``path`` and the SHA-256 of the whole file: the bytes hashed are the bytes scored. ``size`` is the
+    expected (H, W). The array is a view of a buffer that the thread keeps in ``memory``, valid until its next read.
+    Raises PredictionError, without the file's name, for anything but a plain .npy of that size and a real float
+    dtype."""
     if not hasattr(memory, "buffer"):
         memory.buffer = bytearray(_largest_npy(size))
     view = memoryview(memory.buffer)
@@ -110,11 +109,9 @@ _ENCRYPTED = 0x1
 
 
 def read_npz(path: Path, size: tuple[int, int]) -> tuple[NDArray[Any], str]:
-    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`.
-
-    The array may have any name. The size that the archive declares is checked before a byte is unpacked, and unpacking
-    stops at the limit even where the archive declares a wrong size.
-    """
+    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`. The array may have
+    any name. The size that the archive declares is checked before a byte is unpacked, and unpacking stops at the limit
+    even where the archive declares a wrong size."""
     largest = _largest_npy(size)
     content = read_bounded(path, largest + _ARCHIVE_BYTES)
     try:
@@ -159,11 +156,9 @@ _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
 def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> tuple[NDArray[Any], str]:
-    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`.
-
-    The header, every checksum and the unpacked length are checked before the image is decoded. A level of 65535 is
-    refused: there a depth that does not fit was cut off.
-    """
+    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`. The header, every checksum
+    and the unpacked length are checked before the image is decoded. A level of 65535 is refused: there a depth that
+    does not fit was cut off."""
     if mm_per_level is None:
         raise PredictionError("has no scale: give png_mm_per_level, the mm of one level, in submission.yaml")
     content = read_bounded(path, size[0] * size[1] * 2 + _PNG_SPARE_BYTES)
@@ -191,29 +186,19 @@ def _png_problem(content: bytes, size: tuple[int, int]) -> str | None:
     if bits != 16 or colour != 0 or interlaced:
         kind = f"{bits} bits per channel, colour type {colour}, interlacing {interlaced}"
         return f"has {kind}; expected 16, 0 and 0: {_PNG_ADVICE}"
-    kinds: list[bytes] = []
-    packed: list[bytes] = []
-    offset = len(_PNG_SIGNATURE)
-    while offset < len(content) and kinds[-1:] != [b"IEND"]:
-        if len(content) - offset < 12:
-            return f"is cut off; {_PNG_ADVICE}"
-        length, kind = struct.unpack_from(">I4s", content, offset)
-        end = offset + 12 + length
-        if end > len(content):
-            return f"is cut off; {_PNG_ADVICE}"
-        if zlib.crc32(content[offset + 4 : end - 4]) != struct.unpack(">I", content[end - 4 : end])[0]:
-            return f"is damaged, a checksum does not match; {_PNG_ADVICE}"
-        if kind == b"IDAT":
-            packed.append(content[offset + 8 : end - 4])
-        kinds.append(kind)
-        offset = end
-    if kinds[-1:] != [b"IEND"] or kinds.count(b"IHDR") != 1 or not packed or b"tRNS" in kinds:
+    try:
+        chunks = list(png_chunks(content))
+    except LayoutError as error:
+        return f"{error}; {_PNG_ADVICE}"
+    kinds = [kind for kind, _ in chunks]
+    if kinds[-1:] != [b"IEND"] or kinds.count(b"IHDR") != 1 or b"IDAT" not in kinds or b"tRNS" in kinds:
         return f"is cut off or damaged; {_PNG_ADVICE}"
-    if offset != len(content):
+    if len(_PNG_SIGNATURE) + sum(12 + len(data) for _, data in chunks) != len(content):
         return f"has foreign bytes after the image; {_PNG_ADVICE}"
+    packed = b"".join(data for kind, data in chunks if kind == b"IDAT")
     expected = height * (2 * width + 1)
     try:
-        unpacked = len(zlib.decompressobj().decompress(b"".join(packed), expected + 1))
+        unpacked = len(zlib.decompressobj().decompress(packed, expected + 1))
     except zlib.error:
         return f"is damaged: its pixels can't be unpacked; {_PNG_ADVICE}"
     if unpacked != expected:

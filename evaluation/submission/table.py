@@ -27,10 +27,8 @@ _ADVICE = "write columns sample (text) and depth (list of H lists of W floats) w
 
 
 def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Callable[[str], tuple[NDArray[Any], str]]:
-    """A function from a sample to its map (H, W) and the SHA-256 of the file; PredictionError with the file's name.
-
-    The whole table is held in memory: at most a float64 map per sample.
-    """
+    """A function from a sample to its map (H, W) and the SHA-256 of the file; PredictionError with the file's name. The
+    whole table is held in memory: at most a float64 map per sample."""
     count, pixels = len(samples), size[0] * size[1]
     largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
     try:

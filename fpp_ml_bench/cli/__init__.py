@@ -7,9 +7,11 @@ Only the module of the command that runs is imported, and such a module imports 
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import FppBenchError
@@ -57,19 +59,25 @@ fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check faile
 """
 
 
-def _formatter(prog: str) -> argparse.HelpFormatter:
-    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=30, width=110)
+def count(most: int = 100_000) -> Callable[[str], int]:
+    """Type of an option: a whole number from 1 to ``most``."""
+
+    def parsed(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {most}, got {text!r}")
+        return int(text)
+
+    return parsed
+
+
+_FORMATTER = partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=110)
+_STYLE: dict[str, Any] = {"formatter_class": _FORMATTER, "allow_abbrev": False}
 
 
 def parser_for(command: Command, prog: str) -> argparse.ArgumentParser:
     """Argument parser of one command module."""
-    parser = argparse.ArgumentParser(
-        prog=prog,
-        description=command.SUMMARY,
-        epilog="examples:\n" + "\n".join(f"  {line}" for line in command.EXAMPLES),
-        formatter_class=_formatter,
-        allow_abbrev=False,
-    )
+    epilog = "examples:\n" + "\n".join(f"  {line}" for line in command.EXAMPLES)
+    parser = argparse.ArgumentParser(prog, None, command.SUMMARY, epilog, **_STYLE)
     command.add_arguments(parser)
     return parser
 
@@ -110,14 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run_command(module, f"fpp-bench {arguments[0]}", arguments[1:])
     width = max(map(len, COMMANDS))
     listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
-    parser = argparse.ArgumentParser(
-        prog="fpp-bench",
-        usage="fpp-bench [--help] [--version] COMMAND ...",
-        description="FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry.",
-        epilog=f"commands:\n{listing}\n\n{_EPILOG}",
-        formatter_class=_formatter,
-        allow_abbrev=False,
-    )
+    usage = "fpp-bench [--help] [--version] COMMAND ..."
+    description = "FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry."
+    parser = argparse.ArgumentParser("fpp-bench", usage, description, f"commands:\n{listing}\n\n{_EPILOG}", **_STYLE)
     parser.add_argument("--version", action="version", version=f"fpp-ml-bench {__version__}")
     parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
     args, unknown = parser.parse_known_args(arguments)

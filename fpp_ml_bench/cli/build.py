@@ -61,15 +61,13 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
             horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
             sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
-    meshes = (render.read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(render.single_mesh, args.mesh))
+    own = (render.read_mesh_list(args.meshes) if args.meshes else ()) + tuple(map(render.single_mesh, args.mesh))
     if args.objects is not None:
         objects = tuple(name.strip() for name in args.objects.split(",") if name.strip())
-    elif meshes:
+    elif own:
         objects = ()
-    names = (*objects, *(mesh.name for mesh in meshes))
-    return render.BuildSettings(
-        rig, names, args.placement, args.frames, args.seed, args.noise_sigma, args.shadows, meshes
-    )
+    names = (*objects, *(mesh.name for mesh in own))
+    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, args.noise_sigma, args.shadows, own)
 
 
 def run(args: argparse.Namespace) -> int:

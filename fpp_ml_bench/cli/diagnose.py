@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
+from fpp_ml_bench.cli import count
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads, usable_cores
@@ -41,24 +42,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
     )  # fmt: skip
     text = "most samples of a split, taken evenly (default: the probe's)"
-    parser.add_argument("--samples", type=_count, metavar="N", help=text)
+    parser.add_argument("--samples", type=count(), metavar="N", help=text)
     text = "repeats of what depends on random numbers (default: 2)"
-    parser.add_argument("--seeds", type=_count, metavar="N", help=text)
+    parser.add_argument("--seeds", type=count(), metavar="N", help=text)
     text = "a short run for a first look; its numbers are not reliable"
     parser.add_argument("--quick", action="store_true", help=text)
     parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
     parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
-    parser.add_argument("--threads", type=_count, metavar="N", help="threads (default: every core)")
+    parser.add_argument("--threads", type=count(), metavar="N", help="threads (default: every core)")
     parser.add_argument(
         "--units", choices=UNITS,
         help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
     )  # fmt: skip
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,31 +76,25 @@ def run(args: argparse.Namespace) -> int:
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        diagnosis = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
-    show(_table(model.title, diagnosis))
-    print(f"Written: {diagnosis.report}\nWritten: {diagnosis.values}")
-    return 0
-
-
-def _table(title: str, diagnosis: "diagnostics.Diagnosis") -> Table:
-    table = Table(title=Text(title), title_justify="left")
+        results = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
+    table = Table(title=Text(model.title), title_justify="left")
     table.add_column("Probe")
     table.add_column("Summary", overflow="fold")
     table.add_column("Seconds", justify="right")
-    for result in diagnosis.results:
+    for result in results:
         text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
         table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
-    return table
+    show(table)
+    print(f"Written: {args.out / diagnostics.REPORT_FILE}\nWritten: {args.out / diagnostics.JSON_FILE}")
+    return 0
 
 
 def _command(args: argparse.Namespace) -> str:
     """The command that makes the same report, without the machine's settings."""
     words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
-    for name in args.probe:
-        words += ["--probe", name]
-    for option in ("samples", "seeds", "frame", "units"):
-        value = getattr(args, option)
-        words += [] if value is None else [f"--{option}", str(value)]
+    options = [("probe", name) for name in args.probe]
+    options += [(name, getattr(args, name)) for name in ("samples", "seeds", "frame", "units")]
+    words += [word for name, value in options if value is not None for word in (f"--{name}", str(value))]
     words += ["--quick"] if args.quick else []
     words += ["--layers", *args.layers] if args.layers else []
     return shlex.join(words)

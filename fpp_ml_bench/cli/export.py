@@ -36,9 +36,8 @@ def run(args: argparse.Namespace) -> int:
     dataset = storage.DatasetFolder(args.dataset)
     splits = published.chosen_splits(dataset, args.split)
     samples = sum(len(dataset.samples(split)) for split in splits)
-    with progress_bar(
-        "exporting", samples * sum(form in published.SAMPLE_FORMS for form in forms), "samples"
-    ) as advance:
+    steps = samples * sum(form in published.SAMPLE_FORMS for form in forms)
+    with progress_bar("exporting", steps, "samples") as advance:
         published.export(dataset, args.out, forms, splits, usable_cores(), advance)
     files = [path for path in args.out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         raise BuildError(f"--workers {workers}: expected 1 or more")
     rig = None if args.rig is None else optics.load_rig(args.rig)
     plan = published.plan_import(args.tree, rig, args.frame_order)
-    sample_count = len(plan.tree.all_samples())
+    sample_count = len(plan.reader.tree.by_name)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "images", images) as advance:

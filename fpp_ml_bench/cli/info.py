@@ -3,8 +3,8 @@
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -38,8 +38,8 @@ def run(args: argparse.Namespace) -> int:
             "bytes": sum(file.bytes for file in opened.manifest.files),
             "settings": opened.manifest.settings,
             "rig": opened.manifest.rig,
-            "splits": [asdict(split) for split in statistics],
-            "all": asdict(storage.whole_statistics(opened.manifest)),
+            "splits": statistics,
+            "all": storage.whole_statistics(opened.manifest),
             "samples": opened.splits,
         }
         print(json.dumps(content, indent=1, allow_nan=False))
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     table = Table("", title=title, title_justify="left")
     statistics = [*statistics, storage.whole_statistics(manifest)]
     for split in statistics:
-        table.add_column(split.split, justify="right")
+        table.add_column(split["split"], justify="right")
     for row_title, cell in _ROWS:
         table.add_row(row_title, *map(cell, statistics))
     Console().print(table)
@@ -80,15 +80,15 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2f}%"
 
 
-_ROWS: tuple[tuple[str, Callable[["storage.SplitStatistics"], str]], ...] = (
-    ("objects, samples", lambda s: f"{s.objects}, {s.samples}"),
-    ("cover, mean", lambda s: _share(s.cover_mean)),
-    ("cover, least-most", lambda s: f"{100 * s.cover_min:.1f}-{100 * s.cover_max:.1f}%"),
-    ("depth range, median", lambda s: f"{s.depth_range_median_mm:.0f}"),
-    ("depth range, largest", lambda s: f"{s.depth_range_max_mm:.0f}"),
-    ("ground-truth error, MAE", lambda s: millimetres(s.gt_mae_mm)),
-    ("  RMSE", lambda s: millimetres(s.gt_rmse_mm)),
-    ("  MAE inside (3 px from edges)", lambda s: millimetres(s.gt_interior_mae_mm)),
-    ("  largest", lambda s: millimetres(s.gt_max_mm)),
-    ("pixels without ground truth", lambda s: _share(s.undecoded_share)),
+_ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("objects, samples", lambda s: f"{s['objects']}, {s['samples']}"),
+    ("cover, mean", lambda s: _share(s["cover_mean"])),
+    ("cover, least-most", lambda s: f"{100 * s['cover_min']:.1f}-{100 * s['cover_max']:.1f}%"),
+    ("depth range, median", lambda s: f"{s['depth_range_median_mm']:.0f}"),
+    ("depth range, largest", lambda s: f"{s['depth_range_max_mm']:.0f}"),
+    ("ground-truth error, MAE", lambda s: millimetres(s["gt_mae_mm"])),
+    ("  RMSE", lambda s: millimetres(s["gt_rmse_mm"])),
+    ("  MAE inside (3 px from edges)", lambda s: millimetres(s["gt_interior_mae_mm"])),
+    ("  largest", lambda s: millimetres(s["gt_max_mm"])),
+    ("pixels without ground truth", lambda s: _share(s["undecoded_share"])),
 )

@@ -8,6 +8,7 @@ from typing import Any
 from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.evaluation.protocol import METRICS
 from fpp_ml_bench.leaderboard import page
 
@@ -25,40 +26,33 @@ _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "archit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
-    parser.add_argument(
-        "results", nargs="*", type=Path, metavar="RESULT.json",
+    add = parser.add_argument
+    add("results", nargs="*", type=Path, metavar="RESULT.json",
         help="result files, or folders of them (default: the rows shipped with the package, ./result*.json and "
-        "./results/*.json)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
+             "./results/*.json)")  # fmt: skip
+    add("--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
         help=f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
     )  # fmt: skip
     one_file: dict[str, Any] = {"type": Path, "metavar": "FILE"}
-    parser.add_argument("--markdown", **one_file, help="also write the tables as Markdown")
-    parser.add_argument("--json", **one_file, help="also write the ranking as JSON")
-    parser.add_argument(
-        "--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
+    add("--markdown", **one_file, help="also write the tables as Markdown")
+    add("--json", **one_file, help="also write the ranking as JSON")
+    add("--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
         help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
     )  # fmt: skip
-    page_help = (
-        "write the static page of the shipped rows, or of those given: index.html and a page for each submission"
-    )
-    parser.add_argument("--page", type=Path, metavar="DIR", help=page_help)
-    tradeoff_help = "the tradeoff.json to show on it (default, for the shipped rows: the file that ships)"
-    parser.add_argument("--tradeoff", **one_file, help=f"with --page: {tradeoff_help}")
-    readme_help = (
-        "write the ranking between the leaderboard markers of this file, from the rows shipped with the package"
-    )
-    parser.add_argument("--readme", **one_file, help=readme_help)
-    check_help = "with --readme: write nothing; exit status 1 when the block is not up to date"
-    parser.add_argument("--check", action="store_true", help=check_help)
-    parser.add_argument("--row", **one_file, help="write the given result as a row file for the leaderboard")
-    parser.add_argument(
-        "--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
-        help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)",
+    add("--page", type=Path, metavar="DIR",
+        help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
     )  # fmt: skip
+    add("--tradeoff", **one_file,
+        help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
+    )  # fmt: skip
+    add("--readme", **one_file,
+        help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
+    )  # fmt: skip
+    add("--check", action="store_true",
+        help="with --readme: write nothing; exit status 1 when the block is not up to date")  # fmt: skip
+    add("--row", **one_file, help="write the given result as a row file for the leaderboard")
+    add("--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
+        help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     groups, papers = leaderboard.rank(entries, args.sort), leaderboard.chosen_tables(args.paper)
     for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
         if path is not None:
-            leaderboard.write_text(path, text(groups, papers, args.sort))
+            result.write_file(text(groups, papers, args.sort).encode("utf-8"), path)
     if args.page is not None:
         shipped = None if args.results else tradeoff.shipped_tradeoff()
         settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)

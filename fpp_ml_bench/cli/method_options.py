@@ -27,63 +27,43 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
-    classical = parser.add_argument_group("classical")
-    classical.add_argument("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
-    classical.add_argument(
-        "--direction", choices=("horizontal", "vertical", "both"),
-        help="fringes to use: one direction is enough for a depth (default: both)",
-    )  # fmt: skip
-    classical.add_argument(
-        "--fewest", action="store_const", const=True,
-        help="capture only the Gray frames that the rig's range needs: with both directions usually none",
-    )  # fmt: skip
-    classical.add_argument(
-        "--depth-noise", type=float, metavar="MM",
+    add = parser.add_argument_group("classical").add_argument
+    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    add("--direction", choices=("horizontal", "vertical", "both"),
+        help="fringes to use: one direction is enough for a depth (default: both)")  # fmt: skip
+    add("--fewest", action="store_const", const=True,
+        help="capture only the Gray frames that the rig's range needs: with both directions usually none")  # fmt: skip
+    add("--depth-noise", type=float, metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
     )  # fmt: skip
-    phase = parser.add_argument_group("phase and phase-net")
-    phase.add_argument(
-        "--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)"
-    )
-    phase.add_argument(
-        "--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)"
-    )
-    phase.add_argument(
-        "--error-mm", type=float, metavar="MM",
+    add = parser.add_argument_group("phase and phase-net").add_argument
+    add("--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)")
+    add("--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)")
+    add("--error-mm", type=float, metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
-        "with a single fringe; may need the Gray code",
-    )  # fmt: skip
-    phase.add_argument(
-        "--prior", choices=("none", "standoff"),
+             "with a single fringe; may need the Gray code")  # fmt: skip
+    add("--prior", choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )  # fmt: skip
-    phase.add_argument(
-        "--no-shading", action="store_const", const=True, help="choose the fringe order without brightness"
-    )
-    phase.add_argument(
-        "--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)"
-    )
-    phase.add_argument(
-        "--weights", metavar="FILE",
+    add("--no-shading", action="store_const", const=True, help="choose the fringe order without brightness")
+    add("--min-confidence", type=float, metavar="C",
+        help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
+    add("--weights", metavar="FILE",
         help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
-        "phase-net-fresh, trained on additional objects)",
-    )  # fmt: skip
-    network = parser.add_argument_group("trained networks")
-    network.add_argument(
-        "--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
+             "phase-net-fresh, trained on additional objects)")  # fmt: skip
+    add = parser.add_argument_group("trained networks").add_argument
+    add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
-        "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
+             "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
     )  # fmt: skip
-    network.add_argument("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
-    network.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
+    add("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
+    add("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
 def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
-    """The method that ``args`` name, for the rig of ``opened``.
-
-    Warns on standard error about weights that were trained on another version of the dataset's benchmark. Raises
-    FppBenchError for an unknown method, and for an option that belongs to another one.
-    """
+    """The method that ``args`` name, for the rig of ``opened``. Warns on standard error about weights that were trained
+    on another version of the dataset's benchmark. Raises FppBenchError for an unknown method, and for an option that
+    belongs to another one."""
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     maker = _MAKERS.get(args.method)
@@ -145,9 +125,8 @@ def _network(path: Path, args: argparse.Namespace, opened: "storage.DatasetFolde
 
 
 def _classical(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
-    steps = opened.sequence.steps if args.steps is None else args.steps
-    if args.depth_noise is not None:
-        steps = _steps_for(args, opened)
+    usual = opened.sequence.steps if args.steps is None else args.steps
+    steps = usual if args.depth_noise is None else _steps_for(args, opened)
     return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 
@@ -172,17 +151,13 @@ def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int
 def _phase(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    shading = None if args.no_shading is None else False
-    return _given(
-        direction=args.fringe, prior=args.prior, min_confidence=args.min_confidence, frames=args.frames,
-        error_mm=args.error_mm, shading=shading,
-    )  # fmt: skip
+    options = {name: getattr(args, name) for name in ("prior", "min_confidence", "frames", "error_mm")}
+    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
 def _phase_net(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
-    shading = None if args.no_shading is None else False
-    options = {"threads": args.threads, "min_confidence": args.min_confidence, "weights": args.weights}
-    return _given(direction=args.fringe, shading=shading, **options)
+    options = {name: getattr(args, name) for name in ("threads", "min_confidence", "weights")}
+    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
 def _given(**options: Any) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fpp_ml_bench import baselines
+from fpp_ml_bench.cli import SPLITS
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
 from fpp_ml_bench.loaders import storage
@@ -21,12 +22,11 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
-    parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left"
-    )
+    add = parser.add_argument
+    add("method", metavar="METHOD", help=METHOD_HELP)
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    add("--split", default="test", choices=SPLITS, help="default: test")
+    add("--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left")
     add_method_options(parser)
     add_explain_options(parser)
 

@@ -46,9 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--source-url", metavar="URL", help="https address where the results come from")
 
 
-def _part(
-    kinds: argparse._SubParsersAction, name: str, summary: str, adopt: bool = True
-) -> Callable[..., argparse.Action]:
+def _part(kinds: argparse._SubParsersAction, name: str, summary: str, adopt: bool = True) -> Callable[..., object]:
     add = kinds.add_parser(name, help=summary, description=f"Publish {summary}.", allow_abbrev=False).add_argument
     add("--repo", required=True, metavar="OWNER/NAME", help="repository on the Hub")
     add("--dry-run", action="store_true", help="print what would change and send nothing")
@@ -101,10 +99,10 @@ def _leaderboard(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
 def _results(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
     remote = _remote(args, hub, "model")
     dataset = hub.state("dataset", args.dataset_repo)
-    about = hub.mark("dataset", args.dataset_repo, dataset)
-    scored_on = leaderboard.publish.ScoredOn(args.dataset_repo, dataset.commit or "", about, args.source_url)
+    fingerprint = hub.mark("dataset", args.dataset_repo, dataset).get("fingerprint")
+    scored_on = args.dataset_repo, dataset.commit or "", fingerprint, args.source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
-        publication = leaderboard.publish.stage_results(args.results, args.repo, scored_on, Path(folder))
+        publication = leaderboard.publish.stage_results(args.results, args.repo, Path(folder), *scored_on)
         return _carry_out(args, hub, publication, remote)
 
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
@@ -23,15 +23,13 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
-    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
-    text = "dataset folder; scenes are made from its test objects"
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help=text)
-    text = "samples of each test object, 1 to 6 (default: 2)"
-    parser.add_argument("--views", type=int, default=2, metavar="N", help=text)
-    text = "write the score into this result or leaderboard row of the same method (.json)"
-    parser.add_argument("--into", type=Path, metavar="FILE", help=text)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
+    add = parser.add_argument
+    add("method", metavar="METHOD", help=METHOD_HELP)
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects")
+    add("--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)")
+    add("--into", type=Path, metavar="FILE",
+        help="write the score into this result or leaderboard row of the same method (.json)")  # fmt: skip
+    add("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
     add_method_options(parser)
 
 
@@ -49,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
     if entry is not None:
         check_same_method(entry, method)
     scene_set = diagnostics.SceneSet(dataset, args.views)
-    sha256 = method.settings.get("weights_sha256")
-    sha256 = sha256 if isinstance(sha256, str) else None
+    found = method.settings.get("weights_sha256")
+    sha256 = found if isinstance(found, str) else None
     with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
         reliance, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
@@ -64,9 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(title: str, reliance: "result.Reliance") -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
-    table = Table(title=heading, title_justify="left")
-    table.add_column("")
-    table.add_column("value", justify="right")
+    table = Table("", Column("value", justify="right"), title=heading, title_justify="left")
     low, high = reliance.interval
     interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")

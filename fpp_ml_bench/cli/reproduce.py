@@ -23,34 +23,22 @@ ALL = "all"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
-    parser.add_argument(
-        "table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}"
-    )
-    parser.add_argument(
-        "--preset", choices=PRESETS, default="cpu",
-        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)"
-    )
-    parser.add_argument(
-        "--runs", type=Path, default=Path("runs"), metavar="DIR",
-        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
-    )  # fmt: skip
-    parser.add_argument("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
-    parser.add_argument(
-        "--only-missing", action="store_true",
+    add = parser.add_argument
+    add("table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}")
+    add("--preset", choices=PRESETS, default="cpu",
+        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU")  # fmt: skip
+    add("--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)")
+    add("--runs", type=Path, default=Path("runs"), metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)")  # fmt: skip
+    add("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
+    add("--only-missing", action="store_true",
         help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
-        "again. Finished trainings are always kept",
-    )  # fmt: skip
-    parser.add_argument(
-        "--minutes", type=_minutes, metavar="M",
+             "again. Finished trainings are always kept")  # fmt: skip
+    add("--minutes", type=_minutes, metavar="M",
         help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-        "continues",
-    )  # fmt: skip
-    parser.add_argument("--anyway", action="store_true", help="train preset paper even without a GPU")
-    parser.add_argument("--list", action="store_true", help="show rows, recipes and their state, and stop")
+             "continues")  # fmt: skip
+    add("--anyway", action="store_true", help="train preset paper even without a GPU")
+    add("--list", action="store_true", help="show rows, recipes and their state, and stop")
 
 
 def _minutes(text: str) -> float:
@@ -78,9 +66,11 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
     from fpp_ml_bench.leaderboard import reproduced
 
-    command = _command(args)
-    options = (args.data, args.only_missing, args.minutes, args.anyway)
-    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report=_report)
+    def report(line: str) -> None:  # with the time, where the engine's progress is too
+        print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
+
+    command, options = _command(args), (args.data, args.only_missing, args.minutes, args.anyway)
+    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report)
     outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
@@ -96,11 +86,6 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _report(line: str) -> None:
-    """Print a line with the time on stderr, where the engine's progress is too."""
-    print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
-
-
 def _command(args: argparse.Namespace) -> str:
     """The command that continues where this run stops, keeping its results."""
     words = ["fpp-bench", "reproduce", args.table, "--preset", args.preset]
@@ -113,16 +98,15 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from fpp_ml_bench.cli.console import show
 
     jobs = reproduce.planned(tables, folders.preset)
-    table = Table(title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
-    for title in ("Row", "Training", "State", "Rows written"):
-        table.add_column(title, overflow="fold")
+    columns = [Column(title, overflow="fold") for title in ("Row", "Training", "State", "Rows written")]
+    table = Table(*columns, title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     for job in jobs:
-        row_files = [folders.row(job.recipe, variant) for variant in reproduce.variants(job.recipe)]
+        row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
         written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
         table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
     show(table)

@@ -15,12 +15,12 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
-    parser.add_argument("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
-    parser.add_argument("--sheet", action="store_true", help="all objects and views on one sheet instead")
-    parser.add_argument("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
-    default = "picture to write (default: SAMPLE.png or sheet.png)"
-    parser.add_argument("--out", type=Path, metavar="FILE.png", help=default)
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    add("sample", nargs="?", metavar="SAMPLE", help="sample such as power_drill_A60")
+    add("--sheet", action="store_true", help="all objects and views on one sheet instead")
+    add("--split", default="all", metavar="SPLIT", help="split that --sheet shows (default: all)")
+    add("--out", type=Path, metavar="FILE.png", help="picture to write (default: SAMPLE.png or sheet.png)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from fpp_ml_bench.baselines import stability
@@ -62,12 +63,10 @@ def _show(rows: Sequence[stability.Row]) -> None:
     table = Table()
     for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
         table.add_column(title, justify="left" if title == "group" else "right")
-    for group, counts in stability.summary(rows).items():
-        ratio = counts["largest_ratio"]
-        table.add_row(
-            group, str(counts["cases"]), str(counts["within"]), str(counts["flagged"]), str(counts["FAIL"]),
-            ratio if isinstance(ratio, str) else stability.short(ratio), f"{counts['cpu_seconds']:.1f}",
-        )  # fmt: skip
+    for group, part in stability.summary(rows).items():
+        *counts, ratio, cpu_s = part.values()
+        text = ratio if isinstance(ratio, str) else stability.short(ratio)
+        table.add_row(group, *map(str, counts), text, f"{cpu_s:.1f}")
     show(table)
     for row in rows:
         if row.verdict is stability.Verdict.FAIL:
@@ -79,10 +78,8 @@ def _list(cases: Sequence[stability.Case]) -> int:
 
     from fpp_ml_bench.cli.console import show
 
-    families: dict[tuple[str, str], list[stability.Case]] = {}
-    for case in cases:
-        families.setdefault((case.group, case.family), []).append(case)
-    for (group, family), (case, *others) in families.items():
+    for (group, family), members in groupby(cases, lambda case: (case.group, case.family)):
+        case, *others = members
         show(Text(f"{group}: {family} ({1 + len(others)}): {case.computes}; against {case.reference}"))
         show(Text(f"    bound: {case.predicts}"))
     show(Text(f"{len(cases)} cases"))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench import baselines
+from fpp_ml_bench.cli import SPLITS, count
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
@@ -23,23 +24,16 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("method", metavar="METHOD", help=METHOD_HELP)
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder")
-    parser.add_argument("--split", default="test", choices=("train", "validation", "test", "all"), help="default: test")
-    parser.add_argument("--batch", type=_count, default=4, metavar="N", help="images a batch (default: 4)")
-    parser.add_argument("--repeats", type=_count, default=20, metavar="N", help="timed runs (default: 20)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the timing here")
-    parser.add_argument(
-        "--into", type=Path, action="append", default=[], metavar="FILE",
-        help="put it into this submission.yaml or result file of the same method; may be given again",
-    )  # fmt: skip
+    add = parser.add_argument
+    add("method", metavar="METHOD", help=METHOD_HELP)
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder")
+    add("--split", default="test", choices=SPLITS, help="default: test")
+    add("--batch", type=count(), default=4, metavar="N", help="images a batch (default: 4)")
+    add("--repeats", type=count(), default=20, metavar="N", help="timed runs (default: 20)")
+    add("--json", type=Path, metavar="FILE", help="write the timing here")
+    add("--into", type=Path, action="append", default=[], metavar="FILE",
+        help="put it into this submission.yaml or result file of the same method; may be given again")  # fmt: skip
     add_method_options(parser)
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from fpp_ml_bench.baselines import tradeoff
+from fpp_ml_bench.cli import count
 from fpp_ml_bench.leaderboard import page
 from fpp_ml_bench.machine import limit_threads
 
@@ -19,34 +20,21 @@ _GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
-    parser.add_argument(
-        "--out", type=Path, default=Path("tradeoff"), metavar="DIR",
-        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--only", action="append", choices=_GROUPS, default=[], metavar="GROUP",
-        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
-    )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="fewer settings, views, runs and sizes")
-    parser.add_argument("--list", action="store_true", help="show what would be measured, and stop")
-    parser.add_argument("--threads", type=_count, default=1, metavar="N", help="threads a method may use (default: 1)")
-    parser.add_argument(
-        "--clock", choices=("wall", "processor"), default="wall",
-        help="processor: processor time of this process, for a shared machine (default: wall)",
-    )  # fmt: skip
-    parser.add_argument("--views", type=_count, metavar="N", help="views of each test object (default: 2, quick: 1)")
-    parser.add_argument("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
-    parser.add_argument(
-        "--widths", type=_count, nargs="*", metavar="W",
-        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)",
-    )  # fmt: skip
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 1000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 1000, got {text!r}")
-    return int(text)
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
+    add("--out", type=Path, default=Path("tradeoff"), metavar="DIR",
+        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)")  # fmt: skip
+    add("--only", action="append", choices=_GROUPS, default=[], metavar="GROUP",
+        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)")  # fmt: skip
+    add("--quick", action="store_true", help="fewer settings, views, runs and sizes")
+    add("--list", action="store_true", help="show what would be measured, and stop")
+    add("--threads", type=count(1000), default=1, metavar="N", help="threads a method may use (default: 1)")
+    add("--clock", choices=("wall", "processor"), default="wall",
+        help="processor: processor time of this process, for a shared machine (default: wall)")  # fmt: skip
+    add("--views", type=count(1000), metavar="N", help="views of each test object (default: 2, quick: 1)")
+    add("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
+    add("--widths", type=count(1000), nargs="*", metavar="W",
+        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,16 +42,14 @@ def run(args: argparse.Namespace) -> int:
     limit_threads(args.threads)  # before NumPy is loaded
     from fpp_ml_bench.cli.console import progress_bar, show
 
-    settings = tradeoff.TradeoffSettings(
-        args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock, args.views, args.runs,
-        args.widths,
-    )  # fmt: skip
+    settings = tradeoff.TradeoffSettings(args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock,
+                                         args.views, args.runs, args.widths)  # fmt: skip
     plan = tradeoff.planned(settings, [page.board_ladder(args.quick)] if not args.only or "costs" in args.only else [])
     if args.list:
         show(tradeoff.plan_table(plan))
         print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
         return 0
-    with progress_bar("measuring", len(plan), "settings") as advance:
+    with progress_bar("measuring", len(plan.settings) + len(plan.ladders), "settings") as advance:
         measurements = tradeoff.tradeoff(settings, plan, lambda key: advance(1))
     written = tradeoff.write_report(measurements, args.out)
     if measurements.points:

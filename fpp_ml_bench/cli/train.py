@@ -18,34 +18,20 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net"
-    )
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume"
-    )
-    parser.add_argument(
-        "--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)"
-    )
-    parser.add_argument(
-        "--minutes", type=float, metavar="M",
-        help="stop before an epoch that would not finish in time, everything saved",
-    )  # fmt: skip
-    parser.add_argument(
-        "--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added"
-    )
-    parser.add_argument(
-        "--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)"
-    )
-    parser.add_argument(
-        "--unions", type=int, metavar="N",
+    add = parser.add_argument
+    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net")
+    add("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
+    add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
+    add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
+    add("--minutes", type=float, metavar="M",
+        help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
+    add("--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added")
+    add("--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)")
+    add("--unions", type=int, metavar="N",
         help="phase-net: images that join several objects, made from each sample (default: as the shipped weights)",
     )  # fmt: skip
-    parser.add_argument(
-        "--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)"
-    )
-    parser.add_argument("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
+    add("--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)")
+    add("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,8 +66,8 @@ def _phase_net(args: argparse.Namespace) -> int:
     import cv2
 
     cv2.setNumThreads(1)
-    options = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = phase_network.Recipe(**options)
+    given = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
+    recipe = phase_network.Recipe(**given)
     trained = phase_network.train_phase_net(
         recipe, args.dataset, args.out, extra=args.extra, start=args.start, minutes=args.minutes, show=True,
         print_line=print,

@@ -90,15 +90,11 @@ def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -
     pitch, length = rig.pitch(direction), rig.pattern_length(direction)
     allowed = limits.max_clipped_steps
     return DirectionPlan(
-        direction=direction,
-        sinusoids=tuple(available[i] for i in chosen),
-        gray=tuple(rig.sequence.gray(direction)),
+        direction, sinusoids=tuple(available[i] for i in chosen), gray=tuple(rig.sequence.gray(direction)),
         weights=phase_weights(2 * np.pi * np.array(chosen) / rig.sequence.steps),
-        centres_rad=optics.cell_centres_rad(length, pitch),
-        pitch_px=pitch,
-        length_px=length,
+        centres_rad=optics.cell_centres_rad(length, pitch), pitch_px=pitch, length_px=length,
         max_clipped_steps=steps // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,8 +109,7 @@ class Coordinates:
 
     def at(self, indices: NDArray[np.intp]) -> "Coordinates":
         """The coordinates of the pixels at ``indices`` only."""
-        u, modulation, phase, reason = self.coordinate_px, self.modulation, self.phase, self.reason
-        return Coordinates(u[indices], modulation[indices], phase[indices], reason[indices])
+        return Coordinates(*(values[indices] for values in vars(self).values()))
 
 
 def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
@@ -195,14 +190,10 @@ def depth_and_reason(
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
 
 
-def within_reach(
-    coordinate_px: NDArray[np.float64], rays: Maps, direction: Direction, rig: Rig, limits: Limits
-) -> NDArray[np.bool_]:
+def within_reach(coordinate_px: NDArray, rays: Maps, direction: Direction, rig: Rig, limits: Limits) -> NDArray:
     """Pixels that may still get a depth from both directions; bool (n,). For projectors without distortion only.
-
     ``coordinate_px`` (n,) of ``direction``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that can't be
-    ruled out are True, those with NaN rays too.
-    """
+    ruled out are True, those with NaN rays too."""
     axis = AXES.index(direction)
     if kernels := compiled_kernels():
         reached = np.empty(len(coordinate_px), dtype=np.bool_)

@@ -39,10 +39,8 @@ def check_limits(limits: Limits) -> None:
         raise DecodeError(f"max_clipped_steps: expected 0 or more, got {limits.max_clipped_steps!r}")
 
 
-def flat_frames(
-    frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig
-) -> dict[int, NDArray[np.uint8]]:
-    """The frames at the indices ``used``, checked and flattened to (H * W,)."""
+def flat_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
+    """The frames at the indices ``used``, checked and flattened to uint8 (H * W,)."""
     expected = (rig.camera.height, rig.camera.width)
     if len(frames) != len(rig.sequence):
         raise DecodeError(
@@ -75,13 +73,9 @@ def mask_indices(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.int
     return np.flatnonzero(mask)
 
 
-def check_frames(
-    flat: Mapping[int, NDArray[np.uint8]], plan: DirectionPlan, indices: NDArray[np.intp] | None, rig: Rig
-) -> None:
-    """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others.
-
-    ``flat`` frames by index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested.
-    """
+def check_frames(flat: Mapping[int, NDArray], plan: DirectionPlan, indices: NDArray | None, rig: Rig) -> None:
+    """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others. ``flat`` frames by
+    index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested."""
     pixel_count = len(flat[plan.sinusoids[0]]) if indices is None else len(indices)
     if pixel_count < LEAST_PX or len(plan.sinusoids) < 4:
         return
@@ -103,9 +97,7 @@ def check_frames(
         )
 
 
-def _contradicting_mean(
-    means: NDArray[np.float64], model: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[int, str] | None:
+def _contradicting_mean(means: NDArray, model: NDArray, weights: NDArray) -> tuple[int, str] | None:
     """Position of the frame whose mean contradicts the others, and what is wrong with it."""
     fitted = model @ (weights @ means)
     influence = np.einsum("ij,ji->i", model, weights)

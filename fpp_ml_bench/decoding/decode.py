@@ -74,11 +74,9 @@ class _Block:
 
 @dataclass
 class _Image:
-    """What is decoded and how, and the results, filled block by block; no pixel belongs to two blocks.
-
-    ``pixels`` flat indices of those to decode (None: all). ``depth_alone``: whether the second direction may be left
-    out where the first shows that there is no depth.
-    """
+    """What is decoded and how, and the results, filled block by block; no pixel belongs to two blocks. ``pixels`` flat
+    indices of those to decode (None: all). ``depth_alone``: whether the second direction may be left out where the
+    first shows that there is no depth."""
 
     frames: dict[int, NDArray[np.uint8]]
     rig: Rig
@@ -113,8 +111,7 @@ class _Image:
         self.depth_mm[pixels], self.reason[pixels] = results
         for direction, details in self.details.items():
             found = measured[direction]
-            coordinate_px = np.where(found.reason == 0, found.coordinate_px, np.nan)
-            details.coordinate_px.reshape(-1)[pixels] = coordinate_px
+            details.coordinate_px.reshape(-1)[pixels] = np.where(found.reason == 0, found.coordinate_px, np.nan)
             details.modulation.reshape(-1)[pixels], details.phase.reshape(-1)[pixels] = found.modulation, found.phase
         return count
 
@@ -136,10 +133,8 @@ class _Image:
         block.measured[plan.direction] = decode(levels, plan, self.limits)
 
     def _keep_within_reach(self, block: _Block) -> None:
-        """Reduce the block to the pixels that can still get a depth after the first direction, if they are few.
-
-        A sample of the block is tested first: where the object fills the block, skipping costs no more than that test.
-        """
+        """Reduce the block to the pixels that can still get a depth after the first direction, if they are few. A
+        sample of the block is tested first: where the object fills the block, skipping costs no more than that test."""
         ((direction, first),) = block.measured.items()
         values = first.coordinate_px, *self._rays(block)
         for part in (slice(None, None, SAMPLING), slice(None)):
@@ -171,17 +166,10 @@ class _Image:
 
 
 def decode_stack(
-    frames: Sequence[NDArray | None] | NDArray,
-    rig: Rig,
-    direction: Directions = "both",
-    steps: int | None = None,
-    mask: NDArray[np.bool_] | None = None,
-    limits: Limits | None = None,
-    details: bool = False,
-    threads: int = 1,
-    reasons: bool = True,
-    fewest: bool = False,
-) -> Decoded:
+    frames: Sequence[NDArray | None] | NDArray, rig: Rig, direction: Directions = "both", steps: int | None = None,
+    mask: NDArray[np.bool_] | None = None, limits: Limits | None = None, details: bool = False, threads: int = 1,
+    reasons: bool = True, fewest: bool = False,
+) -> Decoded:  # fmt: skip
     """Depth in mm from a captured sequence.
 
     ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views or an array (F, H, W); a
@@ -203,22 +191,19 @@ def decode_stack(
 
     Depths outside ``rig.working_range_mm`` become 0 with the reason OUTSIDE_RANGE; this also removes the background
     plane. Raises `DecodeError` for frames, steps, mask or limits that don't fit, and for a sinusoid whose capture
-    failed (`fpp_ml_bench.decoding.checks`).
-    """
+    failed (`fpp_ml_bench.decoding.checks`)."""
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
-    limits = limits or Limits()
-    check_limits(limits)
+    check_limits(limits := limits or Limits())
     step_count = rig.sequence.steps if steps is None else steps
     directions: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
     plans, joint = [blocks.plan_direction(rig, name, step_count, limits) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
-    flat = flat_frames(frames, used, rig)
-    shape = rig.camera.height, rig.camera.width
+    flat, shape = flat_frames(frames, used, rig), (rig.camera.height, rig.camera.width)
     pixels = mask_indices(mask, shape)
     for plan in plans:
         check_frames(flat, plan, pixels, rig)

@@ -57,11 +57,9 @@ def gray_levels_in_view(rig: Rig, direction: Direction) -> tuple[int | None, ...
 @dataclass(frozen=True)
 class JointCode:
     """How well both directions' phases together fix the orders, in projector px across the epipolar line.
-
     ``least_gap_px``: smallest distance of a wrong pair of orders from the right one; ``background_gap_px``: smallest at
     which the background could pass for a point in range. ``driver``: the direction of which a ray crosses more periods
-    within the range, ``most_periods`` at most.
-    """
+    within the range, ``most_periods`` at most."""
 
     least_gap_px: float
     background_gap_px: float
@@ -81,12 +79,10 @@ class JointCode:
 
 @lru_cache(maxsize=8)
 def orders_from_phases(rig: Rig) -> JointCode:
-    """How well two wrapped phases alone give the orders of both directions within the working range.
-
-    A wrong pair is i periods off in u and j in v, not both 0, within the segment that the range and the decoder's
-    tolerance cover on the epipolar line. Its distance from the line is ``|i P_u e_v - j P_v e_u|``, e the line's unit
-    direction. Own derivation; a distorted projector's epipolar lines are not straight, and both gaps are 0.
-    """
+    """How well two wrapped phases alone give the orders of both directions within the working range. A wrong pair is i
+    periods off in u and j in v, not both 0, within the segment that the range and the decoder's tolerance cover on the
+    epipolar line. Its distance from the line is ``|i P_u e_v - j P_v e_u|``, e the line's unit direction. Own
+    derivation; a distorted projector's epipolar lines are not straight, and both gaps are 0."""
     near, far, background = reach_of(rig)
     line = far - near
     usable = np.isfinite(line).all(axis=0) & np.isfinite(background).all(axis=0) & (np.hypot(*line) > 0)
@@ -124,10 +120,8 @@ def fewest_steps(
     rig: Rig, direction: Direction | str, depth_mm_sigma: float, modulation: float, noise_grey: float
 ) -> int | None:
     """Fewest phase steps with which noise moves depth by at most ``depth_mm_sigma`` (standard deviation, mm) at the far
-    end of the range on the optical axis; None where all steps of the sequence are too few.
-
-    ``modulation`` at that depth and ``noise_grey`` in grey levels; see `triangulation.depth_noise_mm`.
-    """
+    end of the range on the optical axis; None where all steps of the sequence are too few. ``modulation`` at that depth
+    and ``noise_grey`` in grey levels; see `triangulation.depth_noise_mm`."""
     far_mm = rig.working_range_mm[1]
     for steps in range(3, rig.sequence.steps + 1):
         if float(depth_noise_mm(rig, far_mm, direction, steps, modulation, noise_grey)) <= depth_mm_sigma:
@@ -158,11 +152,9 @@ def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits)
 def nearest_pair(
     measured: dict[Direction, Coordinates], rays: Maps, rig: Rig, joint: JointCode
 ) -> tuple[dict[Direction, NDArray[np.float64]], NDArray[np.float64]]:
-    """The pair of fringe orders that lies nearest to the epipolar line, for every pixel.
-
-    Returns the orders of each direction, whole numbers as float64 (n,), and the pair's distance from the line in
-    projector px, inf where no order lies in the range.
-    """
+    """The pair of fringe orders that lies nearest to the epipolar line, for every pixel. Returns the orders of each
+    direction, whole numbers as float64 (n,), and the pair's distance from the line in projector px, inf where no order
+    lies in the range."""
     a = AXES.index(joint.driver)
     b, tolerance_px = 1 - a, joint.tolerance_px
     first, second = measured[AXES[a]].phase, measured[AXES[b]].phase
@@ -195,8 +187,7 @@ def nearest_pair(
 
 def with_order(coordinates: Coordinates, order: NDArray[np.float64], rig: Rig, direction: Direction) -> Coordinates:
     """Coordinates of a direction from its wrapped phase and its fringe orders (n,), as with Gray code."""
-    absolute = coordinates.phase + 2 * np.pi * order
-    coordinate = absolute * (rig.pitch(direction) / (2 * np.pi))
+    coordinate = (coordinates.phase + 2 * np.pi * order) * (rig.pitch(direction) / (2 * np.pi))
     reason = coordinates.reason.copy()
     outside = (coordinate < -0.5) | (coordinate > rig.pattern_length(direction) - 0.5)
     reason[(reason == 0) & outside] = Reason.OUTSIDE_PATTERN

@@ -55,8 +55,7 @@ def decode_block(frames, weights, code, limits, codes, results):  # type: ignore
     ``frames`` uint8 (N + bits, n): sinusoids, then Gray bits; ``weights`` (3, N); ``code`` = number of Gray bits, cell
     centres in rad, pitch and length in px; ``limits`` = least modulation, most clipped steps, ambiguous fraction,
     inconsistent rad; ``codes`` = low modulation, saturated, inconsistent, outside; ``results`` = coordinate px,
-    modulation and phase (float64) and reason (uint8, 0 = decoded), each (n,).
-    """
+    modulation and phase (float64) and reason (uint8, 0 = decoded), each (n,)."""
     bits, centres, pitch, length = code
     coordinate, modulation, phase, reason = results
     steps, total = weights.shape[1], frames.shape[1]

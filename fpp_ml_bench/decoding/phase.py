@@ -48,8 +48,7 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
     shifts = np.asarray(shifts_rad, dtype=np.float64)
     if shifts.ndim != 1 or len(shifts) < 3 or not np.all(np.isfinite(shifts)):
         raise DecodeError(f"shifts_rad: expected at least 3 finite phase shifts in rad, got {shifts_rad!r}")
-    count = len(shifts)
-    turns = shifts / (2 * np.pi)
+    count, turns = len(shifts), shifts / (2 * np.pi)
     model = np.stack([np.ones(count), cosine_of_turns(turns), sine_of_turns(turns)], axis=1)
     weights = model.T * np.array([[1.0], [2.0], [2.0]]) / count
     if np.abs(weights @ model - np.eye(3)).max() < 1e-12:
@@ -63,12 +62,10 @@ def phase_weights(shifts_rad: ArrayLike) -> NDArray[np.float64]:
 def wrapped_phase(
     frames: Iterable[ArrayLike], shifts_rad: ArrayLike | None = None, dtype: DTypeLike = np.float64
 ) -> Phase:
-    """Wrapped phase, modulation and mean of N >= 3 frames (N, H, W), or N images (H, W), in grey levels.
-
-    ``shifts_rad`` (N,) defaults to equal steps, 2 pi n / N. Sums are float64 whatever ``dtype`` (float32 or float64)
-    the results have. A phase of exactly +pi comes out as -pi. Where nothing is modulated the phase means nothing: look
-    at the modulation. Raises `DecodeError` for too few frames, unequal shapes, or dtypes that hold no grey levels.
-    """
+    """Wrapped phase, modulation and mean of N >= 3 frames (N, H, W), or N images (H, W), in grey levels. ``shifts_rad``
+    (N,) defaults to equal steps, 2 pi n / N. Sums are float64 whatever ``dtype`` (float32 or float64) the results have.
+    A phase of exactly +pi comes out as -pi. Where nothing is modulated the phase means nothing: look at the modulation.
+    Raises `DecodeError` for too few frames, unequal shapes, or dtypes that hold no grey levels."""
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise DecodeError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
     images = [np.asarray(frame) for frame in frames]

@@ -48,11 +48,9 @@ def _depth_in_front(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.
 
 
 def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
-    """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown.
-
-    The ray supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
-    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN.
-    """
+    """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown. The ray
+    supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
+    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN."""
     device = rig.projector
     measured = (coordinate - device.centre[axis]) / device.focal[axis]
     rotated = [rotated_ray(rays, rig, i) for i in range(3)]
@@ -70,11 +68,9 @@ def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> N
 
 def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direction: Direction) -> NDArray[np.float64]:
     """Depth in mm from one projector coordinate per pixel, float64; NaN where there is no depth (NaN input, ray
-    parallel to the projector plane, intersection behind a device, or a distortion that can't be inverted).
-
-    ``rays``: normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for
-    ``direction`` "vertical", v_p for "horizontal", in px, same shape.
-    """
+    parallel to the projector plane, intersection behind a device, or a distortion that can't be inverted). ``rays``:
+    normalised (x, y) of the camera pixels, as `Pinhole.rays` gives them; ``coordinate_px``: u_p for ``direction``
+    "vertical", v_p for "horizontal", in px, same shape."""
     if direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
     axis, device = AXES.index(direction), rig.projector
@@ -99,8 +95,7 @@ def depth_from_both(
     ``weight_u`` and ``weight_v``: 1 / sigma^2 of the coordinates, up to a common factor; for sinusoids (B / P)^2.
     Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear functions: algebraic start, then
     `GAUSS_NEWTON_STEPS`. ``disagreement_px`` is the measured point's distance from the epipolar line, for any weights,
-    in undistorted px.
-    """
+    in undistorted px."""
     device = rig.projector
     u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)
     tx, ty, tz = rig.t
@@ -128,21 +123,15 @@ def depth_from_both(
 
 
 def depth_noise_mm(
-    rig: Rig,
-    depth_mm: ArrayLike,
-    direction: Direction | str,
-    steps: int,
-    modulation: ArrayLike,
-    noise: ArrayLike = 1.0,
-    rays: Maps | None = None,
-) -> NDArray[np.float64]:
+    rig: Rig, depth_mm: ArrayLike, direction: Direction | str, steps: int, modulation: ArrayLike,
+    noise: ArrayLike = 1.0, rays: Maps | None = None,
+) -> NDArray[np.float64]:  # fmt: skip
     """Standard deviation of the depth in mm that intensity noise causes, float64.
 
     ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical
     axis. sigma_phi = sqrt(2 / N) sigma / B, sigma_u = P sigma_phi / (2 pi), sigma_Z = sigma_u / ``|du/dZ|``; for the
-    paper's rig sigma_Z is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add.
-    Projector distortion is ignored; it changes the slope by a few percent.
-    """
+    paper's rig sigma_Z is sigma_u Z^2 / (f_p b). For ``direction`` "both" the two directions' precisions add. Projector
+    distortion is ignored; it changes the slope by a few percent."""
     if direction != "both" and direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if steps < 3:

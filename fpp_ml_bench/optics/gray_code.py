@@ -59,11 +59,9 @@ def decode_cells(
     bits: ArrayLike, threshold: ArrayLike, modulation: ArrayLike, ambiguous_fraction: float = AMBIGUOUS_FRACTION
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Cell numbers and whether they can be trusted, int32 and bool (H, W), from the Gray frames of a direction.
-
     ``bits`` (n, H, W) grey levels, most significant bit first; ``threshold`` and ``modulation`` (H, W): the mean A and
     amplitude B of its sinusoids. A bit within ``ambiguous_fraction`` B of the threshold is ambiguous; a cell is trusted
-    when no bit is, or when a single bit is and flipping it gives a neighbour.
-    """
+    when no bit is, or when a single bit is and flipping it gives a neighbour."""
     mean, amplitude = np.asarray(threshold, dtype=np.float64), np.asarray(modulation, dtype=np.float64)
     margin = ambiguous_fraction * amplitude
     cells = np.zeros(mean.shape, dtype=np.int32)

@@ -85,11 +85,8 @@ def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients
 
 def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
     """Ideal normalised coordinates of distorted ones, float64; NaN where none within the fold reproduces the input to
-    `INVERSE_TOLERANCE`.
-
-    Newton's method from the inverse of the radial part, read off a table: from the distorted point itself it overshoots
-    where the polynomial flattens out, and misses points that have an inverse.
-    """
+    `INVERSE_TOLERANCE`. Newton's method from the inverse of the radial part, read off a table: from the distorted point
+    itself it overshoots where the polynomial flattens out, and misses points that have an inverse."""
     xd, yd = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not is_distorted(coefficients):
         return xd.copy(), yd.copy()

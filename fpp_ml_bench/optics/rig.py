@@ -50,8 +50,7 @@ class Rig:
     ``rotation`` (three rows) and ``translation_m`` are kept as tuples, so that a rig is hashable and compares by value;
     `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal fringes along the projector's
     rows, ``pitch_vertical_px`` that of the vertical ones along its columns. Raises `RigError` for a pose that is no
-    rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit.
-    """
+    rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit."""
 
     camera: Pinhole
     projector: Pinhole
@@ -71,12 +70,12 @@ class Rig:
             raise RigError(f"rotation: expected three rows of three numbers, got {self.rotation!r}")
         rows = tuple(numbers(row, 3, f"rotation[{i}]") for i, row in enumerate(self.rotation))
         require(len(rows) == 3, f"rotation: expected three rows of three numbers, got {len(rows)} rows")
-        translation = numbers(self.translation_m, 3, "translation_m")
-        near_far = numbers(self.working_range_mm, 2, "working_range_mm")
-        settings: dict[str, Any] = {"rotation": rows, "translation_m": translation, "working_range_mm": near_far}
+        settings: dict[str, Any] = {"rotation": rows, "R": np.array(rows)}
+        for name, count in (("translation_m", 3), ("working_range_mm", 2)):
+            settings[name] = numbers(getattr(self, name), count, name)
         for name in ("pitch_horizontal_px", "pitch_vertical_px", "standoff_m", "background_m"):
             settings[name] = number(getattr(self, name), name, positive=True)
-        settings["R"], settings["t"] = np.array(rows), np.array(translation)
+        settings["t"] = np.array(settings["translation_m"])
         for name, value in settings.items():
             object.__setattr__(self, name, value)
         self.R.setflags(write=False)
@@ -92,24 +91,19 @@ class Rig:
             f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROTATION_TOLERANCE:g}; "
             "write more digits or give a rotation vector",
         )
-        mirrored = np.linalg.det(self.R) < 0
-        require(not mirrored, "rotation: determinant is -1, a mirror image; check the sign of one axis")
+        require(np.linalg.det(self.R) >= 0, "rotation: determinant is -1, a mirror image; check the sign of one axis")
         require(np.any(self.t), "translation_m: the baseline is zero, so no depth can be triangulated")
         near, far = self.working_range_mm
         require(0 < near < far, f"working_range_mm: expected 0 < near < far, got {near:g} to {far:g} mm")
         outside = f"standoff_m: {self.standoff_m:g} m is outside the working range {near:g} to {far:g} mm"
         require(near <= self.standoff_m * MM_PER_M <= far, outside)
-        require(
-            self.background_m * MM_PER_M > far,
-            f"background_m: {self.background_m:g} m must lie beyond the working range, which ends at {far:g} mm",
-        )
+        inside = f"background_m: {self.background_m:g} m must lie beyond the working range, which ends at {far:g} mm"
+        require(self.background_m * MM_PER_M > far, inside)
 
     def _check_code(self, direction: Direction) -> None:
         pitch, length = self.pitch(direction), self.pattern_length(direction)
-        require(
-            SMALLEST_PITCH_PX <= pitch <= length,
-            f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px",
-        )
+        fits = f"pitch_px.{direction}: expected {SMALLEST_PITCH_PX:g} to {length} px (the pattern), got {pitch:g} px"
+        require(SMALLEST_PITCH_PX <= pitch <= length, fits)
         bits, needed = self.sequence.bits(direction), bits_needed(length, pitch)
         require(
             bits >= needed,
@@ -145,16 +139,12 @@ class Rig:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an equal rig back."""
         return {
-            "camera": self.camera.to_dict(),
-            "projector": self.projector.to_dict(),
-            "rotation": [list(row) for row in self.rotation],
-            "translation_m": list(self.translation_m),
+            "camera": self.camera.to_dict(), "projector": self.projector.to_dict(),
+            "rotation": [list(row) for row in self.rotation], "translation_m": list(self.translation_m),
             "pitch_px": {direction: self.pitch(direction) for direction in DIRECTIONS},
-            "sequence": asdict(self.sequence),
-            "working_range_mm": list(self.working_range_mm),
-            "standoff_m": self.standoff_m,
-            "background_m": self.background_m,
-        }
+            "sequence": asdict(self.sequence), "working_range_mm": list(self.working_range_mm),
+            "standoff_m": self.standoff_m, "background_m": self.background_m,
+        }  # fmt: skip
 
     def _central_coordinate(self, direction: Direction, depth_m: ArrayLike, shift_px: float = 0.0) -> NDArray:
         """Projector coordinate seen ``shift_px`` beside the camera's central pixel, (K,) for depths (K,)."""
@@ -177,8 +167,7 @@ class Rig:
         """Image px a fringe period covers at the image centre, on a plane square to the axis at the standoff: central
         difference over one image px along the axis that the fringes vary; 22.56 for the paper's rig at 960 px."""
         left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
-        change = abs(float(right - left))
-        return self.pitch(direction) / change if change > 0 else math.inf
+        return self.pitch(direction) / change if (change := abs(float(right - left))) > 0 else math.inf
 
     def check_sampling(self) -> None:
         """Raise `RigError` where a fringe period covers fewer than 4 image px, naming the pitch that would do."""
@@ -230,10 +219,8 @@ def _mapping(value: object, keys: Iterable[str], name: str) -> dict[str, Any]:
 
 
 def rig_from_dict(data: object) -> Rig:
-    """The rig that a mapping in the form of this module's docstring describes.
-
-    Raises `RigError` naming the key for anything unknown, missing, of the wrong type, or impossible as a rig.
-    """
+    """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
+    anything unknown, missing, of the wrong type, or impossible as a rig."""
     entries = _mapping(data, _RIG_KEYS, "")
     pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
     for device in ("camera", "projector"):

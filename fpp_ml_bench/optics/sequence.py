@@ -50,10 +50,9 @@ class Sequence:
     def __post_init__(self) -> None:
         if self.steps < 3:
             raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
-        horizontal, vertical = self.bits_horizontal, self.bits_vertical
-        if not (1 <= horizontal <= 15 and 1 <= vertical <= 15):
-            given = f"{horizontal} horizontal and {vertical} vertical"
-            raise ValueError(f"Gray bits must be 1 to 15 per direction, got {given}")
+        across, down = self.bits_horizontal, self.bits_vertical
+        if not (1 <= across <= 15 and 1 <= down <= 15):
+            raise ValueError(f"Gray bits must be 1 to 15 per direction, got {across} horizontal and {down} vertical")
 
     def __len__(self) -> int:
         return 2 * self.steps + self.bits_horizontal + self.bits_vertical + 2

@@ -56,9 +56,7 @@ def write_page(
     return [out / name for name in files]
 
 
-def page_files(
-    groups: Sequence[Group], papers: Sequence[PaperTable], tradeoff: Tradeoff | None = None
-) -> dict[str, bytes]:
+def page_files(groups: Sequence[Group], papers: Sequence[PaperTable], run: Tradeoff | None = None) -> dict[str, bytes]:
     """Relative name -> content of every file of the page."""
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
@@ -67,7 +65,7 @@ def page_files(
     body = render(
         _PACKAGE, "index.html", **shared, tables=tables, told=TOLD, assumption=assumption, search=_search,
         slug=lambda entry: slugs[id(entry)], rankings=_rankings(groups), by_the_paper=BY_THE_PAPER,
-        sections=[_section(group, slugs) for group in groups], tradeoff=_tradeoff(tradeoff),
+        sections=[_section(group, slugs) for group in groups], tradeoff=_tradeoff(run),
         provenances=[name for name in MEANING if name in present],
         papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), tables.paper_note(p)) for p in papers],
     )  # fmt: skip

@@ -1,8 +1,6 @@
 """Exporting a dataset: as Parquet, as the published tree (PNG fringes, .mat depth, raw scans), its meshes and patterns.
-
 In the tree, depth in mm is written as float32, the same bits as in the dataset. The normalised representations are
-written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm.
-"""
+written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -38,10 +36,8 @@ def write_tree(
     dataset: DatasetFolder, folder: Path, splits: list[str], threads: int, row_done: Callable[[], None] = lambda: None
 ) -> None:
     """Write ``splits`` of a dataset into ``folder`` as the published layout; raw scans where all frames are stored.
-
     ``fpp-bench import`` reads the same frames, depth and splits back from the tree. The layout has no place for
-    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written.
-    """
+    ``depth_exact``, which is not written. Raises ``OSError`` when the disk can't be written."""
     samples = [(split, sample) for split in splits for sample in dataset.samples(split)]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
         for _ in pool.map(lambda named: _write_sample(dataset, folder, *named), samples):
@@ -61,12 +57,10 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
         if name != "raw":
             represented = normalise(depth_mm.astype(np.float64), name, low_mm, high_mm, out=np.empty(depth_mm.shape))
         depth = matrix_bytes({variable: represented})
-        for variant, image in (
-            (tree.VARIANT_FOLDERS[name], fringe),
-            (tree.BACKGROUND_REMOVED_FOLDERS[name], background_removed),
-        ):
-            _write(training / variant / published_split / tree.FRINGE / f"{sample}.png", image)
-            _write(training / variant / published_split / tree.DEPTH / f"{sample}.mat", depth)
+        for variants, image in ((tree.VARIANT_FOLDERS, fringe), (tree.BACKGROUND_REMOVED_FOLDERS, background_removed)):
+            part = training / variants[name] / published_split
+            _write(part / tree.FRINGE / f"{sample}.png", image)
+            _write(part / tree.DEPTH / f"{sample}.mat", depth)
     limits = matrix_bytes(dict(zip(tree.INFO_VARIABLES, (low_mm, high_mm), strict=True)))
     _write(training / tree.INFO / published_split / tree.DEPTH / f"{sample}.mat", limits)
     if "all" in dataset.configs:
@@ -81,10 +75,9 @@ def _write_scan(dataset: DatasetFolder, sample: str, folder: Path) -> None:
         _write(folder / tree.frame_file(index), png_bytes(image))
     measured = decode_stack(frames, dataset.rig, _PHASE_DIRECTION, details=True).details[_PHASE_DIRECTION]
     absolute_rad = measured.coordinate_px * (2 * np.pi / dataset.rig.pitch(_PHASE_DIRECTION))
-    _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: measured.phase.astype(np.float32)}))
-    _write(
-        folder / tree.UNWRAPPED_PHASE, matrix_bytes({tree.UNWRAPPED_PHASE_VARIABLE: absolute_rad.astype(np.float32)})
-    )
+    wrapped, unwrapped = measured.phase.astype(np.float32), absolute_rad.astype(np.float32)
+    _write(folder / tree.WRAPPED_PHASE, matrix_bytes({tree.WRAPPED_PHASE_VARIABLE: wrapped}))
+    _write(folder / tree.UNWRAPPED_PHASE, matrix_bytes({tree.UNWRAPPED_PHASE_VARIABLE: unwrapped}))
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -94,11 +87,9 @@ def _write(path: Path, content: bytes) -> None:
 
 @contextmanager
 def exporting(out: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails.
-
-    Remains of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being
-    written by another process, or the disk can't be written.
-    """
+    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails. Remains
+    of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being written
+    by another process, or the disk can't be written."""
     target = out.resolve()
     if target.exists() and not target.is_dir():
         raise BuildError(f"{out}: is a file; give a new folder")
@@ -136,10 +127,8 @@ def export(
     progress: Callable[[int], None] = lambda rows: None,
 ) -> None:  # fmt: skip
     """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
-
     ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
-    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks.
-    """
+    written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks."""
     if not forms or not set(forms) <= set(FORMS):
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:

@@ -19,7 +19,7 @@ from fpp_ml_bench.errors import LayoutError
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB = 0, 2
-_COLOURS = {_GREY: "grey", _RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
+_KINDS = {_GREY: "grey", _RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
 _HEADER_BYTES = 33
 COMPRESSION_LEVEL = 1  # twice as fast as 3 on noisy fringes, and 6% larger (measured)
 
@@ -45,18 +45,14 @@ def _header(start: bytes, path: Path) -> tuple[tuple[int, int], int]:
     if bits != 8:
         raise LayoutError(f"{path}: expected an 8-bit PNG, got {bits} bits per channel; convert it to 8 bits")
     if colour not in (_GREY, _RGB):
-        raise LayoutError(
-            f"{path}: expected a grey PNG, or RGB with equal channels, got {_COLOURS.get(colour, colour)}"
-        )
+        raise LayoutError(f"{path}: expected a grey PNG, or RGB with equal channels, got {_KINDS.get(colour, colour)}")
     return (height, width), colour
 
 
 def read_grey_png(path: Path) -> NDArray[np.uint8]:
-    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal.
-
-    Raises `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour
-    type, or its channels differ.
-    """
+    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal. Raises
+    `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour type, or
+    its channels differ."""
     content = _content(path)
     size, colour = _header(content, path)
     try:
@@ -72,7 +68,7 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     channels = (3,) if colour == _RGB else ()
     if image is None or image.dtype != np.uint8 or image.shape != (*size, *channels):
-        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_COLOURS[colour]} PNG")
+        raise LayoutError(f"{path}: can't be decoded as an 8-bit {_KINDS[colour]} PNG")
     if not channels:
         return np.asarray(image, dtype=np.uint8)
     blue, green, red = image[..., 0], image[..., 1], image[..., 2]
@@ -82,10 +78,8 @@ def read_grey_png(path: Path) -> NDArray[np.uint8]:
 
 
 def png_chunks(content: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Kind and data of a PNG's chunks up to its end, the signature not looked at, each with a right checksum.
-
-    Raises `LayoutError` that says, without a subject, what is wrong: "is cut off".
-    """
+    """Kind and data of a PNG's chunks up to its end, the signature not looked at, each with a right checksum. Raises
+    `LayoutError` that says, without a subject, what is wrong: "is cut off"."""
     view, position = memoryview(content), len(_SIGNATURE)
     kind = b""
     while position < len(view) and kind != b"IEND":
@@ -116,7 +110,11 @@ _HEADER_PARTS = (6,), (5, 6), (1, 16)
 """Element types of a matrix's flags, dimensions and name."""
 _HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_CLASSES = (
+    "unknown", "cell", "struct", "object", "char", "sparse", "double", "single", "int8", "uint8", "int16", "uint16",
+    "int32", "uint32", "int64", "uint64",
+)  # fmt: skip
+_FIRST_NUMERIC = 6
 _COMPLEX = 0x0800
 _LARGEST_BYTES = 1 << 30
 _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
@@ -124,23 +122,18 @@ _WRITTEN_BY = b"MATLAB 5.0 MAT-file, written by fpp-ml-bench"
 
 def read_matrix(path: Path, variable: str) -> NDArray:
     """Variable ``variable`` of a v5 or v7.3 file as in MATLAB: a real numeric matrix (rows, columns) of any dtype.
-
     Raises `LayoutError` naming the file when it can't be read, lacks the variable (the message lists its variables), or
-    the variable is not a real numeric matrix.
-    """
+    the variable is not a real numeric matrix."""
+    content = _content(path)
     try:
-        return parse_matrix(path.read_bytes(), variable)
-    except OSError as error:
-        raise LayoutError(f"{path}: can't be read ({error.strerror or error})") from error
+        return parse_matrix(content, variable)
     except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
 
 
 def parse_matrix(content: bytes, variable: str, largest_bytes: int = _LARGEST_BYTES) -> NDArray:
-    """`read_matrix` on the content of a file; its `LayoutError` names no file.
-
-    No variable is unpacked to more than ``largest_bytes``, and other files that ``content`` refers to are not read.
-    """
+    """`read_matrix` on the content of a file; its `LayoutError` names no file. No variable is unpacked to more than
+    ``largest_bytes``, and other files that ``content`` refers to are not read."""
     if content.startswith(b"MATLAB") and content[_HDF5_AT:].startswith(_HDF5_SIGNATURE):
         return _read_hdf5(content, variable, largest_bytes)
     try:
@@ -179,35 +172,48 @@ def _read_v5(content: bytes, variable: str, largest_bytes: int) -> NDArray:
         kind, data, rest = _element(rest, order, padded=False)
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
-            unpacked = unpacker.decompress(data, largest_bytes)
+            unpacked = memoryview(unpacker.decompress(data, largest_bytes))
+            if unpacker.unconsumed_tail:
+                _, shape, name, _ = _matrix_header(unpacked[8:], order)
+                if name == variable:
+                    raise LayoutError(f"{variable}: {shape} is too large for a depth map")
+                names.append(name)
+                continue
             if not unpacker.eof:
                 raise LayoutError("a compressed variable is cut off or too large; the file is damaged")
-            kind, data, more = _element(memoryview(unpacked), order)
+            kind, data, more = _element(unpacked, order)
             if len(more):
                 raise LayoutError("a compressed variable holds more than its matrix; the file is damaged")
         if kind != _MATRIX:
             raise LayoutError(f"expected a matrix, got element type {kind}; the file is damaged")
-        parts = []
-        for expected in _HEADER_PARTS:
-            kind, part, data = _element(data, order)
-            if kind not in expected:
-                raise LayoutError(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
-            parts.append(part)
-        flags, dimensions, name = parts
-        if len(flags) != 8 or len(dimensions) % 4:
-            raise LayoutError("a matrix header has a wrong length; the file is damaged")
-        shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-        if any(length < 0 for length in shape):
-            raise LayoutError(f"a matrix has the shape {shape}; the file is damaged")
-        names.append(bytes(name).decode("latin-1") or "(unnamed)")
-        if bytes(name).decode("latin-1") == variable:
-            return _real_matrix(variable, struct.unpack(order + "II", flags)[0], shape, order, data)
+        flags, shape, name, data = _matrix_header(data, order)
+        if name == variable:
+            return _real_matrix(variable, flags, shape, order, data)
+        names.append(name or "(unnamed)")
     raise LayoutError(f"expected the variable {variable}, got {', '.join(names) or 'none'}")
 
 
+def _matrix_header(content: memoryview, order: str) -> tuple[int, tuple[int, ...], str, memoryview]:
+    """Flags, shape and name of a matrix, and the content after them."""
+    parts = []
+    for expected in _HEADER_PARTS:
+        kind, part, content = _element(content, order)
+        if kind not in expected:
+            raise LayoutError(f"a matrix header has element type {kind} for {expected[0]}; the file is damaged")
+        parts.append(part)
+    flags, dimensions, name = parts
+    if len(flags) != 8 or len(dimensions) % 4:
+        raise LayoutError("a matrix header has a wrong length; the file is damaged")
+    shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+    if any(length < 0 for length in shape):
+        raise LayoutError(f"a matrix has the shape {shape}; the file is damaged")
+    return struct.unpack(order + "II", flags)[0], shape, bytes(name).decode("latin-1"), content
+
+
 def _real_matrix(name: str, flags: int, shape: tuple[int, ...], order: str, content: memoryview) -> NDArray:
-    matrix_class = flags & 0xFF
-    if matrix_class not in _CLASSES or flags & _COMPLEX:
+    number = flags & 0xFF
+    matrix_class = _CLASSES[number if number < len(_CLASSES) else 0]
+    if number < _FIRST_NUMERIC or matrix_class == _CLASSES[0] or flags & _COMPLEX:
         note = ", complex" if flags & _COMPLEX else ""
         raise LayoutError(f"{name}: expected a real numeric matrix, got MATLAB class {matrix_class}{note}")
     if len(shape) != 2:
@@ -220,25 +226,23 @@ def _real_matrix(name: str, flags: int, shape: tuple[int, ...], order: str, cont
         raise LayoutError(f"{name}: {len(data)} bytes do not make {shape}; the file is damaged")
     # MATLAB stores whole numbers in the smallest type that fits; the matrix class gives their true type.
     values = np.frombuffer(data, stored).reshape(shape, order="F")
-    return np.ascontiguousarray(values, dtype=np.dtype(_CLASSES[matrix_class]))
+    return np.ascontiguousarray(values, dtype=np.dtype(matrix_class))
 
 
 def _element(content: memoryview, order: str, padded: bool = True) -> tuple[int, memoryview, memoryview]:
     """First data element: its type, its bytes, and the content after it. Elements in a matrix are padded to 8 bytes."""
     if len(content) < 8:
         raise LayoutError("a data element is cut off; the file is damaged")
-    kind, length = struct.unpack(order + "II", content[:8])
+    kind, size = struct.unpack(order + "II", content[:8])
     if kind >> 16:  # up to four bytes, packed into the tag itself
-        kind, length = kind & 0xFFFF, kind >> 16
-        if length > 4:
+        kind, size = kind & 0xFFFF, kind >> 16
+        if size > 4:
             raise LayoutError("a small data element is too long; the file is damaged")
-        return kind, content[4 : 4 + length], content[8:]
-    if length > len(content) - 8:
-        raise LayoutError(
-            f"a data element of {length} bytes has only {len(content) - 8}; the file is cut off or damaged"
-        )
-    stop = 8 + (length + 7 & ~7 if padded else length)
-    return kind, content[8 : 8 + length], content[stop:]
+        return kind, content[4 : 4 + size], content[8:]
+    if size > len(content) - 8:
+        raise LayoutError(f"a data element of {size} bytes has only {len(content) - 8}; the file is cut off or damaged")
+    stop = 8 + (size + 7 & ~7 if padded else size)
+    return kind, content[8 : 8 + size], content[stop:]
 
 
 def _read_hdf5(content: bytes, variable: str, largest_bytes: int) -> NDArray:

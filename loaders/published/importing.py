@@ -1,13 +1,12 @@
-"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build.
-
-`SampleReader` reads a sample, fringe, depth in mm and raw frames, with every check on their contents.
-"""
+"""Importing a published tree into the dataset format, through the same crash-safe assembly as a build. `SampleReader`
+reads a sample, fringe, depth in mm and raw frames, with every check on their contents."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,25 +45,26 @@ def _listed(problems: list[str]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SampleReader:
-    """Reads the samples of a tree. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
+    """Picklable source of an import's rows: reads and checks the files of one sample of ``tree`` after the other.
+    ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
-    size: tuple[int, int]
-    variants: tuple[Normalisation, ...]
+    tree: PublishedTree
     rig: Rig
     order: FrameOrder | None
 
-    def read(self, sample: PublishedSample) -> Row:
-        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
-        row, problems = self._read(sample)
-        if row is None:
-            raise LayoutError("\n".join(problems))
-        return row
+    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
+        for stem, _, _ in plan.samples:
+            yield self.read(self.tree.by_name[stem])
 
     def problems(self, sample: PublishedSample) -> list[str]:
         """Problems of the sample's files, a line each; empty when the sample can be read."""
-        return self._read(sample)[1]
+        problems: list[str] = []
+        with _listed(problems):
+            self.read(sample)
+        return "\n".join(problems).splitlines()
 
-    def _read(self, sample: PublishedSample) -> tuple[Row | None, list[str]]:
+    def read(self, sample: PublishedSample) -> Row:
+        """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
         problems: list[str] = []
         fringe, *copies = self._images(sample.fringes, problems)
         if fringe is not None:
@@ -85,8 +85,8 @@ class SampleReader:
                 ordered = self.order.frames(self.rig.sequence)
                 frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
         if problems or depth_mm is None:
-            return None, problems
-        return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None), problems
+            raise LayoutError("\n".join(problems))
+        return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None)
 
     def _images(self, paths: tuple[Path, ...], problems: list[str]) -> list[NDArray[np.uint8] | None]:
         images: list[NDArray[np.uint8] | None] = [None] * len(paths)
@@ -109,7 +109,7 @@ class SampleReader:
         """Depth from the first variant; the other variants and the depth range must agree with it."""
         maps: list[tuple[Normalisation, Path, NDArray[np.float64]]] = []
         limits = self._range_mm(sample, problems)
-        for variant, path in zip(self.variants, sample.depths, strict=True):
+        for variant, path in zip(self.tree.variants, sample.depths, strict=True):
             if variant == "individual" and limits is None:
                 continue
             with _listed(problems):
@@ -125,7 +125,7 @@ class SampleReader:
                     f"{path}: differs from {sample.depths[0]} by up to {difference_mm:.3f} mm; expected at "
                     f"most {AGREEMENT_MM} mm"
                 )
-        if limits is not None and self.variants[0] != "individual":
+        if limits is not None and self.tree.variants[0] != "individual":
             inside = depth_mm[object_mask(depth_mm)]
             actual = float(inside.min()), float(inside.max())
             if max(abs(a - b) for a, b in zip(actual, limits, strict=True)) > AGREEMENT_MM:
@@ -147,8 +147,9 @@ class SampleReader:
     def _to_mm(
         self, path: Path, values: NDArray, variant: Normalisation, limits: tuple[float, float]
     ) -> NDArray[np.float64]:
-        if values.shape != self.size:
-            raise LayoutError(f"{path}: expected {self.size[0]} x {self.size[1]} like the images, got {values.shape}")
+        height, width = self.tree.size
+        if values.shape != (height, width):
+            raise LayoutError(f"{path}: expected {height} x {width} like the images, got {values.shape}")
         if not np.isfinite(values).all():
             raise LayoutError(f"{path}: {np.count_nonzero(~np.isfinite(values))} pixels are NaN or infinite")
         if (values < 0).any():
@@ -180,34 +181,18 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
     return float(np.abs(variant_mm - expected).max())
 
 
-@dataclass(frozen=True)
-class ImportedRows:
-    """Picklable source of an import's rows: reads and checks the files of one sample after the other."""
+class ImportPlan(NamedTuple):
+    """An import that is ready to start: the reader of the scanned tree, and the dataset to assemble."""
 
-    samples: dict[str, PublishedSample]
-    reader: SampleReader
-
-    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
-        for stem, _, _ in plan.samples:
-            yield self.reader.read(self.samples[stem])
-
-
-@dataclass(frozen=True)
-class ImportPlan:
-    """An import that is ready to start: the scanned tree, its reader and the dataset to assemble."""
-
-    tree: PublishedTree
     reader: SampleReader
     assembly: Assembly
 
 
 def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
-    """Scan the tree at ``root`` and determine how it is read.
-
-    ``rig``: the rig that took the images; None assumes the paper's rig, scaled to the image size. ``frame_order``: see
-    `FrameOrder`; ``auto`` determines it from the first sample's images, and checks all others against it. Raises
-    `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size.
-    """
+    """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
+    paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
+    sample's images, and checks all others against it. Raises `LayoutError` listing all files that break the layout,
+    `RigError` for a rig of another image size."""
     order = parse_order(frame_order)
     tree = published_tree.scan_tree(root, len((rig or paper_rig()).sequence))
     rig_used = _rig_for(tree, rig)
@@ -215,7 +200,6 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         order = None
     elif order is None:
         order = _order_of(tree, rig_used)
-    reader = SampleReader(tree.size, tree.variants, rig_used, order)
     stored = "all" if tree.has_frames else "single_shot"
     plans = []
     for split, samples in tree.samples.items():
@@ -234,25 +218,31 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
     }
     generator = {"name": "fpp-ml-bench", "version": __version__}
     manifest = Manifest(IMPORTED, generator, settings, rig_used.to_dict(), tree.size, stored, exact=False)
-    rows = ImportedRows({sample.sample: sample for sample in tree.all_samples()}, reader)
-    return ImportPlan(tree, reader, Assembly(plans, rows, manifest))
+    reader = SampleReader(tree, rig_used, order)
+    return ImportPlan(reader, Assembly(plans, reader, manifest))
 
 
 def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned import into ``folder``, or resume an interrupted import.
-
-    Contents are checked as they are read. When a file is wrong, all others are checked too, so that the `LayoutError`
-    lists every wrong file. Raises `BuildError` as a build does, and when the tree changed after ``folder`` was
-    finished.
-    """
-    _refuse_changed(folder, plan.tree)
-    _drop_stale_receipts(folder, plan)
+    """Write the planned import into ``folder``, or resume an interrupted import. Contents are checked as they are read.
+    When a file is wrong, all others are checked too, so that the `LayoutError` lists every wrong file. Raises
+    `BuildError` as a build does, and when the tree changed after ``folder`` was finished."""
+    samples = plan.reader.tree.by_name
+    if (folder / MANIFEST).is_file():
+        for sample in samples.values():
+            if path := _changed_after(sample, folder / MANIFEST):
+                raise BuildError(
+                    f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
+                )
+    for shard in plan.assembly.plans:  # one of which a source file changed after it was written is read again
+        receipt = folder / WORK_FOLDER / f"{shard.name}.json"
+        if receipt.is_file() and any(_changed_after(samples[stem], receipt) for stem, _, _ in shard.samples):
+            receipt.unlink()
     try:
         return storage.assemble(folder, plan.assembly, workers, progress)
     except LayoutError as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems = [line for lines in pool.map(plan.reader.problems, plan.tree.all_samples()) for line in lines]
-        raise published_tree.layout_error(plan.tree.root, problems or str(error).splitlines()) from error
+            problems = [line for lines in pool.map(plan.reader.problems, samples.values()) for line in lines]
+        raise published_tree.layout_error(plan.reader.tree.root, problems or str(error).splitlines()) from error
 
 
 def import_notes(manifest: Manifest) -> list[str]:
@@ -298,7 +288,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
 def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
-    for sample in tree.all_samples()[:_MOST_SCANS_TRIED]:
+    for sample in list(tree.by_name.values())[:_MOST_SCANS_TRIED]:
         try:
             files = [read_grey_png(path) for path in sample.frames]
         except LayoutError as error:
@@ -315,31 +305,11 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
 
 
 def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
-    """A file of the sample that changed after the file ``moment`` was written, or None.
-
-    Unlike the modification time alone, copying or setting times can't reset what is compared here.
-    """
+    """A file of the sample that changed after the file ``moment`` was written, or None. Unlike the modification time
+    alone, copying or setting times can't reset what is compared here."""
     written = moment.stat().st_mtime_ns
     for path in sample.files:
         status = path.stat()
         if max(status.st_ctime_ns, status.st_mtime_ns) > written:
             return path
     return None
-
-
-def _refuse_changed(folder: Path, tree: PublishedTree) -> None:
-    if (folder / MANIFEST).is_file():
-        for sample in tree.all_samples():
-            if path := _changed_after(sample, folder / MANIFEST):
-                raise BuildError(
-                    f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
-                )
-
-
-def _drop_stale_receipts(folder: Path, plan: ImportPlan) -> None:
-    """Delete receipts of shards of which a source file changed after the shard was written; they are read again."""
-    samples = {sample.sample: sample for sample in plan.tree.all_samples()}
-    for shard_plan in plan.assembly.plans:
-        receipt = folder / WORK_FOLDER / f"{shard_plan.name}.json"
-        if receipt.is_file() and any(_changed_after(samples[stem], receipt) for stem, _, _ in shard_plan.samples):
-            receipt.unlink()

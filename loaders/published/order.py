@@ -8,7 +8,7 @@ sinusoids. The check uses a few image rows and columns and takes a few ms per fo
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations, compress, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from fpp_ml_bench.optics import DIRECTIONS, Direction, Frame, Rig, Sequence
 
 AUTO = "auto"
 _Run = tuple[str, Direction]
+_Lit = list[NDArray[np.bool_]]
+"""Which pixels of `_Lines.parts` the projector reaches: (lines, W) and (lines, H)."""
 _RUNS: tuple[_Run, _Run, _Run, _Run] = (
     ("sinusoid", "horizontal"), ("sinusoid", "vertical"), ("gray", "horizontal"), ("gray", "vertical"),
 )  # fmt: skip
@@ -46,43 +48,35 @@ _LEAST_EDGES_A_LINE = 0.5
 
 @dataclass(frozen=True)
 class FrameOrder:
-    """Which frame of the sequence each file of a raw scan is.
-
-    ``layout`` is a key of `LAYOUTS`; black and white come last. ``white_first``: white before black.
-    ``backward_steps``: the phase shifts are -2 pi n / N, so that file n is step (N - n) mod N.
-    ``least_bit_first``: Gray code from the least significant bit.
-    """
+    """Which frame of the sequence each file of a raw scan is. ``layout`` is a key of `LAYOUTS`; black and white come
+    last. Of `MODIFIERS`, ``white-first``: white before black. ``backward-steps``: the phase shifts are -2 pi n / N, so
+    that file n is step (N - n) mod N. ``least-bit-first``: Gray code from the least significant bit."""
 
     layout: str = "paper"
-    white_first: bool = False
-    backward_steps: bool = False
-    least_bit_first: bool = False
+    modifiers: frozenset[str] = frozenset()
 
     @property
     def name(self) -> str:
-        chosen = zip(MODIFIERS, (self.white_first, self.backward_steps, self.least_bit_first), strict=True)
-        return "+".join([self.layout, *(name for name, used in chosen if used)])
+        return "+".join([self.layout, *(name for name in MODIFIERS if name in self.modifiers)])
 
     def frames(self, sequence: Sequence) -> tuple[Frame, ...]:
         """The frames in file order."""
         frames: list[Frame] = []
         for kind, direction in LAYOUTS[self.layout]:
             indices = list(sequence.sinusoids(direction) if kind == "sinusoid" else sequence.gray(direction))
-            if kind == "sinusoid" and self.backward_steps:
+            if kind == "sinusoid" and BACKWARD_STEPS in self.modifiers:
                 indices = [indices[-n % len(indices)] for n in range(len(indices))]
-            if kind == "gray" and self.least_bit_first:
+            if kind == "gray" and LEAST_BIT_FIRST in self.modifiers:
                 indices.reverse()
             frames += [sequence.frames[i] for i in indices]
         ends = [sequence.black, sequence.white]
-        frames += [sequence.frames[i] for i in (reversed(ends) if self.white_first else ends)]
+        frames += [sequence.frames[i] for i in (reversed(ends) if WHITE_FIRST in self.modifiers else ends)]
         return tuple(frames)
 
 
 def parse_order(name: str) -> FrameOrder | None:
-    """The order called ``name``, e.g. ``paper`` or ``vertical-first+white-first``; None for ``auto``.
-
-    Raises `LayoutError` for an unknown name.
-    """
+    """The order called ``name``, e.g. ``paper`` or ``vertical-first+white-first``; None for ``auto``. Raises
+    `LayoutError` for an unknown name."""
     if name == AUTO:
         return None
     layout, *modifiers = name.split("+")
@@ -91,13 +85,13 @@ def parse_order(name: str) -> FrameOrder | None:
             f"frame order {name!r}: expected {AUTO}, or one of {', '.join(LAYOUTS)}, followed by any of "
             + ", ".join(f"+{modifier}" for modifier in MODIFIERS)
         )
-    return FrameOrder(layout, *(modifier in modifiers for modifier in MODIFIERS))
+    return FrameOrder(layout, frozenset(modifiers))
 
 
 def all_orders() -> Iterator[FrameOrder]:
     """All named orders, the paper's first."""
-    for *modifiers, layout in product((False, True), (False, True), (False, True), LAYOUTS):
-        yield FrameOrder(layout, *modifiers)
+    for *used, layout in product((False, True), (False, True), (False, True), LAYOUTS):
+        yield FrameOrder(layout, frozenset(compress(MODIFIERS, used)))
 
 
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
@@ -112,14 +106,14 @@ def check_order(files: list[NDArray[np.uint8]], order: FrameOrder, rig: Rig) -> 
 
 
 class _Lines:
-    """A raw scan on some image rows ``along_x`` (F, lines, W) and columns ``along_y`` (F, lines, H), float32."""
+    """A raw scan on some image rows and columns: ``parts`` along x (F, lines, W) and along y (F, lines, H), float32."""
 
     def __init__(self, files: list[NDArray[np.uint8]]) -> None:
         height, width = files[0].shape
         rows = np.unique(np.linspace(0, height - 1, _LINES).astype(int))
         columns = np.unique(np.linspace(0, width - 1, _LINES).astype(int))
-        self.along_x = np.stack([image[rows] for image in files]).astype(np.float32)
-        self.along_y = np.stack([image[:, columns].T for image in files]).astype(np.float32)
+        along_x, along_y = [image[rows] for image in files], [image[:, columns].T for image in files]
+        self.parts = tuple(np.stack(lines).astype(np.float32) for lines in (along_x, along_y))
         self.mean = np.array([float(image.mean(dtype=np.float64)) for image in files])
 
 
@@ -133,7 +127,7 @@ def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
             f"A_{darkest}.png is the darkest and A_{brightest}.png the brightest image; expected black in "
             f"A_{black}.png and white in A_{white}.png"
         ]
-    lit = [part[white] - part[black] >= _LEAST_CONTRAST for part in (lines.along_x, lines.along_y)]
+    lit = [part[white] - part[black] >= _LEAST_CONTRAST for part in lines.parts]
     if min(float(part.mean()) for part in lit) < _LEAST_LIT:
         return [f"A_{white}.png is hardly brighter than A_{black}.png: too little contrast to check an order"]
     problems = _two_valued(lines, frames, lit, black, white)
@@ -141,16 +135,14 @@ def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
         for direction in DIRECTIONS:
             sinusoids, codes = rig.sequence.sinusoids(direction), rig.sequence.gray(direction)
             problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], lit, direction, rig)
-            limit = [(part[black] + part[white]) / 2 for part in (lines.along_x, lines.along_y)]
+            limit = [(part[black] + part[white]) / 2 for part in lines.parts]
             problems += _codes(lines, [file_of_frame[i] for i in codes], lit, direction, rig, limit)
     return problems
 
 
-def _two_valued(
-    lines: _Lines, frames: tuple[Frame, ...], lit: list[NDArray[np.bool_]], black: int, white: int
-) -> list[str]:
+def _two_valued(lines: _Lines, frames: tuple[Frame, ...], lit: _Lit, black: int, white: int) -> list[str]:
     problems = []
-    parts = [part[:, part_lit] for part, part_lit in zip((lines.along_x, lines.along_y), lit, strict=True)]
+    parts = [part[:, part_lit] for part, part_lit in zip(lines.parts, lit, strict=True)]
     grey = np.concatenate(parts, axis=1)
     share = (grey - grey[black]) / (grey[white] - grey[black])
     middle = ((share > _MIDDLE[0]) & (share < _MIDDLE[1])).mean(axis=1)
@@ -174,14 +166,12 @@ def _expected_gradient(direction: Direction, rig: Rig) -> NDArray[np.float64]:
     return np.array([coordinates_px[1] - coordinates_px[0], coordinates_px[2] - coordinates_px[0]])
 
 
-def _sinusoids(
-    lines: _Lines, numbers: list[int], lit: list[NDArray[np.bool_]], direction: Direction, rig: Rig
-) -> list[str]:
+def _sinusoids(lines: _Lines, numbers: list[int], lit: _Lit, direction: Direction, rig: Rig) -> list[str]:
     steps = len(numbers)
     shifts = 2 * np.pi * np.arange(steps) / steps
     weights = phase_weights(shifts)
     residuals, real, imaginary, gradients = [], [], [], []
-    for part, part_lit in zip((lines.along_x, lines.along_y), lit, strict=True):
+    for part, part_lit in zip(lines.parts, lit, strict=True):
         stack = part[numbers]
         mean, cosine, sine = weighted_sums(stack, weights)
         wave = cosine - 1j * sine
@@ -218,11 +208,10 @@ def _sinusoids(
 
 
 def _codes(
-    lines: _Lines, numbers: list[int], lit: list[NDArray[np.bool_]], direction: Direction, rig: Rig,
-    limit: list[NDArray[np.float32]],
-) -> list[str]:  # fmt: skip
+    lines: _Lines, numbers: list[int], lit: _Lit, direction: Direction, rig: Rig, limit: list[NDArray[np.float32]]
+) -> list[str]:
     axis = int(np.abs(_expected_gradient(direction, rig)).argmax())
-    codes = [part[numbers] > middle for part, middle in zip((lines.along_x, lines.along_y), limit, strict=True)]
+    codes = [part[numbers] > middle for part, middle in zip(lines.parts, limit, strict=True)]
     pairs = [part_lit[:, 1:] & part_lit[:, :-1] for part_lit in lit]
     # Changes of each bit per image line: (bits,) along x and along y.
     edges = [
@@ -234,7 +223,7 @@ def _codes(
         f"A_{numbers[i]}.png: expected {direction} Gray bit {i}, varying along image {'xy'[axis]}; it does not"
         for i in np.flatnonzero((across > along) & (across > _LEAST_EDGES_A_LINE))
     ]
-    grey = (lines.along_x, lines.along_y)[axis][numbers]
+    grey = lines.parts[axis][numbers]
     problems += [
         f"A_{numbers[i]}.png and A_{numbers[j]}.png: the same image, expected two Gray bits"
         for i, j in combinations(range(len(numbers)), 2)

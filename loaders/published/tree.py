@@ -1,12 +1,11 @@
 """The published tree: its names, and a scan that lists its samples and every error in the layout that names alone show.
-
 Only directory entries and PNG headers are read here; contents are checked when a sample is read
-(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored.
-"""
+(`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored."""
 
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
@@ -87,8 +86,9 @@ class PublishedTree:
     has_frames: bool
     ignored: tuple[str, ...]
 
-    def all_samples(self) -> list[PublishedSample]:
-        return [sample for samples in self.samples.values() for sample in samples]
+    @cached_property
+    def by_name(self) -> dict[str, PublishedSample]:
+        return {sample.sample: sample for samples in self.samples.values() for sample in samples}
 
 
 def _locate(root: Path) -> tuple[Path, Path | None]:
@@ -123,9 +123,7 @@ def _entries(folder: Path) -> list[Path]:
 
 def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
-
-    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself.
-    """
+    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
     training, scans_folder = _locate(root)
     scan = _Scan(training)
     variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())

@@ -21,10 +21,8 @@ from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 @dataclass(frozen=True)
 class PhotographedRows:
-    """Picklable source of a build's rows: photographs the objects of a shard and writes their meshes.
-
-    The studio, with its background and buffers, serves every shard of a process.
-    """
+    """Picklable source of a build's rows: photographs the objects of a shard and writes their meshes. The studio, with
+    its background and buffers, serves every shard of a process."""
 
     settings: BuildSettings
 
@@ -63,18 +61,14 @@ def assembly_of(settings: BuildSettings) -> Assembly:
 
 
 def build(folder: Path, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Build a dataset into ``folder``, or go on with one that was interrupted. Same settings, same bytes.
-
-    Raises `BuildError` (folder in use, other settings, disk full) and `MeshError` (an object does not fit).
-    """
+    """Build a dataset into ``folder``, or go on with one that was interrupted. Same settings, same bytes. Raises
+    `BuildError` (folder in use, other settings, disk full) and `MeshError` (an object does not fit)."""
     return storage.assemble(folder, assembly_of(settings), workers, progress)
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     """The account of a built dataset. Takes a second or two: it makes one view, that of median cover, several times.
-
-    Raises `BuildError` for a dataset of an earlier version, which counted something else.
-    """
+    Raises `BuildError` for a dataset of an earlier version, which counted something else."""
     if manifest.origin != storage.GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]

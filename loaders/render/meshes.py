@@ -15,7 +15,7 @@ import yaml
 
 from fpp_ml_bench.constants import OBJECTS, SPLITS
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import file_hash
+from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
@@ -34,11 +34,9 @@ def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
 
 
 def load_user_mesh(description: UserMesh) -> SolidMesh:
-    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted.
-
-    Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or
-    triangles between vertices that are not there.
-    """
+    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Raises
+    `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or triangles
+    between vertices that are not there."""
     mesh = _read_mesh(Path(description.path))
     vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
@@ -85,9 +83,7 @@ def write_ply(mesh: SolidMesh, path: Path) -> None:
     """Write a mesh as binary PLY in metres, object coordinates."""
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
-    temporary.replace(path)
+    write_atomically(path, trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
 
 
 def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:

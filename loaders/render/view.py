@@ -16,7 +16,6 @@ from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
 from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.sample import Flag, Row, stored_frames
-from fpp_ml_bench.optics import Sequence
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
@@ -57,7 +56,9 @@ class Studio:
         self._vignetting = vignetting(camera, self.light.camera.falloff) if self.light.camera.falloff else None
         self._lens = gaussian_weights(self.light.camera.blur_px**2, 3.0).astype("f4") if self.light.camera.blur_px else None
         self.stored = stored_frames(rig.sequence, settings.stored)
-        self.unstored = unstored_frames(rig.sequence, self.stored)
+        # Frames that the ground truth is decoded from and that are not stored: all others but black and white.
+        unneeded = {*self.stored, rig.sequence.black, rig.sequence.white}
+        self.unstored = tuple(i for i in range(len(rig.sequence)) if i not in unneeded)
         self._frames = np.zeros((len(rig.sequence), camera.height, camera.width), dtype=np.uint8)
 
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
@@ -176,11 +177,6 @@ class Studio:
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
-
-
-def unstored_frames(sequence: Sequence, stored: tuple[int, ...]) -> tuple[int, ...]:
-    """Frames that the ground truth is decoded from and that are not ``stored``: all others but black and white."""
-    return tuple(i for i in range(len(sequence)) if i not in stored and i not in (sequence.black, sequence.white))
 
 
 def _runs(indices: tuple[int, ...]) -> list[range]:

@@ -6,8 +6,6 @@ from .benchmark import benchmark_of as benchmark_of
 from .benchmark import benchmark_sentence as benchmark_sentence
 from .benchmark import intended_benchmark as intended_benchmark
 from .card import RIG_FILE as RIG_FILE
-from .card import SplitStatistics as SplitStatistics
-from .card import data_version as data_version
 from .card import ground_truth_summary as ground_truth_summary
 from .card import split_statistics as split_statistics
 from .card import whole_statistics as whole_statistics
@@ -20,6 +18,7 @@ from .manifest import ShardFile as ShardFile
 from .manifest import describe_file as describe_file
 from .manifest import read_manifest as read_manifest
 from .parquet import PREVIEW as PREVIEW
+from .parquet import card_configs as card_configs
 from .parquet import columns as columns
 from .parquet import data_shards as data_shards
 from .parquet import preview as preview

@@ -1,8 +1,6 @@
 """From planned shards to a finished folder: skip finished shards, write the rest, then card, rig and manifest.
-
 Generated and imported datasets are written alike; only the source of their rows differs. Each finished shard leaves a
-receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states.
-"""
+receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states."""
 
 import json
 import os
@@ -64,11 +62,9 @@ class Assembly:
 
 
 def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset, and return its manifest.
-
-    ``progress`` is called with numbers of finished rows, first those of an interrupted run; not for a finished dataset.
-    Raises `BuildError` when the folder is in use, holds other files, or can't be written.
-    """
+    """Write or finish the dataset, and return its manifest. ``progress`` is called with numbers of finished rows, first
+    those of an interrupted run; not for a finished dataset. Raises `BuildError` when the folder is in use, holds other
+    files, or can't be written."""
     try:
         with writing(folder) as scratch:
             if (folder / MANIFEST).exists():
@@ -86,9 +82,7 @@ def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress 
 @contextmanager
 def writing(folder: Path) -> Iterator[Path]:
     """Lock a dataset folder for its single writer; yields its work folder, which is removed once the manifest is there.
-
-    Raises `BuildError` for a folder that another process is writing, or that holds other files than a dataset.
-    """
+    Raises `BuildError` for a folder that another process is writing, or that holds other files than a dataset."""
     work = folder / WORK_FOLDER
     if folder.exists() and not folder.is_dir():
         raise BuildError(f"{folder}: is a file; give a folder")

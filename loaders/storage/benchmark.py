@@ -1,8 +1,6 @@
-"""The benchmarks that this package names: which bytes a preset must have, and whether a dataset folder has them.
-
-A result is only comparable with results on the same bytes. A benchmark therefore has a name, a version and a
-fingerprint (`Manifest.fingerprint`), the same on every processor. A change of the bytes is a new version.
-"""
+"""The benchmarks that this package names: which bytes a preset must have, and whether a dataset folder has them. A
+result is only comparable with results on the same bytes. A benchmark therefore has a name, a version and a fingerprint
+(`Manifest.fingerprint`), the same on every processor. A change of the bytes is a new version."""
 
 from dataclasses import dataclass
 

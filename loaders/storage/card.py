@@ -1,11 +1,8 @@
 """What describes a dataset: the files by which Hugging Face tools open its folder, the rig file, and its statistics.
-
 ``datasets.load_dataset(FOLDER, "single_shot")`` follows the card's ``configs:`` and copies into its cache;
-``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place.
-"""
+``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -93,42 +90,20 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
     return ["README.md", RIG_FILE, *contents]
 
 
-@dataclass(frozen=True)
-class SplitStatistics:
-    """Statistics of a split; lengths in mm, shares from 0 to 1, None where a dataset has no exact depth.
-
-    ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact depth over all
-    object pixels, averaged over samples like every score. ``gt_interior_*``: the same over object pixels 3 px or more
-    from depth edges.
-    """
-
-    split: str
-    samples: int
-    objects: int
-    cover_mean: float
-    cover_min: float
-    cover_max: float
-    depth_range_median_mm: float
-    depth_range_max_mm: float
-    gt_mae_mm: float | None
-    gt_rmse_mm: float | None
-    gt_interior_mae_mm: float | None
-    gt_interior_rmse_mm: float | None
-    gt_max_mm: float | None
-    undecoded_share: float | None
-
-
-def split_statistics(manifest: Manifest) -> list[SplitStatistics]:
-    """Statistics of each split that has rows in the manifest."""
+def split_statistics(manifest: Manifest) -> list[dict[str, Any]]:
+    """Statistics of each split that has rows in the manifest: lengths in mm, shares from 0 to 1, None where a dataset
+    has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact
+    depth over all object pixels, averaged over samples like every score; ``gt_interior_*`` over those 3 px or more from
+    depth edges."""
     return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
 
 
-def whole_statistics(manifest: Manifest) -> SplitStatistics:
+def whole_statistics(manifest: Manifest) -> dict[str, Any]:
     """Statistics of all rows together, as a split called ``all``."""
     return _split("all", [row for rows in manifest.samples.values() for row in rows], manifest)
 
 
-def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> SplitStatistics:
+def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[str, Any]:
     pixels = manifest.size[0] * manifest.size[1]
     cover = np.array([row["object_px"] for row in rows]) / pixels
     ranges = np.array([row["depth_max_mm"] - row["depth_min_mm"] for row in rows])
@@ -139,21 +114,22 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> SplitS
 
     largest = [row["gt_max_mm"] for row in rows if row.get("gt_max_mm") is not None]
     exact_px = sum(row.get("exact_px", 0) for row in rows)
-    return SplitStatistics(
-        split, len(rows), len({row["object"] for row in rows}), float(cover.mean()), float(cover.min()),
-        float(cover.max()), float(np.median(ranges)), float(ranges.max()),
-        **{name: average(name) for name in ("gt_mae_mm", "gt_rmse_mm", "gt_interior_mae_mm", "gt_interior_rmse_mm")},
-        gt_max_mm=max(largest) if largest else None,
-        undecoded_share=sum(row["undecoded_px"] for row in rows) / exact_px if exact_px else None,
-    )  # fmt: skip
+    means = ("gt_mae_mm", "gt_rmse_mm", "gt_interior_mae_mm", "gt_interior_rmse_mm")
+    return {
+        "split": split, "samples": len(rows), "objects": len({row["object"] for row in rows}),
+        "cover_mean": float(cover.mean()), "cover_min": float(cover.min()), "cover_max": float(cover.max()),
+        "depth_range_median_mm": float(np.median(ranges)), "depth_range_max_mm": float(ranges.max()),
+        **{name: average(name) for name in means}, "gt_max_mm": max(largest) if largest else None,
+        "undecoded_share": sum(row["undecoded_px"] for row in rows) / exact_px if exact_px else None,
+    }  # fmt: skip
 
 
 def ground_truth_summary(manifest: Manifest) -> list[str]:
     """A sentence per split on the error of the decoded ground truth against the exact depth; none for imported data."""
     return [
-        f"{s.split}: ground truth within {s.gt_mae_mm:.3f} mm MAE, {s.gt_rmse_mm:.3f} mm RMSE of the exact depth "
-        f"({s.gt_interior_mae_mm:.3f} mm 3 px or more from depth edges); {100 * s.undecoded_share:.2f}% of object "
-        "pixels not decodable"
+        f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm RMSE of the exact "
+        f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); {100 * s['undecoded_share']:.2f}% of "
+        "object pixels not decodable"
         for s in split_statistics(manifest)
-        if s.gt_mae_mm is not None and s.gt_interior_mae_mm is not None and s.undecoded_share is not None
+        if None not in (s["gt_mae_mm"], s["gt_interior_mae_mm"], s["undecoded_share"])
     ]

@@ -1,8 +1,6 @@
-"""``manifest.json``: what a finished dataset folder holds, with a checksum for every file.
-
-It is written last, so a folder without one is a build that was interrupted. It holds nothing that differs between two
-builds of the same settings: no date, no path, no machine.
-"""
+"""``manifest.json``: what a finished dataset folder holds, with a checksum for every file. It is written last, so a
+folder without one is a build that was interrupted. It holds nothing that differs between two builds of the same
+settings: no date, no path, no machine."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -47,11 +45,9 @@ class OtherFile:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything a reader must know before it opens a shard.
-
-    ``samples`` holds, per split, one mapping per row in row order: sample, object, view and what the builder measured
-    of it (cover, distance, ground-truth error). ``stored`` is the configuration whose frames are on disk.
-    """
+    """Everything a reader must know before it opens a shard. ``samples`` holds, per split, one mapping per row in row
+    order: sample, object, view and what the builder measured of it (cover, distance, ground-truth error). ``stored`` is
+    the configuration whose frames are on disk."""
 
     origin: str
     generator: dict[str, str]

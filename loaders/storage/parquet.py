@@ -9,7 +9,7 @@ of a file is in memory at a time.
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
@@ -65,6 +65,20 @@ def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
     return [*names[:place], PREVIEW, *names[place:]]
 
 
+def card_configs(dataset: DatasetFolder, identity: str, files: Mapping[str, object], preview: bool) -> list[Any]:
+    """The configurations as a card lists them; ``files`` are a pattern or names for each split."""
+    return [
+        {
+            "config_name": config,
+            **({"default": True} if config == dataset.configs[0] else {}),
+            "version": data_version(identity),
+            "data_files": [{"split": split, "path": paths} for split, paths in files.items()],
+            "columns": [name for name in columns(dataset, config) if preview or name != PREVIEW],
+        }
+        for config in dataset.configs
+    ]
+
+
 def _all_columns(dataset: DatasetFolder) -> list[str]:
     return layout.row_columns(dataset.sequence, dataset.manifest.stored_frames, dataset.has_exact)
 
@@ -81,11 +95,8 @@ def write_parquet(
     dataset: DatasetFolder, folder: Path, splits: list[str], threads: int = 1,
     rows_done: Callable[[int], None] = lambda rows: None,
 ) -> None:  # fmt: skip
-    """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it.
-
-    Raises ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in
-    memory.
-    """
+    """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it. Raises
+    ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in memory."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
     files = [(folder / name, shard) for name, shard in data_shards(dataset).items() if shard.split in splits]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
@@ -111,13 +122,9 @@ def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_don
     _write_groups(path, schema, settings, groups, rows_done)
 
 
-def write_shard(
-    dataset: DatasetFolder, shard: ShardFile, path: Path, threads: int, row_done: Callable[[int], None]
-) -> None:
-    """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all.
-
-    Raises `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write.
-    """
+def write_shard(dataset: DatasetFolder, shard: ShardFile, out: Path, threads: int, done: Callable[[int], None]) -> None:
+    """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all. Raises
+    `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write."""
     parts = _parts(dataset, shard)
     for part in parts:
         if file_hash(dataset.path / part.path) != part.xxh3_128:
@@ -146,18 +153,23 @@ def write_shard(
     def groups(pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
         for first in range(0, len(samples), rows):
             group = samples[first : first + rows]
-            encoded = {name: _encoded(dataset, group, schema.field(name), pool) for name in pictures}
+            encoded = {}
+            for name in pictures:
+                index = None if name == PREVIEW else int(name.removeprefix("frame_"))
+                contents = pool.map(lambda sample, index=index: _png(dataset, sample, index), group)
+                cells = [{"bytes": content, "path": None} for content in contents]
+                encoded[name] = pa.array(cells, schema.field(name).type)
             plain = {name: column.slice(first, len(group)) for name, column in stored.items()}
             yield pa.Table.from_arrays([(plain | encoded)[name] for name in names], schema=schema)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         with ThreadPoolExecutor(threads) as pool:
-            _write_groups(temporary, schema, settings, groups(pool), row_done)
+            _write_groups(temporary, schema, settings, groups(pool), done)
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        temporary.replace(path)
+        temporary.replace(out)
     finally:
         temporary.unlink(missing_ok=True)
         for part in parts:
@@ -207,12 +219,6 @@ def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]
     return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
 
 
-def _encoded(dataset: DatasetFolder, samples: list[str], field: pa.Field, pool: ThreadPoolExecutor) -> pa.Array:
-    index = None if field.name == PREVIEW else int(field.name.removeprefix("frame_"))
-    encoded = pool.map(lambda sample: _png(dataset, sample, index), samples)
-    return pa.array([{"bytes": content, "path": None} for content in encoded], field.type)
-
-
 def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
     """A frame, or the preview (None), as PNG. Noisy fringes have no repetition to search for: with Huffman coding
     alone the files are 22% smaller than at OpenCV's level 1, and decode 1.7 times as fast (measured)."""
@@ -226,9 +232,7 @@ def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
 
 def preview(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Picture of a depth map float32 (H, W) in mm: uint8, at most `PREVIEW_PX` a side; nearest white, background black.
-
-    Scaled to the object's own range, so it is for looking only.
-    """
+    Scaled to the object's own range, so it is for looking only."""
     step = -(-max(depth_mm.shape) // PREVIEW_PX)
     small = depth_mm[::step, ::step].astype(np.float64)
     inside = object_mask(small)
@@ -243,16 +247,7 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     manifest = dataset.manifest
     # Exports of the same dataset with different splits must not share a cache entry.
     identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
-    configs = [
-        {
-            "config_name": config,
-            **({"default": True} if config == dataset.configs[0] else {}),
-            "version": data_version(identity),
-            "data_files": [{"split": split, "path": f"data/{split}-*.parquet"} for split in splits],
-            "columns": config_columns(dataset.sequence, config, dataset.has_exact),
-        }
-        for config in dataset.configs
-    ]
+    configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
     return CARD_HEAD + _CARD.format(
         configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(), origin=manifest.origin,
         rows=sum(len(dataset.samples(split)) for split in splits), height=dataset.size[0], width=dataset.size[1],

@@ -34,11 +34,9 @@ _BLOCKS = 4
 
 
 class DirectFile:
-    """A new file for sequential writing, in the form that ``pyarrow.PythonFile`` takes.
-
-    ``thread`` writes the blocks; several files may share it. After `close`, ``size`` bytes with hash ``xxh3_128`` are
-    on the disk. Errors of the disk are raised as ``OSError`` by a later `write` or by `close`.
-    """
+    """A new file for sequential writing, in the form that ``pyarrow.PythonFile`` takes. ``thread`` writes the blocks;
+    several files may share it. After `close`, ``size`` bytes with hash ``xxh3_128`` are on the disk. Errors of the disk
+    are raised as ``OSError`` by a later `write` or by `close`."""
 
     def __init__(self, path: Path, thread: ThreadPoolExecutor) -> None:
         self._hash = xxhash.xxh3_128()
@@ -167,11 +165,9 @@ def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> l
 
 
 def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
-    """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``.
-
-    Arrays are the storage type of its Array2D extension, a list of rows, with the extension named in the field's
-    metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain lists.
-    """
+    """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``. Arrays
+    are the storage type of its Array2D extension, a list of rows, with the extension named in the field's metadata: a
+    reader that has imported ``datasets`` sees Array2D, all others see plain lists."""
     fields, described = [], layout.features(columns, size)
     types = {"string": pa.string(), "float32": pa.float32(), "uint8": pa.uint8()}
     for name, feature in described.items():
@@ -189,10 +185,8 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
 
 class ShardWriter:
     """Writes shards of one dataset, one after the other. Pixels are copied once, into buffers that all shards reuse.
-
     ``sequence``, ``stored``, ``exact`` and ``size`` (H, W) are the dataset's, as in its `Manifest`; unfinished files
-    lie in ``scratch``.
-    """
+    lie in ``scratch``."""
 
     def __init__(
         self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
@@ -208,10 +202,8 @@ class ShardWriter:
         self._buffers: dict[str, NDArray] = {}
 
     def write(self, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None) -> Receipt:
-        """Write the rows of ``plan``, which come in its order, and call ``row_done`` after each.
-
-        Raises `BuildError` when the disk is full or can't be written; no unfinished file is left.
-        """
+        """Write the rows of ``plan``, which come in its order, and call ``row_done`` after each. Raises `BuildError`
+        when the disk is full or can't be written; no unfinished file is left."""
         temporary = {group: self._scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._groups}
         try:
             described, sinks = self._write_streams(plan, rows, temporary, row_done)
@@ -321,10 +313,8 @@ def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
 
 
 def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
-    """Least and greatest depth above 0 of a sample (paper Section 3.3), mm.
-
-    Raises `BuildError` for a map without object pixels, or with a depth that is negative or not finite.
-    """
+    """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for a map without
+    object pixels, or with a depth that is negative or not finite."""
     if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
         raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
     inside = depth_mm[object_mask(depth_mm)]

@@ -5,11 +5,10 @@ NumPy and pyarrow. Plain ``datasets.load_dataset`` copies what it reads into its
 leave columns out; `load_dataset` joins the tables of the column groups, and a frame is read only when its row is.
 """
 
-import ctypes
 import mmap
 import sys
 from collections.abc import Iterable
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,15 +18,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import SPLITS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.sample import (
-    DATA_GROUP,
-    DEPTH,
-    DEPTH_EXACT,
-    available_configs,
-    config_columns,
-    features,
-    stored_groups,
-)
+from fpp_ml_bench.loaders import sample as layout
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, config_columns, stored_groups
 from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
 from fpp_ml_bench.optics import CONFIGS, Rig, Sequence, rig_from_dict
 
@@ -39,11 +31,9 @@ ALL_SPLITS = "all"
 
 
 class DatasetFolder:
-    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder.
-
-    Images are read-only memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker
-    processes map the files themselves.
-    """
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder. Images are read-only
+    memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker processes map the
+    files themselves."""
 
     def __init__(self, path: str | Path, check: bool = True) -> None:
         """With ``check`` off, the folder opens even if some of its files are missing or cut."""
@@ -51,7 +41,7 @@ class DatasetFolder:
         self.manifest = read_manifest(self.path)
         self._batches: dict[str, list[pa.RecordBatch]] = {}
         self._images: dict[tuple[str, str], list[NDArray]] = {}
-        self._maps: dict[str, pa.Buffer] = {}
+        self._maps: dict[str, mmap.mmap] = {}
         for shard in self.manifest.shards if check else ():
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
@@ -91,7 +81,7 @@ class DatasetFolder:
     @property
     def configs(self) -> tuple[str, ...]:
         """Configurations whose frames are stored here."""
-        return available_configs(self.sequence, self.manifest.stored)
+        return layout.available_configs(self.sequence, self.manifest.stored)
 
     @property
     def has_exact(self) -> bool:
@@ -142,12 +132,9 @@ class DatasetFolder:
         return self._image(sample, DATA_GROUP, column)
 
     def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background.
-
-        The object is the same set of pixels for either column, the pixels with a decoded ``depth``: a surface that the
-        projector does not reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same
-        pixels.
-        """
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background. The object is the same
+        set of pixels for either column, the pixels with a decoded ``depth``: a surface that the projector does not
+        reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same pixels."""
         depth_mm = self.depth_mm(sample)
         if column == DEPTH:
             return depth_mm
@@ -168,10 +155,8 @@ class DatasetFolder:
         return [self.frame(sample, index) for index in indices]
 
     def release(self, sample: str) -> None:
-        """Release the memory of a sample's images that were read. Views of them stay valid.
-
-        Called after each sample of a split, it keeps the memory from growing with the number of samples.
-        """
+        """Release the memory of a sample's images that were read. Views of them stay valid. Called after each sample of
+        a split, it keeps the memory from growing with the number of samples."""
         split, row = self._find(sample)
         for shard in self.manifest.shards:
             mapped_file = self._maps.get(shard.path)
@@ -179,7 +164,7 @@ class DatasetFolder:
                 continue
             for column in self.record_batches(shard)[0].schema.names:
                 if (shard.path, column) in self._images:
-                    release_pages(self._row_of(shard, column, row), mapped_file.address, mapped_file.size)
+                    release_pages(self._row_of(shard, column, row), mapped_file)
             if row - shard.first_row == shard.rows - 1:
                 self.forget(shard)  # pages between its images stay mapped as long as the file is
 
@@ -206,11 +191,11 @@ class DatasetFolder:
 
             path = self.path / shard.path
             try:
-                memory_map = pa.memory_map(str(path), "r")
-                mapped_file = memory_map.read_buffer()
-                self._batches[shard.path] = list(pa.ipc.open_stream(mapped_file))
+                with path.open("rb") as file:
+                    mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+                self._batches[shard.path] = list(pa.ipc.open_stream(pa.py_buffer(mapped_file)))
                 self._maps[shard.path] = mapped_file
-            except (pa.ArrowException, OSError) as error:
+            except (pa.ArrowException, OSError, ValueError) as error:
                 raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
         return self._batches[shard.path]
 
@@ -235,36 +220,22 @@ class DatasetFolder:
         return pixels.reshape(len(storage), *self.size)
 
 
-_MADV_DONTNEED = 4
 FAULT_AROUND_BYTES = 1 << 16
 """A page fault on a file also maps the neighbouring pages, in aligned windows of this size (Linux's default)."""
 
 
-@cache
-def _madvise() -> Any:
-    if not sys.platform.startswith("linux"):
-        return None
-    function = getattr(ctypes.CDLL(None), "madvise", None)
-    if function is not None:
-        function.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-    return function
-
-
-def release_pages(view: NDArray[Any], address: int, size: int) -> None:
-    """Release the pages of ``view``, a contiguous array in a READ-ONLY FILE map, and the pages mapped with them.
-
-    ``address`` and ``size`` (bytes) are those of the whole map. No page outside is touched: on memory that is not
-    backed by a file, the same call would erase the data. Does nothing on other systems than Linux.
-    """
-    madvise = _madvise()
-    start = view.ctypes.data
-    stop = start + view.nbytes
-    if madvise is None or not view.nbytes or start < address or stop > address + size:
+def release_pages(view: NDArray[Any], mapped_file: mmap.mmap) -> None:
+    """Release the pages of ``view``, a contiguous array in a READ-ONLY FILE map, and the pages mapped with them. No
+    page outside is touched: on memory that is not backed by a file, the same call would erase the data. Does nothing
+    for a view of other memory (of two threads that map a file at once, one's map is kept), and on other systems than
+    Linux."""
+    address, size = np.frombuffer(mapped_file, np.uint8).ctypes.data, len(mapped_file)
+    start = view.ctypes.data - address
+    if not sys.platform.startswith("linux") or not view.nbytes or start < 0 or start + view.nbytes > size:
         return
-    page = mmap.PAGESIZE
-    begin = max(start // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES, address // page * page)
-    end = min(-(-stop // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES, -(-(address + size) // page) * page)
-    madvise(begin, end - begin, _MADV_DONTNEED)
+    begin = max((start + address) // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES - address, 0)
+    end = min(-(-(start + address + view.nbytes) // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES - address, size)
+    mapped_file.madvise(mmap.MADV_DONTNEED, begin, end - begin)
 
 
 def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
@@ -301,7 +272,7 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
         if names:
             tables.append(concat_tables([file.select(names) for file in files], axis=0))
     table = tables[0] if len(tables) == 1 else ConcatenationTable.from_tables(tables, axis=1)
-    described = Features.from_dict(features(columns, dataset.size))
+    described = Features.from_dict(layout.features(columns, dataset.size))
     info = DatasetInfo(features=described, config_name=config, dataset_name="fpp-ml-bench")
     # `datasets` caches later transforms by this fingerprint: it depends on the data, not on the path.
     fingerprint = f"{dataset.fingerprint[:16]}-{config}-{split}"

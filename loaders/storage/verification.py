@@ -28,8 +28,7 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     Checks: every file of the manifest is there with its checksum; no foreign file; every Arrow file holds the rows and
     columns it should; labels and depth ranges agree with the images; depths are finite and not negative; no object is
     in two splits, none lacks a view, the benchmark's own objects are in their split; no image appears in two splits.
-    Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file.
-    """
+    Raises ``DatasetError`` when there is no readable manifest. ``progress`` is called with 1 for each file."""
     opened = DatasetFolder(folder, check=False)
     manifest = opened.manifest
     findings = _foreign_files(folder, manifest)

@@ -46,14 +46,14 @@ def test_one_period_against_the_closed_form(direction, baseline_m):
 
 def test_the_exponent_is_two_where_the_mistake_is_small_and_the_baseline_thin():
     small, away, toward, both, behind = error_curves(paper_rig(176), "horizontal")
-    assert small.exponent == pytest.approx(2, rel=0.01) and small.quadratic_m == pytest.approx([0.3, 10.0])
-    assert away.exponent > 2.1 and toward.exponent < 1.9
-    assert both.quadratic_m is not None and both.quadratic_m[1] == pytest.approx(1.0, rel=0.05)
-    assert both.exponent == pytest.approx(2, rel=0.01)
+    assert small["exponent"] == pytest.approx(2, rel=0.01) and small["quadratic_m"] == pytest.approx([0.3, 10.0])
+    assert away["exponent"] > 2.1 and toward["exponent"] < 1.9
+    assert both["quadratic_m"] is not None and both["quadratic_m"][1] == pytest.approx(1.0, rel=0.05)
+    assert both["exponent"] == pytest.approx(2, rel=0.01)
     # With a projector 0.1 m behind, psi = gain / (Z + 0.1): the local exponent is 2 Z / (Z + 0.1) for a small mistake.
-    at = np.searchsorted(behind.distances_m, 0.5)
-    z = behind.distances_m[at]
-    assert behind.local[at] == pytest.approx(2 * z / (z + 0.1), rel=0.01)
+    at = np.searchsorted(behind["distances_m"], 0.5)
+    z = behind["distances_m"][at]
+    assert behind["local"][at] == pytest.approx(2 * z / (z + 0.1), rel=0.01)
 
 
 def test_the_probe_needs_no_model(opened, tmp_path):

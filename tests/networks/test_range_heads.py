@@ -10,7 +10,7 @@ from torch import nn
 
 from fpp_ml_bench.baselines.networks import range_heads
 from fpp_ml_bench.baselines.networks.base import FringeNetwork
-from fpp_ml_bench.baselines.networks.model import Model, heads_from_tensors
+from fpp_ml_bench.baselines.networks.model import HeadReport, Model, heads_from_tensors
 from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.errors import PredictionError, WeightsError
 
@@ -91,7 +91,7 @@ def test_what_the_frame_tells_is_found(dataset, config, fitted):
     model = Model(KnownNetwork().eval(), config, heads, torch.device("cpu"), "0" * 64)
     train, validation = known_range(dataset, "train"), known_range(dataset, "validation")
     np.testing.assert_allclose(heads.mean_range_mm.numpy(), train.mean(axis=0), rtol=1e-12)
-    report = heads.validation
+    report = HeadReport(*heads.report.tolist())
     assert report.mean_range_error_mm == pytest.approx(np.abs(validation - train.mean(axis=0)).mean(), rel=1e-6)
     assert report.predicted_range_error_mm < 0.05 < 20 < report.mean_range_error_mm
     assert report.mask_iou == 1.0

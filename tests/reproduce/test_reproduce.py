@@ -15,13 +15,13 @@ from fpp_ml_bench.baselines.reproduce.scoring import (
     all_frames_that_hold,
     read_all_frames,
     score_all_frames,
-    write_all_frames,
 )
 from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import claim_folder, depth_training, load_recipe, model_config, save_weights
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
+from fpp_ml_bench.evaluation.result import write_json
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry
@@ -268,7 +268,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
 
     scores = score_all_frames(opened, zeros, [0, 3], ("mm", "standard"), ABOUT)
     path = tmp_path / "all.json"
-    write_all_frames(scores, path)
+    write_json(scores.model_dump(mode="json"), path)
     assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
     assert all_frames_that_hold(path, opened.fingerprint, 64 * "b") is None
     assert scores.metrics.background_mae_mm == 0 and scores.metrics.object_mae_mm > 1500

@@ -2,8 +2,8 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
@@ -17,10 +17,8 @@ from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
-    Scored,
     orderings,
     orderings_sentence,
-    scored,
     table_lines,
     table_markdown,
 )
@@ -52,7 +50,7 @@ def test_rows_of_one_recipe_are_one_training(preset):
     ]
     names = [job.recipe.name for job in jobs]
     assert len(set(names)) == len(names)
-    titles = [(job.recipe.title, variant.depth_range) for job in jobs for variant in variants(job.recipe)]
+    titles = [(job.recipe.title, depth_range) for job in jobs for depth_range in variants(job.recipe)]
     assert len(set(titles)) == len(titles)
 
 
@@ -64,7 +62,7 @@ def test_lines_hold_the_papers_numbers(tmp_path, dataset):
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
         extra = [line.label for line in by_row.values() if line.paper_mm is None]
         assert extra == (["Hformer"] if table == "architecture" else [])
-        assert all(line.scored is line.entry is None for line in by_row.values())
+        assert all(line.scores is line.entry is None for line in by_row.values())
 
 
 def test_two_recipes_under_one_name_are_refused(monkeypatch):
@@ -77,9 +75,11 @@ def test_two_recipes_under_one_name_are_refused(monkeypatch):
         planned(["normalization", "loss"], "cpu")
 
 
-def test_variants_of_a_training():
+def test_variants_of_a_training(tmp_path):
     def of(name):
-        return [variant.suffix for variant in variants(load_recipe(name))]
+        recipe = load_recipe(name)
+        rows = [folders(tmp_path).row(recipe, depth_range).stem for depth_range in variants(recipe)]
+        return [row.removeprefix(f"cpu-{recipe.name}") for row in rows]
 
     assert of("normalization/raw") == of("background_removed/individual") == [""]
     assert of("loss/l1") == ["", "-range-predicted", "-range-mean"]
@@ -120,10 +120,11 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
     """A line with these object errors, sample ``object_view`` to mm."""
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
-    mean = float(np.mean(list(errors.values())))
-    samples = {sample: (sample.rpartition("_")[0], error) for sample, error in errors.items()}
-    of_samples = Scored(dict.fromkeys(paper_tables()["loss"].rows[0].errors_mm, mean), None, samples)
-    return Line(label, label, load_recipe("loss/rmse"), of_samples, entry, paper)
+    samples = [
+        SimpleNamespace(sample=sample, object=sample.rpartition("_")[0], object_mae_mm=error)
+        for sample, error in errors.items()
+    ]
+    return Line(label, label, load_recipe("loss/rmse"), SimpleNamespace(per_sample=samples), entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -172,8 +173,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     ]
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scored=scored(entry.result))
-        for n, entry in enumerate(entries, 1)
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scores=entry.result) for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
     assert (ordering.gap_mm, list(ordering.interval_mm)) == (difference.mean_mm, difference.interval_mm)
@@ -188,7 +188,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
 
 
 def test_rows_that_were_not_measured_stay_empty():
-    empty = replace(line("masked | L1", 18.0, {"a_A0": 1.0}), scored=None)
+    empty = replace(line("masked | L1", 18.0, {"a_A0": 1.0}), scores=None)
     text = table_markdown(
         "loss", [empty], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
     )

@@ -63,7 +63,7 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     write_reliance(read_entry(file), Reliance(**block()))
     again = read_entry(file)
     assert again.provenance == entry.provenance
-    assert again.reliance == Reliance(**block())
+    assert again.result.reliance == Reliance(**block())
     assert again.result.model_copy(update={"reliance": None}) == entry.result
     before = file.read_bytes()
     write_reliance(again, Reliance(**block()))

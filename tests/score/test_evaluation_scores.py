@@ -12,7 +12,7 @@ from scored_dataset import disk_depth
 from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import WITHIN
-from fpp_ml_bench.evaluation.result.model import mean_over_samples, over_samples, pooled
+from fpp_ml_bench.evaluation.result.model import over_samples, pooled
 from fpp_ml_bench.evaluation.score import sample_scores
 from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, ErrorStats, combine, score_sample
 
@@ -243,12 +243,12 @@ def test_averages_over_samples_and_pixels_differ_as_documented():
     rows = [s.metrics() for s in (*samples, without_object)]
     inside, outside = (combine(*(getattr(s, pixels) for s in samples)) for pixels in ("object", "background"))
     pool = pooled(inside, combine(outside, without_object.background))
-    assert mean_over_samples(rows)["object_mae_mm"] == 2.5
+    assert over_samples(rows)["object_mae_mm"] == 2.5
     assert over_samples(rows, statistics.median)["object_mae_mm"] == 2.5
     assert pool["object_mae_mm"] == pytest.approx((10 * 4 + 90 * 1) / 100, rel=1e-15)
     assert pool["object_rmse_mm"] == pytest.approx(math.sqrt((10 * 16 + 90) / 100), rel=1e-15)
-    assert mean_over_samples(rows)["background_mae_mm"] == pytest.approx(1 / 3, rel=1e-15)
-    assert mean_over_samples([without_object.metrics()])["object_mae_mm"] is None
+    assert over_samples(rows)["background_mae_mm"] == pytest.approx(1 / 3, rel=1e-15)
+    assert over_samples([without_object.metrics()])["object_mae_mm"] is None
 
 
 @pytest.mark.parametrize("scale", [1e-160, 1e-300, 5e-324])

@@ -8,7 +8,7 @@ import torch.multiprocessing as spawning
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.result import mean_over_samples
+from fpp_ml_bench.evaluation.result import over_samples
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.torch_metric import KEYS, DepthScores
 
@@ -43,7 +43,7 @@ def assert_same(scores, expected, relative=1e-12):
 def test_same_numbers_as_the_evaluator(kind):
     prediction, target = data(kind)
     rows = [score_sample(p, t).metrics() for p, t in zip(prediction, target, strict=True)]
-    assert_same(scored(3, kind), mean_over_samples(rows))
+    assert_same(scored(3, kind), over_samples(rows))
 
 
 @pytest.mark.parametrize("batches", [2, 4, 11])

@@ -102,7 +102,7 @@ def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
     result = read_result(make("a", noise_mm=2.0))
     assert set(type(result.intervals).model_fields) == set(HEADLINE)
     for key in HEADLINE:
-        low, high = result.intervals[key]
+        low, high = getattr(result.intervals, key)
         assert low <= getattr(result.metrics, key) <= high
     assert [(o.object, o.samples) for o in result.per_object] == [("power_drill", 2), ("wooden_boards", 2)]
     first = [row.object_mae_mm for row in result.per_sample if row.object == "power_drill"]
@@ -115,7 +115,7 @@ def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
 def test_one_object_has_no_interval(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset, split="train", noise_mm=1.0)
     result = evaluate(folder, dataset, "train")
-    assert result.intervals["object_mae_mm"] == [None, None] and result.intervals.of("object_mae_mm") is None
+    assert result.intervals.object_mae_mm == [None, None] and result.intervals.of("object_mae_mm") is None
 
 
 @pytest.mark.parametrize(

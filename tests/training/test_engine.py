@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe,
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.evaluation.result import mean_over_samples
+from fpp_ml_bench.evaluation.result import over_samples
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 
@@ -95,7 +95,7 @@ def test_a_gan_paused_is_the_same_too(tiny, tmp_path):
 
 def validation_of(weights, dataset, recipe):
     """What a log must say of ``weights``, by `score_sample` and NumPy: the mean loss and the scores in mm."""
-    data = FringeDepthDataset(dataset, "validation", recipe.data_config, recipe.normalisation)
+    data = FringeDepthDataset(dataset, "validation", recipe.frames, recipe.normalisation)
     model, rows, losses = load(weights), [], []
     for index in spread(len(data), recipe.validation_pairs):
         item = data[index]
@@ -110,7 +110,7 @@ def validation_of(weights, dataset, recipe):
             prediction = denormalise(values, recipe.normalisation, low, high)
         rows.append(score_sample(prediction, target).metrics())
         losses.append(math.sqrt(float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8))
-    return np.mean(losses), mean_over_samples(rows)
+    return np.mean(losses), over_samples(rows)
 
 
 SCORES = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")

@@ -39,9 +39,7 @@ _DRAWN = {**vars(containers), **vars(household), **vars(tools)}
 
 def object_mesh(name: str) -> trimesh.Trimesh:
     """Mesh of one of the 50 objects at the size it has in the scene: metres, z up, watertight, centred at the origin.
-
-    The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an unknown name.
-    """
+    The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an unknown name."""
     if name not in ENLARGED:
         near = difflib.get_close_matches(name, ENLARGED, n=3, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(ENLARGED)}"

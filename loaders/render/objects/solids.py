@@ -190,10 +190,8 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
 
 
 def skin(rings: np.ndarray, closed: bool = False) -> Solid:
-    """Solid under rings of points (N, K, 3), each joined to the next; ``closed`` joins the last to the first.
-
-    Ends that are not closed are capped by a fan about the mean of their ring, so end rings should be star-shaped.
-    """
+    """Solid under rings of points (N, K, 3), each joined to the next; ``closed`` joins the last to the first. Ends that
+    are not closed are capped by a fan about the mean of their ring, so end rings should be star-shaped."""
     count, sides = rings.shape[:2]
     index = np.arange(count * sides).reshape(count, sides)
     here = index if closed else index[:-1]
@@ -234,10 +232,8 @@ def superellipse(width: float, depth: float, power: float = 2.0, sides: int = 12
 
 
 def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
-    """Upright solid through superellipses (`Level`), wide side to the camera.
-
-    ``smooth`` above 0 passes a smooth curve through the levels, with that many pieces between two of them.
-    """
+    """Upright solid through superellipses (`Level`), wide side to the camera. ``smooth`` above 0 passes a smooth curve
+    through the levels, with that many pieces between two of them."""
     rows = np.asarray(levels, dtype=np.float64)
     if smooth:
         rows = curve(rows, smooth)
@@ -251,10 +247,8 @@ def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
 def tube(
     path: Points, radius: float, flatten: float = 1.0, up: Point3 = (0, 0, 1), closed: bool = False, sides: int = 32
 ) -> Solid:
-    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3).
-
-    ``up`` fixes how an oval section lies: its radius towards ``up`` is ``flatten`` times the one across.
-    """
+    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3). ``up`` fixes how an oval section lies:
+    its radius towards ``up`` is ``flatten`` times the one across."""
     points = np.asarray(path, dtype=np.float64)
     if closed:
         tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
