@@ -3,9 +3,9 @@
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Reliance, Result, result_content, write_result
-from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
+from fpp_ml_bench.schema import validate
 
 _OF_THE_MACHINE = ("threads", "device")
 

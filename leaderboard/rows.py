@@ -15,8 +15,8 @@ from typing import Literal, get_args
 from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, result_content, write_json
-from fpp_ml_bench.evaluation.schema import StrictModel, validate
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.schema import StrictModel, validate
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"

@@ -25,10 +25,10 @@ from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.report import write_sheet
 from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
-from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text, validate
 from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.schema import Count, StrictModel, Text, validate
 
 MAIN_KEY = "object_mae_mm"
 SPLIT, TARGET = "test", "depth"

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import HardwareInfo, read_json, write_json
-from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
+from fpp_ml_bench.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
 
 Group = Literal["classical", "phase", "networks", "precision", "sizes"]
 GROUPS: tuple[Group, ...] = get_args(Group)

@@ -12,9 +12,9 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.evaluation.result import Interval, Result, ends
-from fpp_ml_bench.evaluation.schema import Count, StrictModel, Text
 from fpp_ml_bench.evaluation.score import caution, object_interval
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.schema import Count, StrictModel, Text
 
 MAIN_KEY = "object_mae_mm"
 

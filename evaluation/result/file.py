@@ -17,9 +17,9 @@ from fpp_ml_bench.evaluation import report, submission
 from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION, SchemaVersion
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
-from fpp_ml_bench.evaluation.schema import validate
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.schema import validate
 
 MAX_BYTES = 64 * 1024 * 1024
 

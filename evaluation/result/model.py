@@ -14,9 +14,9 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.result import parts
 from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, SampleResult
-from fpp_ml_bench.evaluation.schema import Count, SparseModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.schema import Count, SparseModel, Text
 
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""

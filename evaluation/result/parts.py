@@ -5,9 +5,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 from fpp_ml_bench.evaluation.score import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
+from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]

@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
-from fpp_ml_bench.evaluation.schema import Count, Positive, Scalar, SparseModel, Text, validate
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
+from fpp_ml_bench.schema import Count, Positive, Scalar, SparseModel, Text, validate
 
 
 class Submission(SparseModel):

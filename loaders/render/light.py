@@ -6,6 +6,7 @@ Grey levels are those of the 8-bit image, before the camera's response.
 """
 
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import strict_yaml
-from fpp_ml_bench.evaluation.schema import NonNegative, Positive, Share, StrictModel, Text, validate
+from fpp_ml_bench.schema import NonNegative, Positive, Share, StrictModel, Text, validate
 
 LIGHTS = Path(__file__).resolve().parent / "lights"
 NAMED = ("paper", "workshop", "hard")
@@ -22,7 +23,7 @@ NAMED = ("paper", "workshop", "hard")
 
 
 def _ascending(curve: tuple[float, ...]) -> tuple[float, ...]:
-    if curve[0] != 0 or curve[-1] != 1 or any(b <= a for a, b in zip(curve, curve[1:], strict=False)):
+    if curve[0] != 0 or curve[-1] != 1 or any(b <= a for a, b in pairwise(curve)):
         raise ValueError("expected a measured response that ascends from 0 to 1")
     return curve
 
@@ -76,10 +77,10 @@ class BounceLight(StrictModel):
 
 class CameraLight(StrictModel):
     """``rays_across``: rays across a pixel that mixes surfaces; 1 is the central ray alone. ``blur_px``: sigma of the
-    lens. ``reference_grey``: direct white light on the material, facing the projector at the near end of the range, at
-    exposure 1. ``exposure``: factor, or the ends of a range from which each view draws one, evenly by its logarithm.
-    ``full_well_e``: electrons at grey level 255, null for no noise. ``bits`` of the converter, whose codes ``response`` (a power) turns
-    into 8-bit grey levels."""
+    lens. ``reference_grey``: direct white light on the matte part of the material, facing the projector at the near end
+    of the range, at exposure 1. ``exposure``: factor, or the ends of a range from which each view draws one, evenly by
+    its logarithm. ``full_well_e``: electrons at grey level 255, null for no noise. ``bits`` of the converter, whose
+    codes ``response`` (a power, or a measured curve) turns into 8-bit grey levels."""
 
     rays_across: Annotated[int, Field(ge=1, le=8)] = 2
     blur_px: Blur = 0.0

@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels
 from fpp_ml_bench.loaders.render.illumination import (
-    LitPixels, Material, grey_of_white, light_surface, projector_centre_m, shine,
+    LitPixels,
+    Material,
+    grey_of_white,
+    light_surface,
+    projector_centre_m,
+    shine,
 )  # fmt: skip
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight
@@ -36,7 +41,7 @@ class Lighting:
         return light_surface(self._points_m, self._normals, self.rig, self.light, self.pattern, occluder=occluder)
 
     def behind(self, traced: TracedObject, covered: NDArray[np.int64]) -> LitPixels:
-        """Light of the plane behind ``traced``, every pixel of the image. Without shadows it is the same for every view.
+        """Light of the plane behind ``traced``, every pixel of the image; without shadows the same for every view.
 
         What lies at ``covered``, the flat pixels that see the object, is of no consequence: there it may differ with
         skipping on and off. ``shadow_rays`` counts the rays that can meet the object, traced or not.

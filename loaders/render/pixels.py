@@ -67,7 +67,7 @@ def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> Mix
     total = across * across
     on_object = np.bincount(parent, minlength=count)
     of_surface = np.bincount(parent[same & ~apart], minlength=count)
-    void = (on_object > 0) & (on_object < total) | (central >= 0) & (of_surface < total) | (central < 0) & (on_object > 0)
+    void = np.where(central >= 0, of_surface < total, on_object > 0)
     needs = void.copy()
     needs[parent[same & edge]] = True
     pixels = np.flatnonzero(needs)

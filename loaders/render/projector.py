@@ -2,8 +2,8 @@
 
 Light is a fraction of the brightest pixel's. A pattern varies along one coordinate, so blur acts along it alone. Its
 variances add: of the transfer function in focus, of the camera pixel's footprint, and of the defocus, whose sigma grows
-with \\|1/z - 1/focus\\| as the blur circle of a thin lens does. A Gaussian of variance q px^2 takes exp(-2 pi^2 q / P^2)
-of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
+with the distance from the focus in dioptres, as a thin lens's blur circle does. A Gaussian of variance q px^2 takes
+exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class PatternLight:
 
     @classmethod
     def of(cls, rig: Rig, light: ProjectorLight, pixel_area: bool = True) -> "PatternLight":
-        """The light of a rig's patterns; with ``pixel_area`` a camera pixel averages over what it sees at the standoff."""
+        """The light of a rig's patterns; with ``pixel_area`` as a camera pixel averages it at the standoff."""
         still = light.pixel_blur_px**2
         levels, per_px = np.array([0.0]), 1
         if light.defocus_px > 0:
@@ -71,7 +71,6 @@ class PatternLight:
             rows.append([blurred(whole, (level + still + area) * per_px**2) for level in levels])
         table = np.pad(np.array(rows, dtype=np.float32), ((0, 0), (0, 0), (0, 1)), mode="edge")
         return cls(table, vertical, levels, per_px)
-
 
     def place(
         self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,

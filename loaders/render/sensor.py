@@ -90,7 +90,6 @@ def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDA
     return table[h & mask] + table[(h >> np.uint32(TABLE_BITS)) & mask]
 
 
-
 @dataclass(frozen=True)
 class Sensor:
     """What turns the light of a pixel into a byte: black level in grey levels, noise, and the 8-bit grey level of each

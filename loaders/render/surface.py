@@ -35,4 +35,3 @@ def _unhidden(cosine: Values, squared: float) -> Values:
     """Smith's share of facets that are seen from an angle."""
     tangent = (1.0 - cosine * cosine) / (cosine * cosine)
     return 2.0 / (1.0 + np.sqrt(1.0 + squared * tangent))
-

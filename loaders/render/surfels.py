@@ -108,9 +108,7 @@ class Surfels:
         row = runs // RAYS
         inside = seen >= 0
         starts = np.concatenate([[0], np.cumsum(np.bincount(row[inside], minlength=count))])
-        return cls(
-            points, grid, starts, seen[inside], lengths[inside] / RAYS, open_starts, direction[left.ravel()]
-        )
+        return cls(points, grid, starts, seen[inside], lengths[inside] / RAYS, open_starts, direction[left.ravel()])
 
 
 def _sides(mesh: SolidMesh) -> NDArray[np.float64]:

@@ -53,8 +53,9 @@ class Studio:
         self.lighting = Lighting(rig, self.light, self.exposure.pattern)
         camera = rig.camera
         self._pixels = np.arange(camera.width * camera.height, dtype=np.uint32)
-        self._vignetting = vignetting(camera, self.light.camera.falloff) if self.light.camera.falloff else None
-        self._lens = gaussian_weights(self.light.camera.blur_px**2, 3.0).astype("f4") if self.light.camera.blur_px else None
+        falloff, blur_px = self.light.camera.falloff, self.light.camera.blur_px
+        self._vignetting = vignetting(camera, falloff) if falloff else None
+        self._lens = gaussian_weights(blur_px**2, 3.0).astype(np.float32) if blur_px else None
         self.stored = stored_frames(rig.sequence, settings.stored)
         # Frames that the ground truth is decoded from and that are not stored: all others but black and white.
         unneeded = {*self.stored, rig.sequence.black, rig.sequence.white}
@@ -113,7 +114,8 @@ class Studio:
             return self.expose(scene, frames)
         height, turn = 2 * uniform(*scene.stream, "height") - 1, uniform(*scene.stream, "turn")
         level = np.sqrt(1 - height * height)
-        step_m = np.array([level * cosine_of_turns(turn), height, level * sine_of_turns(turn)]) * self.light.motion_mm / MM_PER_M
+        direction = np.array([level * cosine_of_turns(turn), height, level * sine_of_turns(turn)])
+        step_m = direction * (self.light.motion_mm / MM_PER_M)
         return sum(self.expose(self.trace(mesh, view, step_m * frame), (frame,)) for frame in frames)
 
     def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
