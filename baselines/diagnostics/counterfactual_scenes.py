@@ -100,7 +100,7 @@ def counterfactuals(
     sample_scene = original(dataset, renderer, sample)
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
     moves, changes = _moves(sample_scene, renderer, direction), outline_changes(sample_scene, renderer, outlines)
-    reprojected = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
+    reprojected: dict[str, Scene] = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
     layer = CalibrationLayer.of(renderer.rig, direction)
     return Counterfactuals(sample_scene, direction, layer, tuple(moves), tuple(changes), reprojected)
 

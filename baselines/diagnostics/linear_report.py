@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench.baselines.diagnostics.fits import INPUT
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Sheet, Table, with_interval
+from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Sheet, Table, with_interval
 from fpp_ml_bench.evaluation.score import object_interval
 
 PAPER_RATIO = 2.82
@@ -98,7 +98,9 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     rows = {layer: {layer: targets} for layer, targets in trained.items()}
     rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
     keys = ("edges", "depth")
-    errors = [(name, *(mean_over(row, key) for key in keys), mean_ratio(row)) for name, row in rows.items()]
+    errors: list[tuple[Cell, ...]] = [
+        (name, *(mean_over(row, key) for key in keys), mean_ratio(row)) for name, row in rows.items()
+    ]
     errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw)))
 
     def r2(one: Score) -> str:

@@ -21,6 +21,8 @@ class Levels(FringeNetwork):
     pooled = True
     encoder: nn.ModuleList
     decoder: nn.ModuleList
+    bottleneck: nn.Module
+    head: nn.Module
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:

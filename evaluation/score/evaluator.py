@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
 from threading import Lock
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def evaluate(
     outcomes: Iterable[Outcome] = ()
     if units in get_args(Units):
         reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
-        outcomes = _scored(reader, listing.present, dataset, target, units, mode, edge_band_px)
+        outcomes = _scored(reader, listing.present, dataset, target, units, cast(Mode, mode), edge_band_px)
     description = None
     if content is not None:
         try:
