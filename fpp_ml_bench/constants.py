@@ -5,7 +5,7 @@ list of its objects. The paper does not list the split; it is defined here, with
 figures in test.
 """
 
-SCHEMA_VERSION = "1.0.0"
+SCHEMA_VERSION = "2.0.0"
 
 MM_PER_M = 1000.0
 GREY_LEVELS = 255

@@ -129,7 +129,11 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
         samples = dataset.manifest.samples[split]
         objects = dict.fromkeys(sample["object"] for sample in samples)
         splits.append(f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |")
-    exact = "\n| `depth_exact` | the same, exact, from the ray cast that made the frames |" if dataset.has_exact else ""
+    exact = ""
+    if dataset.has_exact:
+        exact = "\n| `depth_exact` | the same, exact, from the ray cast that made the frames |"
+        exact += "\n| `flags` | uint8 (H, W), bits: 1 unlit, 2 mixed surfaces, 4 saturated, 8 strong interreflection |"
+        exact += "\n| `cover` | uint8 (H, W): share of the pixel, in 255ths, that the central ray's surface covers |"
     body = _BODY.format(
         rows=sum(len(samples) for samples in dataset.splits.values()), height=dataset.size[0], width=dataset.size[1],
         origin=dataset.manifest.origin, repo=repo, splits="\n".join(splits), config=dataset.configs[-1],

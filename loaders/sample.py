@@ -4,7 +4,8 @@ There is one row per object and view, and one column PER FRAME, so that reading 
 column would decode all 52). Columns are stored in *groups* of separate files, so that no pixel is stored twice and a
 configuration opens only the files it needs:
 
-    data        sample, object, view, split, frame_00, depth, depth_exact, depth_min, depth_max   <split>/data-*.arrow
+    data        sample, object, view, split, frame_00, depth, depth_exact, flags, cover, depth_min, depth_max
+                                                                                                  <split>/data-*.arrow
     horizontal  the other horizontal sinusoids                                     frames/<split>/horizontal-*.arrow
     vertical    the vertical sinusoids                                             frames/<split>/vertical-*.arrow
     codes       Gray code, black, white                                            frames/<split>/codes-*.arrow
@@ -24,6 +25,7 @@ from fpp_ml_bench.optics import CONFIGS, Sequence
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")
 DEPTH, DEPTH_EXACT, FLAGS, COVER = "depth", "depth_exact", "flags", "cover"
+DEPTHS, PIXEL_MAPS = (DEPTH, DEPTH_EXACT), (FLAGS, COVER)
 RANGE = ("depth_min", "depth_max")
 SINGLE_SHOT_FRAME = 0
 
@@ -47,7 +49,9 @@ VOID = Flag.UNLIT | Flag.MIXED
 
 @dataclass
 class Row:
-    """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest.
+    """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest,
+    and for generated data the `Flag`s of each pixel and the share of it, in 255ths, that the surface of its central ray
+    covers, uint8 (H, W).
     The images' memory may be reused as soon as the writer takes the next row."""
 
     sample: str
@@ -87,7 +91,7 @@ def available_configs(sequence: Sequence, stored: str) -> tuple[str, ...]:
 def row_columns(sequence: Sequence, frames: tuple[int, ...], exact: bool) -> list[str]:
     """Columns of a table with ``frames``, in order: labels, frames, depths, range."""
     names = [sequence.frames[i].column for i in frames]
-    return [*LABELS, *names, DEPTH, *([DEPTH_EXACT] if exact else []), *RANGE]
+    return [*LABELS, *names, DEPTH, *([DEPTH_EXACT, *PIXEL_MAPS] if exact else []), *RANGE]
 
 
 def config_columns(sequence: Sequence, config: str, exact: bool) -> list[str]:
@@ -109,6 +113,6 @@ def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, A
         if name in LABELS or name in RANGE:
             described[name] = {"dtype": "string" if name in LABELS else "float32", "_type": "Value"}
         else:
-            kind = "uint8" if name.startswith("frame_") else "float32"
+            kind = "float32" if name in DEPTHS else "uint8"
             described[name] = {"shape": list(size), "dtype": kind, "_type": "Array2D"}
     return described

@@ -18,6 +18,7 @@ EXAMPLES = (
     "fpp-bench build data/full --preset full                      the whole set: 50 objects, 960 px, 15,600 images",
     "fpp-bench build data/train --preset full --frames single_shot    frame 0 and depth only",
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
+    "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
     "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
@@ -35,9 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
     parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
-    parser.add_argument("--noise-sigma", type=float, default=1.0, metavar="GREY",
-                        help="sensor noise at mid-grey, grey levels of 255 (default: 1)")  # fmt: skip
-    parser.add_argument("--shadows", action="store_true", help="let objects cast shadows from the projector")
+    parser.add_argument("--light", default="paper", metavar="NAME|FILE",
+                        help="paper, workshop, hard, or a YAML file with other numbers (default: paper)")  # fmt: skip
+    parser.add_argument("--noise-sigma", type=float, metavar="GREY",
+                        help="sensor noise at mid-grey, grey levels of 255, half of its variance shot noise "
+                             "(default: the light's)")  # fmt: skip
+    parser.add_argument("--shadows", action="store_true", help="let objects cast shadows, whatever the light says")
     parser.add_argument("--mesh", type=Path, action="append", default=[], metavar="FILE",
                         help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable")  # fmt: skip
     parser.add_argument("--meshes", type=Path, metavar="LIST.yaml",
@@ -67,7 +71,14 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     elif own:
         objects = ()
     names = (*objects, *(mesh.name for mesh in own))
-    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, args.noise_sigma, args.shadows, own)
+    light = render.load_light(args.light)
+    if args.noise_sigma is not None:
+        if not 0 <= args.noise_sigma <= 50:
+            raise BuildError(f"--noise-sigma {args.noise_sigma:g}: expected 0 to 50 grey levels")
+        light = light.changed("camera", **render.camera_noise(args.noise_sigma))
+    if args.shadows:
+        light = light.changed("bounces", shadows=True)
+    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -51,6 +51,8 @@ def run(args: argparse.Namespace) -> int:
     near, far = rig.working_range_mm
     periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in optics.DIRECTIONS)
     settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
+    if isinstance(settings.get("light"), dict):
+        settings["light"] = settings["light"].get("name")
     generator = manifest.generator
     height, width = opened.size
     print(f"dataset         {opened.path}")

@@ -26,4 +26,6 @@ from .scene import place as place
 from .scene import preset_settings as preset_settings
 from .scene import turned as turned
 from .sensor import Exposure as Exposure
+from .sensor import Sensor as Sensor
+from .sensor import camera_noise as camera_noise
 from .view import Studio as Studio

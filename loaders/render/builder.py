@@ -72,15 +72,16 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     if manifest.origin != storage.GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
-    if any("shadow_rays" not in row for row in rows):
+    if any("mixed_rays" not in row for row in rows):
         raise BuildError(
             f"--explain: expected a dataset of version {__version__}, this one was built by version "
-            f"{manifest.generator.get('version')} and did not count shadow rays; delete it and build it again"
+            f"{manifest.generator.get('version')} and counted something else; delete it and build it again"
         )
     row = sorted(rows, key=lambda row: row["exact_px"])[len(rows) // 2]
     studio, camera = Studio(settings), settings.rig.camera
+    made = studio.stored + studio.unstored
     scene = studio.trace(solid_mesh(row["object"], settings.user_meshes), row["view"])
-    studio.expose(scene, studio.light(scene))
+    studio.expose(scene, made)
     seen = np.zeros((camera.height, camera.width), dtype=bool)
     seen.ravel()[scene.hits.pixels] = True
     rule = (
@@ -89,7 +90,7 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     )
 
     def empty_scene() -> None:
-        studio.backdrop.behind(scene.traced, scene.hits.pixels)
+        studio.lighting.behind(scene.traced, scene.hits.pixels)
 
     def account(what: str, unit: str, done: int, whole: int, work: Callable[[], object], here: int) -> LeftOut:
         """A line for ``whole`` units of which ``done`` were done; ``work`` leaves out ``here`` of the view's."""
@@ -98,8 +99,10 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     views, view_px = len(rows), camera.width * camera.height
     all_px, object_px, view_object_px = views * view_px, sum(row["exact_px"] for row in rows), row["exact_px"]
     frames, stored, unstored = len(settings.rig.sequence), len(studio.stored), len(studio.unstored)
-    decoded = frames - 2
-    if settings.shadows:  # a ray for every pixel of the image would be all of them
+    decoded, mixed_rays = frames - 2, sum(row["mixed_rays"] for row in rows)
+    stages = settings.light.stages()
+    off = [name for name, on in stages.items() if not on]
+    if settings.light.bounces.shadows:  # a ray for every pixel of the image would be all of them
         rays = sum(row["shadow_rays"] for row in rows)
         past = view_px - row["shadow_rays"]
         background = account("shadow rays past the object's box", "rays", rays, all_px, empty_scene, past)
@@ -110,12 +113,20 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
         background,
         account(
             f"exposures ({unstored} unstored frames off the object, {frames - stored - unstored} everywhere)", "pixels",
-            object_px * unstored + all_px * stored, all_px * frames, lambda: studio.expose(scene, studio.light(scene)),
+            object_px * unstored + all_px * stored, all_px * frames, lambda: studio.expose(scene, made),
             view_px * (frames - stored) - view_object_px * unstored,
         ),
         account(
             "ground truth off the object", "grey levels", object_px * decoded, all_px * decoded,
             lambda: studio.ground_truth_mm(seen), (view_px - view_object_px) * decoded,
+        ),
+        LeftOut(
+            "rays across pixels that see one surface", "rays", mixed_rays, all_px * settings.light.camera.rays_across**2
+            - mixed_rays, None, None, "not lit and not exposed; seconds not measured",
+        ),
+        LeftOut(
+            "stages that are off", "stages", len(stages) - len(off), len(off), None, None,
+            f"none of their code runs: {', '.join(off) or 'none is off'}",
         ),
         LeftOut(
             "frames not asked for", "frames", stored * views, (frames - stored) * views,

@@ -15,7 +15,7 @@ from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pi
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
 from fpp_ml_bench.loaders.render.sensor import Exposure
-from fpp_ml_bench.loaders.sample import Flag, Row, stored_frames
+from fpp_ml_bench.loaders.sample import VOID, Flag, Row, stored_frames
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
@@ -76,6 +76,7 @@ class Studio:
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
         flags, cover = self.flags(scene)
         measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": shadow_rays}
+        measured["mixed_rays"] = 0 if scene.mixed is None else len(scene.mixed.points_m)
         measured |= ground_truth_error(depth_mm, exact_mm, flags)
         frames = {index: self._frames[index] for index in self.stored}
         return Row(sample_name(mesh.name, view), mesh.name, view, frames, depth_mm, exact_mm, measured, flags, cover)
@@ -197,17 +198,20 @@ def ground_truth_error(
 ) -> dict[str, Any]:
     """How far the decoded ground truth is from the exact one, per sample; mm and pixel counts, sums in float64.
 
-    Over pixels that both have: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and the first two again
-    for pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object pixels without a
-    decoded depth: they are background in ``depth``.
+    Over pixels that both have and that are not void: ``gt_mae_mm``, ``gt_rmse_mm``, ``gt_bias_mm``, ``gt_max_mm``, and
+    the first two again for pixels at least 3 px from a depth edge (``gt_interior_*``). ``undecoded_px`` counts object
+    pixels without a decoded depth, which are background in ``depth``; the others pixels by their `Flag`.
     """
     seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
-    both = seen & decoded
+    void = (flags & VOID) > 0
+    both = seen & decoded & ~void
     error = depth_mm[both].astype(np.float64) - exact_mm[both]
     inside = error[~object_near_edge(exact_mm, INTERIOR_PX)[both]]
     return {
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),
+        "void_px": int((seen & void).sum()),
+        **{f"{flag.name.lower()}_px": int(((flags & flag) > 0).sum()) for flag in Flag},
         "gt_mae_mm": _mean(np.abs(error)),
         "gt_rmse_mm": _root_mean_square(error),
         "gt_bias_mm": _mean(error),

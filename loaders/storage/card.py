@@ -121,6 +121,7 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[s
         "depth_range_median_mm": float(np.median(ranges)), "depth_range_max_mm": float(ranges.max()),
         **{name: average(name) for name in means}, "gt_max_mm": max(largest) if largest else None,
         "undecoded_share": sum(row["undecoded_px"] for row in rows) / exact_px if exact_px else None,
+        "void_share": sum(row["void_px"] for row in rows) / exact_px if exact_px else None,
     }  # fmt: skip
 
 
@@ -129,7 +130,7 @@ def ground_truth_summary(manifest: Manifest) -> list[str]:
     return [
         f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm RMSE of the exact "
         f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); {100 * s['undecoded_share']:.2f}% of "
-        "object pixels not decodable"
+        f"object pixels not decodable, {100 * s['void_share']:.2f}% void (unlit, or surfaces mixed in a pixel)"
         for s in split_statistics(manifest)
         if None not in (s["gt_mae_mm"], s["gt_interior_mae_mm"], s["undecoded_share"])
     ]

@@ -80,8 +80,8 @@ class Manifest:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row's images: one a pixel and stored frame, four a depth map."""
-        depths = 8 if self.exact else 4
+        """Bytes of a row's images: one a pixel and stored frame, four a depth map, one each of the other maps."""
+        depths = 10 if self.exact else 4
         return self.size[0] * self.size[1] * (len(self.stored_frames) + depths)
 
     @property

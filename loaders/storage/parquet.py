@@ -26,7 +26,7 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, config_columns
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, RANGE, config_columns
 from fpp_ml_bench.loaders.storage.card import CARD_HEAD, data_version
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
@@ -109,7 +109,7 @@ def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_don
     schema = arrow_schema(names, dataset.size)
     stored = _stored_columns(dataset, _parts(dataset, shard))
     table = pa.Table.from_arrays([stored[name] for name in names], schema=schema)
-    depths = [name for name in names if name in (DEPTH, DEPTH_EXACT)]
+    depths = [name for name in names if name in DEPTHS]
     settings = {
         "compression": "zstd",
         "compression_level": _LEVEL,
@@ -131,8 +131,8 @@ def write_shard(dataset: DatasetFolder, shard: ShardFile, out: Path, threads: in
             raise DatasetError(f"{dataset.path / part.path}: damaged, its checksum does not match; it isn't published")
     names = columns(dataset)
     pictures = [name for name in names if name == PREVIEW or name.startswith("frame_")]
-    depths = [name + _LEAF for name in names if name in (DEPTH, DEPTH_EXACT)]
-    plain = [*LABELS, *RANGE]
+    depths = [name + _LEAF for name in names if name in DEPTHS]
+    plain = [*LABELS, *RANGE, *(name + _LEAF for name in names if name in PIXEL_MAPS)]
     settings = {
         # A PNG is compressed already.
         "compression": {

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import sample as layout
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, Row
+from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.optics import Sequence
 
@@ -252,7 +252,7 @@ class ShardWriter:
                         batch = [self._checked(image, column)[None] for column, image in images.items()]
                         writers[group].write_batch(_record_batch(batch, self._schemas[group]))
                         continue
-                    images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
+                    images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm, FLAGS: row.flags, COVER: row.cover}
                     for column in self._images:
                         image = self._checked(images[column], column)
                         self._buffer(column, len(plan.samples))[number] = image
@@ -278,7 +278,7 @@ class ShardWriter:
 
 
 def _dtype(column: str) -> np.dtype:
-    return np.dtype(np.float32 if column in (DEPTH, DEPTH_EXACT) else np.uint8)
+    return np.dtype(np.float32 if column in DEPTHS else np.uint8)
 
 
 def _in_order(plan: ShardPlan, rows: Iterable[Row]) -> Iterator[Row]:

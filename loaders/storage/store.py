@@ -19,7 +19,7 @@ from fpp_ml_bench.constants import SPLITS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import sample as layout
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, config_columns, stored_groups
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, config_columns, stored_groups
 from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
 from fpp_ml_bench.optics import CONFIGS, Rig, Sequence, rig_from_dict
 
@@ -125,7 +125,7 @@ class DatasetFolder:
 
     def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
         """Depth map of a sample, float32 (H, W) in mm, 0 = background: ``depth``, or ``depth_exact`` if stored."""
-        if column not in (DEPTH, DEPTH_EXACT):
+        if column not in DEPTHS:
             raise DatasetError(f"unknown depth column {column!r}; there are {DEPTH} and {DEPTH_EXACT}")
         if column == DEPTH_EXACT and not self.has_exact:
             raise DatasetError(f"{self.path}: has no {DEPTH_EXACT} ({self.manifest.origin} data); use {DEPTH}")
@@ -139,6 +139,12 @@ class DatasetFolder:
         if column == DEPTH:
             return depth_mm
         return np.where(object_mask(depth_mm), self.depth_mm(sample, column), np.float32(0))
+
+    def flags(self, sample: str) -> NDArray[np.uint8]:
+        """What is special about each pixel: bits of `loaders.sample.Flag`, uint8 (H, W); of generated data."""
+        if not self.has_exact:
+            raise DatasetError(f"{self.path}: has no {FLAGS} ({self.manifest.origin} data)")
+        return self._image(sample, DATA_GROUP, FLAGS)
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
         """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""

@@ -13,7 +13,18 @@ from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, LABELS, RANGE, group_columns, stored_groups
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTHS,
+    FLAGS,
+    LABELS,
+    PIXEL_MAPS,
+    RANGE,
+    Flag,
+    group_columns,
+    stored_groups,
+)  # fmt: skip
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -86,13 +97,16 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
         return [f"{path}: its rows or columns are not those the manifest says"]
     findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
     for column in expected:
-        if not (column.startswith("frame_") or column in (DEPTH, DEPTH_EXACT)):
+        if column in (*LABELS, *RANGE):
             continue
         images = (image for batch in opened.column_images(shard, column) for image in batch)
         for row, image in zip(rows, images, strict=True):
-            if column in (DEPTH, DEPTH_EXACT):
+            if column in DEPTHS:
                 findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
-            if image.min() != image.max():  # a uniform image (black without noise) says nothing about what it shows
+            if column == FLAGS and image.max() > sum(Flag):
+                findings.append(f"{path}: sample {row['sample']!r}, column {column}: unknown flags")
+            # A uniform image (black without noise) says nothing about what it shows.
+            if column not in PIXEL_MAPS and image.min() != image.max():
                 digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image).data)
                 places.setdefault(digest, []).append((shard.split, row["sample"], column))
     opened.forget(shard)
