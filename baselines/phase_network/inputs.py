@@ -121,7 +121,10 @@ class Scene:
     def of(cls, observation: Observation, order: NDArray[np.int32]) -> "Scene":
         """From an observation of the measured route, with that route's ``order`` (h, w) as the base order."""
         background, fit = observation.background, observation.fit
-        unit = np.float32(observation.rig.standoff_m**2 / (background.strength / 2))
+        standoff_m2, on_fringe = observation.rig.standoff_m**2, observation.inside & (fit.brightness > 0)
+        # Without a calibration the object itself is taken for a white plane at the standoff; orders are ambiguous then.
+        typical = float(np.median(fit.brightness[on_fringe])) if on_fringe.any() else 1.0
+        unit = np.float32(standoff_m2 / (background.strength / 2) if background.calibrated else 1.0 / typical)
         light = (observation.greys[0] - np.float32(background.ambient_grey)) * unit
         residual = observation.layer.residual_phase(observation.phase_rad, order)
         on_object = observation.inside & np.isfinite(residual)

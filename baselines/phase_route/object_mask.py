@@ -20,11 +20,13 @@ Crop = tuple[slice, slice]
 
 TILE_PX_PER_PERIOD = 1.1
 """Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
-TILE_NOISE_GREY = 3.0  # largest misfit of a tile that may be background: three times the benchmark's noise
+TILE_NOISE_SIGMAS = 3.0  # largest misfit of a tile that may be background, in standard deviations of the image's noise
 LEAST_SHARE = 0.02  # of the image's tiles that must show background for the image to calibrate itself
 STRENGTH_TOLERANCE = 0.4
-"""Relative deviation of the lamp's strength in an image from the calibrated strength. A surface in the working range
-whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+"""Relative deviation of the lamp's strength in an image from a strength that the user gives. A surface in the working
+range whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
+DARK_PERCENTILE = 1.0  # of the grey levels of an image without background that is taken for its ambient light
 SAMPLE_STEP_PX = 5
 FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
 DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
@@ -42,8 +44,8 @@ LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in
 @dataclass(frozen=True)
 class Background:
     """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
-    irradiance; ``residual`` float32 (H, W): image minus prediction; ``share``: of the tiles that show the plane, 0
-    where the calibrated constants were used; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
+    irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W): image minus prediction; ``share``:
+    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
 
     ambient_grey: float
     strength: float
@@ -53,6 +55,11 @@ class Background:
     weights: tuple[float, ...]
 
     @property
+    def calibrated(self) -> bool:
+        """Whether brightness can tell distances: the lamp's strength is known."""
+        return bool(np.isfinite(self.strength))
+
+    @property
     def different(self) -> Mask:
         """Pixels (H, W) whose own grey level the empty scene does not explain."""
         return np.abs(self.residual) > DIFFERENT_SIGMAS * self.noise_grey
@@ -60,14 +67,18 @@ class Background:
 
 class EmptyScene:
     """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase is
-    calibrated, and so is its brightness except for ambient light, the lamp's strength and a slow change of its sheen
-    across the image, which are fitted. ``white_grey`` and ``ambient_grey`` are the photometric calibration used where
-    an image shows no background: the grey level of a white pattern on a surface that faces the projector at the near
-    end of the working range, and of a surface in ambient light alone."""
+    calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
+    pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
+    calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
+    range, and of a surface in ambient light alone. Without them an image that does not show the plane is not
+    calibrated: everything brighter than its darkest pixels is object there, and brightness tells no distance."""
 
-    def __init__(self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float, ambient_grey: float):
+    def __init__(
+        self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float | None,
+        ambient_grey: float | None,
+    ) -> None:  # fmt: skip
         self.ambient_grey = ambient_grey
-        self.strength = white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
         self._rays = rig.camera.rays()
         self._phase = layer.absolute_phase(rig.background_m * MM_PER_M)
         self._fall_off = plane_irradiance(rig, rig.background_m)
@@ -82,8 +93,11 @@ class EmptyScene:
         plane_tiles = self._background_tiles(grey)
         share = float(plane_tiles.mean())
         if share < LEAST_SHARE:
-            residual = grey - self.ambient_grey - self.strength * self._terms[0]
-            return Background(self.ambient_grey, self.strength, DEFAULT_NOISE_GREY, residual, 0.0, (self.strength,))
+            dark = float(np.percentile(image, DARK_PERCENTILE)) if self.ambient_grey is None else self.ambient_grey
+            strength = float(np.nan_to_num(self.strength))
+            residual = grey - np.float32(dark) - np.float32(strength) * self._terms[0]
+            noise = max(image_noise_grey(image), DEFAULT_NOISE_GREY)
+            return Background(dark, float(self.strength), noise, residual, 0.0, (strength,))
         plane_pixels = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
         places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
         row, column = (SAMPLE_STEP_PX * place for place in places)
@@ -122,12 +136,27 @@ class EmptyScene:
             covariance = self._tiles(grey * self._light) - mean * self._mean
             slope = covariance / spread
             misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
-            plane_tiles = (misfit < TILE_NOISE_GREY) & (spread > 1e-2 * spread.max())
-            plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
+            largest = TILE_NOISE_SIGMAS * max(image_noise_grey(grey), 1.0)
+            plane_tiles = (misfit < largest) & (spread > 1e-2 * spread.max()) & (slope * np.sqrt(spread) > largest / 3)
+            if np.isfinite(self.strength):
+                plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
         if not plane_tiles.any():
             return plane_tiles
-        typical = float(np.median(slope[plane_tiles]))
+        # The plane is the surface with the most tiles of one strength.
+        ascending = np.sort(slope[plane_tiles])
+        count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(ascending.size)
+        first = int(count.argmax())
+        typical = float(np.median(ascending[first : first + count[first]]))
         return plane_tiles & (np.abs(slope / typical - 1) < 0.15)
+
+
+def image_noise_grey(image: NDArray) -> float:
+    """Standard deviation of an image's noise in grey levels, by the median over pixels of a mask that removes planes
+    and slow fringes (Immerkaer 1996, Fast Noise Variance Estimation)."""
+    grey = image.astype(np.float32)
+    across = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
+    mask = across[:-2] - 2 * across[1:-1] + across[2:]
+    return 1.4826 * float(np.median(np.abs(mask))) / 6.0
 
 
 def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:

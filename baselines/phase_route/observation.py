@@ -12,12 +12,11 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLaye
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.render import Lighting
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 Prior = Literal["none", "standoff"]
 PIXELWISE = 3  # frames from which on every pixel has a phase of its own
-_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread", "white_grey"
+_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread"
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,9 @@ class Settings:
     Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
     (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
     ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
-    more. ``slack_mm`` widens the working range for noise at its ends. ``white_grey`` and ``ambient_grey`` calibrate
-    images that show no background (see `EmptyScene`).
+    more. ``slack_mm`` widens the working range for noise at its ends. ``white_grey`` and ``ambient_grey``, if given,
+    calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
+    shows none, every pixel with several possible orders is ambiguous.
     """
 
     direction: Direction = "horizontal"
@@ -49,8 +49,8 @@ class Settings:
     prior_cost: float = 0.002
     jump_rad: float = 2.5
     slack_mm: float = 15.0
-    white_grey: float = Lighting.white_grey
-    ambient_grey: float = Lighting.ambient_grey
+    white_grey: float | None = None
+    ambient_grey: float | None = None
 
     def __post_init__(self) -> None:
         if self.direction not in DIRECTIONS:
@@ -59,7 +59,8 @@ class Settings:
             raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
         if not 0 <= self.min_confidence < 1:
             raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
-        for name in _POSITIVE:
+        given = [name for name in ("white_grey", "ambient_grey") if getattr(self, name) is not None]
+        for name in (*_POSITIVE, *given):
             if not getattr(self, name) > 0:
                 raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
 

@@ -24,6 +24,7 @@ NODES_PER_PERIOD = 7.5  # grid points along a period: every third pixel at 960 p
 EVIDENCE_PERIODS = 2.0
 """Side of the square over which evidence for an order is averaged: a single pixel's brightness is too uncertain."""
 LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a surface turned away
+LEAST_GREY = 0.1  # least brightness, in grey levels, whose logarithm is taken
 JUMP_RAD_PER_PX, JUMP_LOG_PER_PX = 0.1, 0.06
 """Change of residual phase, and of log brightness, from which on two neighbours with a phase of their own lie on two
 surfaces."""
@@ -89,11 +90,13 @@ def question_of(seen: Observation) -> Question:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         light = np.stack([irradiance(layer, candidate, grid_slopes, rig, where) for candidate in residual])
         depth = np.stack([layer.depth_of_residual_mm(candidate) for candidate in residual]).astype(np.float32)
+    # NaN where the lamp's strength is unknown: then brightness tells nothing, and no evidence separates orders.
     brightness = fit.brightness[grid] / np.float32(seen.background.strength / 2)
-    trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * np.clip(brightness * rig.standoff_m**2, 0.02, 1) ** 2
+    lit = np.nan_to_num(np.clip(brightness * rig.standoff_m**2, 0.02, 1), nan=1.0)
+    trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * lit**2
     exists = np.stack([k < count for k in steps])
     # Jumps between neighbours show where every pixel has a phase of its own.
-    smooth = _smooth_links(residual[0], brightness, stride) if seen.pixelwise else (1.0, 1.0)
+    smooth = _smooth_links(residual[0], fit.brightness[grid], stride) if seen.pixelwise else (1.0, 1.0)
     trust, inside = trust.astype(np.float32), seen.inside[grid]
     return Question(residual, depth, exists, light, brightness, trust, inside, stride, seen.period_px, *smooth)
 
@@ -137,7 +140,7 @@ def _drift(layer: CalibrationLayer, residual_rad: NDArray, z: Image, axis: int, 
 
 def _smooth_links(residual_rad: Image, brightness: Image, stride: int) -> tuple[Image, Image]:
     """Weights of the links along x (h, w - 1) and y (h - 1, w): less where the surface visibly jumps."""
-    log_brightness = np.log(np.maximum(brightness, LEAST_BRIGHTNESS))
+    log_brightness = np.log(np.maximum(brightness, LEAST_GREY))
     links = []
     for axis in (1, 0):
         jump = np.abs(wrapped(np.diff(residual_rad, axis=axis))) > JUMP_RAD_PER_PX * stride

@@ -102,6 +102,8 @@ class PhaseRoute:
                 f"expected an order and a margin for each of the {inside.shape} pixels (h, w) around the object, got "
                 f"{np.shape(order)} and {np.shape(margin)}"
             )
+        if not observation.background.calibrated:  # no evidence about the order, whatever the chooser preferred
+            margin = np.where(observation.candidates.count > 1, 0.0, margin).astype(np.float32)
         watch.done("order")
         depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
         depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
