@@ -7,7 +7,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.render import BuildSettings, Exposure, Lighting, Noise, Studio, light_surface, solid_mesh
+from fpp_ml_bench.loaders.render import (
+    BuildSettings,
+    Exposure,
+    Studio,
+    camera_noise,
+    light_surface,
+    named_light,
+    solid_mesh,
+)  # fmt: skip
 from fpp_ml_bench.optics import Rig, paper_rig
 
 RIG = paper_rig(480)
@@ -41,7 +49,8 @@ def plane_fringe(
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None]
     normal = np.array([tilt[0], tilt[1], -1.0])
     normals = np.broadcast_to(normal / np.linalg.norm(normal), points.shape)
-    lit = light_surface(points.reshape(-1, 3), normals.reshape(-1, 3), rig, Lighting())
+    light = named_light("paper").changed("camera", **camera_noise(noise))
+    exposure = Exposure.of(rig, light)
+    lit = light_surface(points.reshape(-1, 3), normals.reshape(-1, 3), rig, light, exposure.pattern)
     pixels = np.arange(x.size, dtype=np.uint32)
-    exposure = Exposure.of(rig, Noise.of_sigma(noise))
     return exposure.expose([frame], lit, pixels, (7, "plane", frame))[0].reshape(x.shape)

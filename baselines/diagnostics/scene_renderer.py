@@ -165,41 +165,47 @@ class Scene:
 class SceneRenderer:
     """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
 
-    def __init__(self, rig: Rig, noise_sigma_grey: float = render.BuildSettings.noise_sigma_grey) -> None:
-        self.rig, self.lighting = rig, render.Lighting()
+    def __init__(self, rig: Rig, light: render.Light | None = None) -> None:
+        self.rig, self.lamp = rig, light or render.named_light("paper")
         self.shape = (rig.camera.height, rig.camera.width)
-        self.noise = render.Noise.of_sigma(noise_sigma_grey)
         self._background_stream: tuple[object, ...] = ()
         self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
-        """The renderer for ``dataset``; with the benchmark's noise where an imported dataset does not state its own."""
-        settings = dataset.manifest.settings
-        return cls(dataset.rig, settings.get("noise_sigma_grey", render.BuildSettings.noise_sigma_grey))
+        """The renderer for ``dataset``: the paper's light, with the noise of the dataset's camera where it says so."""
+        camera = dataset.manifest.settings.get("light", {}).get("camera", {})
+        noise = {key: camera[key] for key in ("full_well_e", "read_noise_e") if key in camera}
+        return cls(dataset.rig, render.named_light("paper").changed("camera", **noise))
 
     @cached_property
     def exposure(self) -> render.Exposure:
-        return render.Exposure.of(self.rig, self.noise)
+        return render.Exposure.of(self.rig, self.lamp)
 
     @cached_property
     def _uniform(self) -> render.Exposure:
-        light = np.broadcast_to(self.exposure.light.mean(axis=1, keepdims=True), self.exposure.light.shape)
-        return replace(self.exposure, light=np.ascontiguousarray(light))
+        pattern = self.exposure.pattern
+        table = np.broadcast_to(pattern.table.mean(axis=2, keepdims=True), pattern.table.shape)
+        return replace(self.exposure, pattern=replace(pattern, table=np.ascontiguousarray(table)))
 
     @cached_property
     def _other_pitch(self) -> render.Exposure:
         names = ("pitch_horizontal_px", "pitch_vertical_px")
         wider = replace(self.rig, **{name: PITCH_FACTOR * getattr(self.rig, name) for name in names})
-        return render.Exposure.of(wider, self.noise)
+        return render.Exposure.of(wider, self.lamp)
 
     @cached_property
     def _empty(self) -> render.LitPixels:
-        return render.background_plane(self.rig, self.lighting)
+        x, y = (rays.ravel() for rays in self.rig.camera.rays())
+        points_m = np.column_stack([x, y, np.ones_like(x)]) * self.rig.background_m
+        return self._lit(points_m, np.broadcast_to([0.0, 0.0, -1.0], points_m.shape))
 
     def light(self, surface: Surface) -> render.LitPixels:
-        """The light on ``surface``; no cast shadows, as in the paper."""
-        return render.light_surface(surface.points_m(), surface.normals, self.rig, self.lighting)
+        """The direct light on ``surface``; no cast shadows, as in the paper."""
+        return self._lit(surface.points_m(), surface.normals)
+
+    def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> render.LitPixels:
+        return render.light_surface(points_m, normals, self.rig, self.lamp, self.exposure.pattern)
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""

@@ -209,5 +209,7 @@ def light_at_projector() -> Outcome:
     """light on a point in the projector's centre; against finite and not negative; bound: must be finite"""
     centre = render.projector_centre_m(RIG)
     points = np.array([centre, centre + 1e-200 * AHEAD_M, centre + 1e-6 * AHEAD_M, 0.0 * AHEAD_M, AHEAD_M])
-    gain = render.light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, render.Lighting()).gain
+    light = render.named_light("paper")
+    pattern = render.PatternLight.of(RIG, light.projector)
+    gain = render.light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, light, pattern).gain
     return worst(np.where(np.isfinite(gain) & (gain >= 0), 0.0, math.inf))

@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outc
 from fpp_ml_bench.baselines.stability.phase_order import plane_stack
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.loaders.render import Lighting, light_surface
+from fpp_ml_bench.loaders.render import PatternLight, light_surface, named_light
 
 RIG = Group("rig")
 TRIANGULATION = Group("triangulation", "the closed form on the same float64 inputs in 50 digits", "u (8 kappa + 5 "
@@ -219,7 +219,9 @@ def lit_from_behind() -> Outcome:
     turn = optics.rotation_matrix((0.0, math.pi, 0.0))
     shift = -turn @ np.array([-0.125, 0.1, 3.0])
     rig = replace(PAPER, rotation=turn.tolist(), translation_m=tuple(shift.tolist()))
-    lit = light_surface(_RAYS_3D * 1.8, np.tile([0.0, 0.0, -1.0], (40, 1)), rig, Lighting())
+    light = named_light("paper")
+    pattern = PatternLight.of(PAPER, light.projector)
+    lit = light_surface(_RAYS_3D * 1.8, np.tile([0.0, 0.0, -1.0], (40, 1)), rig, light, pattern)
     return worst(lit.gain, 0.0, lit.gain == 0)
 
 

@@ -14,6 +14,7 @@ from .meshes import read_mesh_list as read_mesh_list
 from .meshes import single_mesh as single_mesh
 from .meshes import solid_mesh as solid_mesh
 from .meshes import write_ply as write_ply
+from .projector import PatternLight as PatternLight
 from .raycast import Hits as Hits
 from .raycast import PixelRays as PixelRays
 from .raycast import TracedObject as TracedObject

@@ -12,7 +12,7 @@ from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
-from fpp_ml_bench.loaders.render import BuildSettings, build
+from fpp_ml_bench.loaders.render import BuildSettings, build, camera_noise, named_light
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import paper_rig
 
@@ -23,7 +23,8 @@ STEPS = (3, 4, 6, 9, 18)
 def noisy(tmp_path_factory):
     """A cork at 240 px and noise of 3 grey levels, where sensor noise and not the 8-bit pattern decides."""
     folder = tmp_path_factory.mktemp("noisy") / "set"
-    build(folder, BuildSettings(paper_rig(240), ("bowl", "cork"), noise_sigma_grey=3.0), workers=1)
+    noisy = named_light("paper").changed("camera", **camera_noise(3.0))
+    build(folder, BuildSettings(paper_rig(240), ("bowl", "cork"), light=noisy), workers=1)
     return DatasetFolder(folder)
 
 

@@ -12,7 +12,17 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.decoding import Limits, Reason, decode_stack
-from fpp_ml_bench.loaders.render import Backdrop, Exposure, Lighting, PixelRays, SolidMesh, TracedObject, build, place
+from fpp_ml_bench.loaders.render import (
+    Exposure,
+    Lighting,
+    PatternLight,
+    PixelRays,
+    SolidMesh,
+    TracedObject,
+    build,
+    named_light,
+    place,
+)  # fmt: skip
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import paper_rig
@@ -43,6 +53,10 @@ def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
     assert [name for name in skipped if skipped[name] != whole[name]] == []
 
 
+SHADY = named_light("paper").changed("bounces", shadows=True, interreflection=False, ambient_occlusion=False)
+SHADY = SHADY.changed("camera", rays_across=1)
+
+
 def counting(monkeypatch):
     """What really happens: shadow rays traced, pixels exposed whole or in part."""
     counts = {"rays": 0, "exposed": 0}
@@ -63,27 +77,28 @@ def counting(monkeypatch):
 
 def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeypatch):
     counts = counting(monkeypatch)
-    settings = tiny_settings(objects=("cork",), stored="single_shot", shadows=True)
+    settings = tiny_settings(objects=("cork",), stored="single_shot", light=SHADY)
     manifest = build(tmp_path / "on", settings, workers=1)
     rows = manifest.samples["train"]
     pixels, traced = TINY_SIZE**2, counts["rays"]
     assert traced == sum(row["shadow_rays"] for row in rows) < 0.1 * len(rows) * pixels
-    # Frame 0 whole; 49 that only the ground truth needs at the object alone; black and white nowhere.
-    assert counts["exposed"] == sum(pixels + 49 * row["exact_px"] for row in rows)
+    # Frame 0 whole; it and 49 that only the ground truth needs at the object alone; black and white nowhere.
+    assert counts["exposed"] == sum(pixels + 50 * row["exact_px"] for row in rows)
     counts.update(rays=0, exposed=0)
     with skipping(False):
         build(tmp_path / "off", settings, workers=1)
     assert counts["rays"] > 2 * traced
-    assert counts["exposed"] == len(rows) * 52 * pixels
+    assert counts["exposed"] == sum(52 * (pixels + row["exact_px"]) for row in rows)
 
 
 def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
-    rig, lighting = paper_rig(TINY_SIZE), Lighting(shadows=True)
+    rig = paper_rig(TINY_SIZE)
+    pattern = PatternLight.of(rig, SHADY.projector)
     ball = trimesh.creation.icosphere(3, 0.15)
     mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
     traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
     covered = traced.primary(PixelRays.of(rig.camera)).pixels
-    backdrop, counts = Backdrop(rig, lighting), counting(monkeypatch)
+    backdrop, counts = Lighting(rig, SHADY, pattern), counting(monkeypatch)
     fewer = backdrop.behind(traced, covered)
     traced_rays = counts["rays"]
     with skipping(False):
@@ -92,7 +107,7 @@ def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
     elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
     elsewhere[covered] = False
     np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
-    unshaded = Backdrop(rig, Lighting()).behind(traced, covered).gain
+    unshaded = Lighting(rig, named_light("paper"), pattern).behind(traced, covered).gain
     assert ((fewer.gain == 0) & (unshaded > 0))[elsewhere].sum() > 100
 
 

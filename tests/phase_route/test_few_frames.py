@@ -19,7 +19,7 @@ from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.evaluation.submission import REPORTS_FILE, read_submission
-from fpp_ml_bench.loaders.render import Exposure, Lighting, Noise, light_surface
+from fpp_ml_bench.loaders.render import Exposure, camera_noise, light_surface, named_light
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import paper_rig
 
@@ -39,10 +39,12 @@ def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) 
     """All fringes and Gray frames of one direction on a plane that fills the frame."""
     x, y = RIG.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
-    lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, Lighting())
+    light = named_light("paper").changed("camera", **camera_noise(noise))
+    exposure = Exposure.of(RIG, light)
+    lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern)
     indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
     pixels = np.arange(x.size, dtype=np.uint32)
-    images = Exposure.of(RIG, Noise.of_sigma(noise)).expose(indices, lit, pixels, (7, "plane", 0))
+    images = exposure.expose(indices, lit, pixels, (7, "plane", 0))
     frames: list[np.ndarray | None] = [None] * len(RIG.sequence)
     for index, image in zip(indices, images, strict=True):
         frames[index] = image.reshape(x.shape)

@@ -13,7 +13,7 @@ from fpp_ml_bench.baselines.phase_route.observation import Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.loaders.render import Lighting
+from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import Rig
 
 SIZE = RIG.camera.width
@@ -118,7 +118,7 @@ def test_nothing_is_measured_where_nothing_is() -> None:
     measurement = route("horizontal").measure(empty)
     assert not measurement.depth_mm.any()
     assert measurement.counts["background"] == empty.size
-    dark = np.full((SIZE, SIZE), round(Lighting().ambient_grey), np.uint8)
+    dark = np.full((SIZE, SIZE), round(named_light("paper").ambient_grey), np.uint8)
     assert not route("horizontal").measure(dark).depth_mm.any()
 
 

@@ -7,7 +7,7 @@ import pytest
 from conftest import tiny_settings
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.loaders.render import assembly_of, build, preset_settings
+from fpp_ml_bench.loaders.render import assembly_of, build, named_light, preset_settings
 from fpp_ml_bench.loaders.storage import benchmark as module
 from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, benchmark_of, benchmark_sentence, intended_benchmark
 
@@ -32,7 +32,11 @@ def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
 
 def test_settings_of_ones_own_are_no_benchmark():
     settings = preset_settings("mini")
-    for other in (replace(settings, seed=1), replace(settings, shadows=True), replace(settings, stored="single_shot")):
+    for other in (
+        replace(settings, seed=1),
+        replace(settings, light=named_light("workshop")),
+        replace(settings, stored="single_shot"),
+    ):
         manifest = assembly_of(other).manifest
         assert intended_benchmark(manifest) is None
         as_expected, sentence = benchmark_sentence(manifest)

@@ -16,7 +16,7 @@ from disks import small_disk
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.loaders.render import Studio, assembly_of, build
+from fpp_ml_bench.loaders.render import Studio, assembly_of, build, named_light
 from fpp_ml_bench.loaders.storage import assembly as assembling
 from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -211,7 +211,7 @@ def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_datas
         ({"objects": ("cork", "bowl")}, r"objects \(there \[\"mug\", \"cork\"\], now"),
         ({"placement": "varied"}, "placement"),
         ({"stored": "all"}, "stored"),
-        ({"noise_sigma_grey": 2.0}, "noise_sigma_grey"),
+        ({"light": named_light("hard")}, "light"),
         ({"shadows": True}, "shadows"),
     ],
 )
