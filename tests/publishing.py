@@ -41,7 +41,8 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
             for sample, name, view in plan.samples:
                 frames = dict(enumerate(rng.integers(0, 256, (len(PAPER_SEQUENCE), *SIZE), dtype=np.uint8)))
                 depth = np.nextafter(disk_depth(SIZE, len(rows)), np.float32(5000)).astype(np.float32)
-                rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001)))
+                maps = np.zeros(depth.shape, np.uint8), np.full(depth.shape, 255, np.uint8)
+                rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps))
             files, described = ShardWriter(folder, scratch, PAPER_SEQUENCE, "all", True, SIZE).write(plan, rows)
             shards += files
             samples.setdefault(split, []).extend(described)

@@ -65,7 +65,17 @@ def make_dataset(
                 else:
                     frame, depth = scene(seed)
                 rows.append(
-                    Row(sample, name, view, {0: frame}, depth, depth + np.float32(0.5) * (depth > 0) if exact else None)
+                    Row(
+                        sample,
+                        name,
+                        view,
+                        {0: frame},
+                        depth,
+                        depth + np.float32(0.5) * (depth > 0) if exact else None,
+                        {},
+                        np.zeros(depth.shape, np.uint8),
+                        np.full(depth.shape, 255, np.uint8),
+                    )  # fmt: skip
                 )
             written, described = writer.write(plan, rows)
             shards += written

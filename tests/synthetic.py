@@ -35,7 +35,17 @@ class SyntheticRows:
             if self.spoil[1] == 0:
                 depth[:] = 0
         frame = noise(dict(self.same).get(sample, sample)).integers(0, 256, SIZE, dtype=np.uint8)
-        return Row(sample, name, view, {0: frame}, depth, exact)
+        return Row(
+            sample,
+            name,
+            view,
+            {0: frame},
+            depth,
+            exact,
+            {},
+            np.zeros(depth.shape, np.uint8),
+            np.full(depth.shape, 255, np.uint8),
+        )
 
 
 def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):

@@ -24,7 +24,7 @@ from fpp_ml_bench.loaders.storage.verification import verify
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
 
 datasets.disable_progress_bars()
-IMAGES = ("frame_00", "depth", "depth_exact")
+IMAGES = ("frame_00", "depth", "depth_exact", "flags", "cover")
 
 
 def rows_by_sample(dataset, columns):
@@ -38,7 +38,7 @@ def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, ope
     dataset = load_dataset(tiny, config, split="validation")
     frames = [f"frame_{i:02d}" for i in PAPER_SEQUENCE.config(config)]
     assert dataset.column_names == [
-        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "depth_min", "depth_max",
+        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "flags", "cover", "depth_min", "depth_max",
     ]  # fmt: skip
     assert len(dataset) == 6 and dataset.split == "validation"
     assert dataset["sample"][:] == opened.splits["validation"]
