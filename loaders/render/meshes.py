@@ -1,4 +1,4 @@
-"""Meshes by name: the 50 procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
+"""Meshes by name: procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
 
 import io
 import logging
@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 import yaml
 
-from fpp_ml_bench.constants import OBJECTS, SPLITS
+from fpp_ml_bench.constants import OBJECTS, SPLITS, UNSEEN
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.loaders.render.objects import object_mesh
@@ -124,7 +124,7 @@ def _entry(entry: object, where: str, folder: Path) -> UserMesh:
     name = entry["name"]
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         raise MeshError(f"{where}: name must be of a-z, 0-9 and _, got {name!r}")
-    if name in OBJECTS:
+    if name in (*OBJECTS, *UNSEEN):
         raise MeshError(f"{where}: {name!r} is one of the benchmark's own objects; choose another name")
     file = folder / str(entry["path"])
     if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file():

@@ -13,13 +13,24 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, MM_PER_M, OBJECTS, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.constants import (
+    FULL_SIZE,
+    MINI_OBJECTS,
+    MINI_SIZE,
+    MM_PER_M,
+    OBJECTS,
+    UNSEEN,
+    VIEW_DEGREES,
+    VIEWS,
+)  # fmt: skip
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-PRESETS: dict[str, tuple[tuple[str, ...], int]] = {"mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE)}
+PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
+    "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
+}  # fmt: skip
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
 
@@ -44,8 +55,8 @@ class UserMesh:
 class BuildSettings:
     """Everything that decides the bytes of a dataset.
 
-    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's and then the users' by name, whatever order
-    they were given in: it is the order of the rows.
+    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then the users' by name,
+    whatever order they were given in: it is the order of the rows.
     """
 
     rig: Rig
@@ -57,7 +68,7 @@ class BuildSettings:
     user_meshes: tuple[UserMesh, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        names = {*OBJECTS, *(mesh.name for mesh in self.user_meshes)}
+        names = {*OBJECTS, *UNSEEN, *(mesh.name for mesh in self.user_meshes)}
         for name in self.objects:
             if name not in names:
                 near = ", ".join(get_close_matches(name, sorted(names), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
@@ -68,7 +79,7 @@ class BuildSettings:
             twice = next(name for name in self.objects if self.objects.count(name) > 1)
             raise BuildError(f"object {twice!r} is named twice")
         user_meshes = sorted(self.user_meshes, key=lambda mesh: mesh.name)
-        order = (*OBJECTS, *(mesh.name for mesh in user_meshes))
+        order = (*OBJECTS, *UNSEEN, *(mesh.name for mesh in user_meshes))
         object.__setattr__(self, "user_meshes", tuple(user_meshes))
         object.__setattr__(self, "objects", tuple(sorted(self.objects, key=order.index)))
         if self.placement not in PLACEMENTS:

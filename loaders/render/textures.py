@@ -20,11 +20,17 @@ KINDS: dict[str, tuple[str, ...]] = {
         "master_chef_can", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "potted_meat_can", "bleach_cleanser",
         "spray_bottle", "container_bottle", "container_tin", "paint_container_bottle", "paint_container_jar",
         "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
-        "paint_thinner", "battery", "battery_case",
+        "paint_thinner", "battery", "battery_case", "tall_column", "sphere_pair",
     ),
-    "text": ("cracker_box", "sugar_box", "pudding_box", "gelatin_box", "open_book", "magazine_stack", "vial"),
-    "wood": ("wood_block", "wooden_boards", "hammer", "paint_brush", "paint_brush_large", "cork", "pallet_knife"),
-    "checks": ("duct_tape", "mug", "marker", "pen", "boxcutter"),
+    "text": (
+        "cracker_box", "sugar_box", "pudding_box", "gelatin_box", "open_book", "magazine_stack", "vial",
+        "hinged_leaves",
+    ),
+    "wood": (
+        "wood_block", "wooden_boards", "hammer", "paint_brush", "paint_brush_large", "cork", "pallet_knife",
+        "stair_tower", "cone_stack",
+    ),
+    "checks": ("duct_tape", "mug", "marker", "pen", "boxcutter", "saddle", "step_wedge"),
 }  # fmt: skip
 """Objects by what is on them; all others, and users' meshes, have stains."""
 _KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
