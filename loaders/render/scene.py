@@ -25,6 +25,7 @@ from fpp_ml_bench.constants import (
 )  # fmt: skip
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.paint import Paint
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
@@ -39,7 +40,8 @@ _MARGIN_PX = 2.0
 
 @dataclass(frozen=True)
 class UserMesh:
-    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, content hash."""
+    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, hash of
+    its bytes and its textures'."""
 
     name: str
     path: str
@@ -118,11 +120,13 @@ def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> floa
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3)."""
+    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3), and the
+    albedo of its own that a user's mesh may have, by triangle."""
 
     name: str
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
+    paint: Paint | None = None
 
 
 def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
