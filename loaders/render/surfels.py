@@ -94,7 +94,7 @@ class Surfels:
                  origin_m, direction)  # fmt: skip
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
         along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
-        target = np.empty(len(along), dtype=np.int32)
+        target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
         assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid.corner_m, grid.cell_m,
                     grid.table, grid.position_m, grid.normal, target)  # fmt: skip
         target = target.reshape(count, RAYS)

@@ -169,7 +169,7 @@ def cone_stack() -> Solid:
 
 def hollow_cube() -> Solid:
     """The frame of a cube of 280 mm, and the sphere that its beams hold."""
-    windows = [block(*(400 if axis == k else 200 for axis in range(3))) for k in range(3)]
+    windows = [block(400, 200, 200), block(200, 400, 200), block(200, 200, 400)]
     beams = [rod(tuple(-100.0 * np.array(way)), tuple(100.0 * np.array(way)), 16)
              for way in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]  # fmt: skip
     body = union(cut(block(280, 280, 280, 6), *windows), *beams, Manifold.sphere(70, 64))
