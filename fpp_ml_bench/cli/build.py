@@ -16,6 +16,7 @@ SUMMARY = "Generate the benchmark: virtual rig, objects, six views each, decoded
 EXAMPLES = (
     "fpp-bench build data/mini --preset mini                      6 objects at 480 px, all 52 frames",
     "fpp-bench build data/full --preset full                      the whole set: 50 objects, 960 px, 15,600 images",
+    "fpp-bench build data/unseen --preset unseen                  20 other objects at 960 px, all in split test",
     "fpp-bench build data/train --preset full --frames single_shot    frame 0 and depth only",
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
@@ -26,7 +27,9 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or one whose build was interrupted")
-    parser.add_argument("--preset", choices=("mini", "full"), default="mini", help="objects and size (default: mini)")
+    parser.add_argument(
+        "--preset", choices=tuple(render.PRESETS), default="mini", help="objects and size (default: mini)"
+    )
     parser.add_argument("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",

@@ -86,15 +86,13 @@ class ObjectLight:
     surfels: Surfels | None
     bounced: NDArray[np.float64] | None
 
-    def at(
-        self, points_m: NDArray[np.float64], normals: NDArray[np.float64], on_object: NDArray[np.bool_] | None = None
-    ) -> LitPixels:
-        """Light of points (n, 3) with unit normals (n, 3), camera coordinates; those not ``on_object`` bool (n,) are on
-        the background plane."""
+    def at(self, points_m: NDArray[np.float64], normals: NDArray[np.float64], triangle: NDArray[np.int32]) -> LitPixels:
+        """Light of points (n, 3) with unit normals (n, 3), camera coordinates, on triangles ``triangle`` (n,), rows of
+        the mesh's faces; where it is -1 on the background plane."""
         rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.pattern
-        own = np.arange(len(points_m)) if on_object is None else np.flatnonzero(on_object)
+        own = np.flatnonzero(triangle >= 0)
         position, facing = unturned(points_m[own] - self.offset_m, self.degrees), unturned(normals[own], self.degrees)
-        material = material_of(self.mesh, position, facing, light.surface)
+        material = material_of(self.mesh, position, facing, light.surface, triangle[own])
         if len(own) < len(points_m):
             albedo = np.full(len(points_m), (1.0 - light.surface.gloss) * light.surface.albedo)
             gloss = np.zeros(len(points_m))
@@ -125,7 +123,7 @@ class ObjectLight:
         arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)
         direct = np.empty((len(pattern.table), len(placed)))
         pattern.read(arriving.place, arriving.irradiance, direct)
-        material = material_of(self.mesh, points.position_m, points.normal, light.surface)
+        material = material_of(self.mesh, points.position_m, points.normal, light.surface, points.triangle)
         albedo = points.mean(np.broadcast_to((1.0 - material.gloss) * material.albedo, len(placed)))
         outside = plane.upon(self.surfels, self.degrees, self.offset_m)
         return between_surfels(self.surfels, points.mean(direct.T), outside, albedo)

@@ -1,9 +1,6 @@
-"""Meshes by name: the 50 procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
+"""Meshes by name: procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
 
-import io
-import logging
 import math
-import struct
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
@@ -13,14 +10,14 @@ import numpy as np
 import trimesh
 import yaml
 
-from fpp_ml_bench.constants import OBJECTS, SPLITS
+from fpp_ml_bench.constants import OBJECTS, SPLITS, UNSEEN
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, read_mesh
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
 
 
@@ -34,11 +31,10 @@ def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
 
 
 def load_user_mesh(description: UserMesh) -> SolidMesh:
-    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Raises
-    `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, or triangles
-    between vertices that are not there."""
-    mesh = _read_mesh(Path(description.path))
-    vertices_m = np.asarray(mesh.vertices, dtype=np.float64) * description.scale
+    """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Its
+    colours and textures come along. Raises `MeshError` as `read_mesh` does."""
+    vertices, faces, paint = read_mesh(Path(description.path))
+    vertices_m = vertices * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
         cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
         first, second = (axis + 1) % 3, (axis + 2) % 3
@@ -47,36 +43,7 @@ def load_user_mesh(description: UserMesh) -> SolidMesh:
     if description.centre:
         vertices_m = vertices_m - (vertices_m.min(axis=0) + vertices_m.max(axis=0)) / 2
     vertices_m = vertices_m + np.asarray(description.offset_m)
-    return SolidMesh(description.name, vertices_m, np.asarray(mesh.faces, dtype=np.int32))
-
-
-# What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8
-# sends it looking for a package that guesses encodings).
-_READER_ERRORS = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, NameError, OSError,
-    RuntimeError, TypeError, ValueError, struct.error,
-)  # fmt: skip
-
-
-def _read_mesh(path: Path) -> trimesh.Trimesh:
-    # Its log would put a traceback of its own on the screen; what matters of it is in our message.
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())
-    kind = path.suffix.lower().removeprefix(".")
-    try:
-        content = path.read_bytes()
-        if kind == "obj":  # its comments may be in any encoding, and its numbers are ASCII
-            content = content.decode("utf-8", errors="replace").encode()
-        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh", process=False)
-    except _READER_ERRORS as error:
-        reason = "damaged, or of another format" if isinstance(error, ImportError | NameError) else error
-        raise MeshError(f"{path}: can't be read as a mesh ({reason}); expected {', '.join(MESH_SUFFIXES)}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or np.shape(mesh.vertices)[1:] != (3,):
-        raise MeshError(f"{path}: holds no triangles; export it as a triangle mesh")
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{path}: has vertices that are not finite numbers; repair the mesh")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise MeshError(f"{path}: has triangles between vertices that are not there; it is damaged, export it again")
-    return mesh
+    return SolidMesh(description.name, vertices_m, faces, paint)
 
 
 def write_ply(mesh: SolidMesh, path: Path) -> None:
@@ -124,7 +91,7 @@ def _entry(entry: object, where: str, folder: Path) -> UserMesh:
     name = entry["name"]
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         raise MeshError(f"{where}: name must be of a-z, 0-9 and _, got {name!r}")
-    if name in OBJECTS:
+    if name in (*OBJECTS, *UNSEEN):
         raise MeshError(f"{where}: {name!r} is one of the benchmark's own objects; choose another name")
     file = folder / str(entry["path"])
     if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file():
@@ -143,7 +110,7 @@ def _entry(entry: object, where: str, folder: Path) -> UserMesh:
     centre = entry.get("centre", True)
     if not isinstance(centre, bool):
         raise MeshError(f"{where}: centre must be true or false, got {centre!r}")
-    return UserMesh(name, str(file), scale, centre=centre, split=split, content=file_hash(file), **triples)
+    return UserMesh(name, str(file), scale, centre=centre, split=split, content=content_hash(file), **triples)
 
 
 def _finite(value: object, where: str) -> float:

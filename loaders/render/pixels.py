@@ -22,16 +22,21 @@ _EDGE_COSINE = 0.9
 @dataclass(frozen=True)
 class MixedPixels:
     """Pixels that need more than their central ray. Flat ``pixels`` int64 (m,) ascending; per pixel and ray, (m s^2,)
-    in turn: ``points_m`` and ``normals`` float64 (m s^2, 3), on the object where ``on_object`` bool, else on the
-    background plane. ``void`` bool (m,): whether surfaces at different depths mix. ``share`` float64 (m,): of the rays,
-    on the surface that the central ray sees."""
+    in turn: ``points_m`` and ``normals`` float64 (m s^2, 3), on the ``triangle`` int32, a row of the mesh's faces, or
+    on the background plane: -1. ``void`` bool (m,): whether surfaces at different depths mix. ``share`` float64 (m,):
+    of the rays, on the surface that the central ray sees."""
 
     pixels: NDArray[np.int64]
     points_m: NDArray[np.float64]
     normals: NDArray[np.float64]
-    on_object: NDArray[np.bool_]
+    triangle: NDArray[np.int32]
     void: NDArray[np.bool_]
     share: NDArray[np.float64]
+
+    @property
+    def on_object(self) -> NDArray[np.bool_]:
+        """Which rays meet the object; bool (m s^2,)."""
+        return self.triangle >= 0
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -46,7 +51,7 @@ def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> Mix
     inside = parent < count
     if not inside.all():  # a camera whose height does not scale to a whole number of rays
         row, column, parent = row[inside], column[inside], parent[inside]
-        sub = Hits(sub.pixels[inside], sub.depth_m[inside], sub.normals[inside])
+        sub = Hits(sub.pixels[inside], sub.depth_m[inside], sub.normals[inside], sub.triangle[inside])
     central = np.full(count, -1, dtype=np.int64)
     central[hits.pixels] = np.arange(hits.pixels.size)
     seen = central[parent]
@@ -83,8 +88,10 @@ def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> Mix
     direction = np.column_stack([fine.x.ravel()[ray], fine.y.ravel()[ray], np.ones(ray.size)])
     normals = np.tile([0.0, 0.0, -1.0], (ray.size, 1))
     normals[hit] = sub.normals[of[hit]]
+    triangle = np.full(ray.size, -1, dtype=np.int32)
+    triangle[hit] = sub.triangle[of[hit]]
     share = np.where(central >= 0, of_surface, total - on_object)[pixels] / total
-    return MixedPixels(pixels, direction * depth_m[:, None], normals, hit, void[pixels], share)
+    return MixedPixels(pixels, direction * depth_m[:, None], normals, triangle, void[pixels], share)
 
 
 def _fine_pixels(pixels: NDArray[np.int64], width: int, across: int) -> NDArray[np.int64]:

@@ -30,11 +30,13 @@ _SHADOW_OFFSET_M = 1e-4
 @dataclass(frozen=True)
 class Hits:
     """Pixels that see the object: flat ``pixels`` int64 (n,) ascending, ``depth_m`` float64 (n,), ``normals`` float64
-    (n, 3), unit vectors turned toward the camera, so that a mesh with flipped triangles shades like one without."""
+    (n, 3), unit vectors turned toward the camera, so that a mesh with flipped triangles shades like one without, and
+    ``triangle`` int32 (n,), rows of the mesh's faces."""
 
     pixels: NDArray[np.int64]
     depth_m: NDArray[np.float64]
     normals: NDArray[np.float64]
+    triangle: NDArray[np.int32]
 
 
 class PixelRays:
@@ -74,6 +76,7 @@ class TracedObject:
         solid = lengths > 0
         if not solid.any():
             raise MeshError(f"object {mesh.name!r} has no triangle with an area")
+        self._row = np.flatnonzero(solid).astype(np.int32)
         self._corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
         self._normals = normals[solid] / lengths[solid, None]
         self._offsets = _dot(self._normals, self._corners[:, 0])
@@ -99,6 +102,7 @@ class TracedObject:
             pixels=row * rays.x.shape[1] + column,
             depth_m=depth_m[row - top, column - left],
             normals=np.where((facing > 0)[:, None], -normals, normals),
+            triangle=self._row[seen],
         )
 
     def _window(self, rays: PixelRays) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -13,13 +13,25 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, MM_PER_M, OBJECTS, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.constants import (
+    FULL_SIZE,
+    MINI_OBJECTS,
+    MINI_SIZE,
+    MM_PER_M,
+    OBJECTS,
+    UNSEEN,
+    VIEW_DEGREES,
+    VIEWS,
+)  # fmt: skip
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.paint import Paint
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-PRESETS: dict[str, tuple[tuple[str, ...], int]] = {"mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE)}
+PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
+    "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
+}  # fmt: skip
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
 
@@ -28,7 +40,8 @@ _MARGIN_PX = 2.0
 
 @dataclass(frozen=True)
 class UserMesh:
-    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, content hash."""
+    """A mesh of the user's: file, scale, turn (degrees about x, y, z, in that order), shift, split, hash of
+    its bytes and its textures'."""
 
     name: str
     path: str
@@ -44,8 +57,8 @@ class UserMesh:
 class BuildSettings:
     """Everything that decides the bytes of a dataset.
 
-    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's and then the users' by name, whatever order
-    they were given in: it is the order of the rows.
+    ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then the users' by name,
+    whatever order they were given in: it is the order of the rows.
     """
 
     rig: Rig
@@ -57,7 +70,7 @@ class BuildSettings:
     user_meshes: tuple[UserMesh, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        names = {*OBJECTS, *(mesh.name for mesh in self.user_meshes)}
+        names = {*OBJECTS, *UNSEEN, *(mesh.name for mesh in self.user_meshes)}
         for name in self.objects:
             if name not in names:
                 near = ", ".join(get_close_matches(name, sorted(names), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
@@ -68,7 +81,7 @@ class BuildSettings:
             twice = next(name for name in self.objects if self.objects.count(name) > 1)
             raise BuildError(f"object {twice!r} is named twice")
         user_meshes = sorted(self.user_meshes, key=lambda mesh: mesh.name)
-        order = (*OBJECTS, *(mesh.name for mesh in user_meshes))
+        order = (*OBJECTS, *UNSEEN, *(mesh.name for mesh in user_meshes))
         object.__setattr__(self, "user_meshes", tuple(user_meshes))
         object.__setattr__(self, "objects", tuple(sorted(self.objects, key=order.index)))
         if self.placement not in PLACEMENTS:
@@ -107,11 +120,13 @@ def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> floa
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3)."""
+    """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3), and the
+    albedo of its own that a user's mesh may have, by triangle."""
 
     name: str
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int32]
+    paint: Paint | None = None
 
 
 def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:

@@ -32,11 +32,13 @@ SIDES = 6
 @dataclass(frozen=True)
 class SurfacePoints:
     """Points spread evenly over an object: ``position_m`` and unit ``normal`` float64 (P, 3), sorted by the surfel
-    that each belongs to: those of surfel k are ``starts[k]:starts[k + 1]``, int64 (K + 1,)."""
+    that each belongs to: those of surfel k are ``starts[k]:starts[k + 1]``, int64 (K + 1,). ``triangle`` int64 (P,):
+    the rows of the mesh's faces that they lie on."""
 
     position_m: NDArray[np.float64]
     normal: NDArray[np.float64]
     starts: NDArray[np.int64]
+    triangle: NDArray[np.int64]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean of values (P, ...) over each surfel's points, (K, ...)."""
@@ -80,7 +82,7 @@ class Surfels:
     def of(cls, mesh: SolidMesh) -> "Surfels":
         """The surfels of ``mesh``. A mesh that does not enclose a volume has them on both of its sides."""
         traced = TracedObject(mesh, mesh.vertices_m)
-        points, grid = place_surfels(_sides(mesh))
+        points, grid = place_surfels(_sides(mesh), len(mesh.faces))
         count = len(grid.area_m2)
         turn = np.arange(count) * _GOLDEN
         disk = np.arange(RAYS) * _GOLDEN
@@ -92,7 +94,7 @@ class Surfels:
                  origin_m, direction)  # fmt: skip
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
         along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
-        target = np.empty(len(along), dtype=np.int32)
+        target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
         assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid.corner_m, grid.cell_m,
                     grid.table, grid.position_m, grid.normal, target)  # fmt: skip
         target = target.reshape(count, RAYS)
@@ -124,8 +126,9 @@ def _sides(mesh: SolidMesh) -> NDArray[np.float64]:
     return corners if volume > 0 else corners[:, ::-1]
 
 
-def place_surfels(corners: NDArray[np.float64]) -> tuple[SurfacePoints, SurfelGrid]:
-    """Points spread over the triangles ``corners`` (F, 3, 3) by area, and the surfels that they make."""
+def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tuple[SurfacePoints, SurfelGrid]:
+    """Points spread over the triangles ``corners`` (F, 3, 3) by area, and the surfels that they make. After ``faces``
+    triangles the same ones come again, from behind."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.sqrt(normal[:, 0] ** 2 + normal[:, 1] ** 2 + normal[:, 2] ** 2)
     behind = np.cumsum(double / 2)
@@ -146,7 +149,9 @@ def place_surfels(corners: NDArray[np.float64]) -> tuple[SurfacePoints, SurfelGr
     key = np.ravel_multi_index((*cell.T, side), (*shape, SIDES))
     order = np.argsort(key, kind="stable")
     keys, starts = np.unique(key[order], return_index=True)
-    points = SurfacePoints(position[order], facing[order], np.append(starts, POINTS))
+    points = SurfacePoints(
+        position[order], facing[order], np.append(starts, POINTS), triangle[order] % (faces or len(corners))
+    )
     mean_normal = points.mean(points.normal)
     mean_normal /= np.sqrt((mean_normal * mean_normal).sum(axis=1))[:, None]
     table = np.full((*shape, SIDES), -1, dtype=np.int32)

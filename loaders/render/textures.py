@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.illumination import Material
 from fpp_ml_bench.loaders.render.light import SurfaceLight
+from fpp_ml_bench.loaders.render.paint import barycentric
 from fpp_ml_bench.loaders.render.scene import SolidMesh, uniform
 
 Values = NDArray[np.float64]
@@ -20,15 +21,23 @@ KINDS: dict[str, tuple[str, ...]] = {
         "master_chef_can", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "potted_meat_can", "bleach_cleanser",
         "spray_bottle", "container_bottle", "container_tin", "paint_container_bottle", "paint_container_jar",
         "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
-        "paint_thinner", "battery", "battery_case",
+        "paint_thinner", "battery", "battery_case", "tall_column", "sphere_pair",
     ),
-    "text": ("cracker_box", "sugar_box", "pudding_box", "gelatin_box", "open_book", "magazine_stack", "vial"),
-    "wood": ("wood_block", "wooden_boards", "hammer", "paint_brush", "paint_brush_large", "cork", "pallet_knife"),
-    "checks": ("duct_tape", "mug", "marker", "pen", "boxcutter"),
+    "text": (
+        "cracker_box", "sugar_box", "pudding_box", "gelatin_box", "open_book", "magazine_stack", "vial",
+        "hinged_leaves",
+    ),
+    "wood": (
+        "wood_block", "wooden_boards", "hammer", "paint_brush", "paint_brush_large", "cork", "pallet_knife",
+        "stair_tower", "cone_stack",
+    ),
+    "checks": ("duct_tape", "mug", "marker", "pen", "boxcutter", "saddle", "step_wedge"),
 }  # fmt: skip
-"""Objects by what is on them; all others, and users' meshes, have stains."""
+"""Objects by what is on them; all others, and users' meshes without colours, have stains."""
 _KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
 CHECK_MM, LETTER_MM, STAIN_MM, RING_MM = 24.0, 14.0, 45.0, 9.0
+DARKEST = 0.02
+"""Least luminance of a mesh's own colours: black paint returns some light."""
 _GLYPHS = (
     0x7C12117E00, 0x7F49493600, 0x3E41412200, 0x7F41413E00, 0x7F49494100, 0x7F09090100, 0x3E41497A00, 0x7F08087F00,
     0x00417F4100, 0x7F08147300, 0x7F40404000, 0x7F06187F00, 0x3E41413E00, 0x7F09090600, 0x7F09197600, 0x2649493200,
@@ -36,13 +45,20 @@ _GLYPHS = (
 """Letters as five columns of seven points, a byte each, the lowest bit on top."""
 
 
-def material_of(mesh: SolidMesh, position_m: Values, normal: Values, surface: SurfaceLight) -> Material:
-    """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object coordinates."""
+def material_of(
+    mesh: SolidMesh, position_m: Values, normal: Values, surface: SurfaceLight,
+    triangle: NDArray[np.integer] | None = None,
+) -> Material:  # fmt: skip
+    """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object coordinates, on triangles
+    ``triangle`` (n,) of it. Where a light has textures, a mesh with colours of its own has those and no map."""
     if surface.textures == "none":
         return Material(surface.albedo, surface.gloss)
+    gloss = surface.gloss * uniform("gloss", mesh.name)
+    if mesh.paint is not None and triangle is not None:
+        weights = barycentric(mesh.vertices_m[mesh.faces[triangle]], position_m)
+        return Material(surface.albedo * np.maximum(mesh.paint.at(triangle, weights), DARKEST), gloss)
     kind = _KIND_OF.get(mesh.name, "stains") if surface.textures == "by_kind" else surface.textures
     dark = MAPS[kind](position_m * MM_PER_M, normal, mesh.name)
-    gloss = surface.gloss * uniform("gloss", mesh.name)
     return Material(surface.albedo * (1.0 - surface.contrast * dark), gloss)
 
 

@@ -93,11 +93,12 @@ class Studio:
         stream = (settings.seed, mesh.name, view)
         object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
         x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())
-        lit = object_light.at(np.column_stack([x, y, np.ones_like(x)]) * hits.depth_m[:, None], hits.normals)
+        points_m = np.column_stack([x, y, np.ones_like(x)]) * hits.depth_m[:, None]
+        lit = object_light.at(points_m, hits.normals, hits.triangle)
         mixed = mixed_lit = None
         if light.camera.rays_across > 1:
             mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across)
-            mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.on_object)
+            mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
         return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self._brightness(stream), stream)
 
     def _brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:

@@ -43,11 +43,11 @@ _CARD = """\
 
 ```python
 from fpp_ml_bench import load_dataset            # every configuration, memory-mapped, no copy
-train = load_dataset("THIS FOLDER", "{config}", split="train")
+{split} = load_dataset("THIS FOLDER", "{config}", split="{split}")
 
 import datasets                                   # frame 0 and depth
-train = datasets.load_dataset("THIS FOLDER", "single_shot", split="train")   # through its cache
-train = datasets.load_from_disk("THIS FOLDER")["train"]                      # in place
+{split} = datasets.load_dataset("THIS FOLDER", "single_shot", split="{split}")   # through its cache
+{split} = datasets.load_from_disk("THIS FOLDER")["{split}"]                      # in place
 ```
 
 `fpp-bench info` says what is in it, `fpp-bench verify` proves it intact. Made by fpp-ml-bench {package}.
@@ -84,7 +84,8 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
     text = CARD_HEAD + _CARD.format(
         version=data_version(manifest.fingerprint), data_files="\n".join(paths), origin=manifest.origin,
         rows=sum(len(rows) for rows in manifest.samples.values()), height=manifest.size[0], width=manifest.size[1],
-        stored=manifest.stored, config=available_configs(sequence, manifest.stored)[-1], package=__version__,
+        stored=manifest.stored, split=next(iter(manifest.samples)),
+        config=available_configs(sequence, manifest.stored)[-1], package=__version__,
     )  # fmt: skip
     write_atomically(folder / "README.md", text.encode())
     return ["README.md", RIG_FILE, *contents]

@@ -9,7 +9,7 @@ import pyarrow as pa
 import xxhash
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import OBJECTS, VIEWS, sample_name, split_of
+from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
@@ -169,7 +169,7 @@ def _split_findings(manifest: Manifest) -> list[str]:
             if sorted(seen) != sorted(VIEWS):
                 expected, found = ", ".join(VIEWS), ", ".join(seen)
                 findings.append(f"object {name!r} in {split}: expected the views {expected}, found {found}")
-            if manifest.origin == GENERATED and name in OBJECTS and split_of(name) != split:
+            if manifest.origin == GENERATED and name in (*OBJECTS, *UNSEEN) and split_of(name) != split:
                 findings.append(f"object {name!r} is in {split}, the benchmark has it in {split_of(name)}")
     return findings
 

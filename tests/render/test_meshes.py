@@ -170,6 +170,7 @@ def test_single_mesh_is_named_after_its_file(part):
         ([{"name": "", "path": "PART"}], "name must be"),
         ([{"name": 5, "path": "PART"}], "name must be"),
         ([{"name": "mug", "path": "PART"}], "one of the benchmark's own"),
+        ([{"name": "gear", "path": "PART"}], "one of the benchmark's own"),
         ([{"name": "x", "path": "nothing.stl"}], "no mesh file"),
         ([{"name": "x", "path": "list.yaml"}], "no mesh file"),
         ([{"name": "x", "path": None}], "no mesh file"),

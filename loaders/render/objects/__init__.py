@@ -1,9 +1,10 @@
-"""The 50 ground-truth objects of the benchmark, as procedural watertight meshes.
+"""The benchmark's 50 ground-truth objects and the 20 of the set ``unseen``, as procedural watertight meshes.
 
-Each is drawn in millimetres at its real size, in a pose that shows it to the camera of the first view, and enlarged.
-The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all; ours depart from it where
-its image statistics need it: a view covers 3 to 40% of the image and a tenth on average, half the views span less
-than about 80 mm in depth. Source: own shapes after the names of the YCB and warehouse objects that the paper scanned.
+Each of the 50 is drawn in millimetres at its real size, in a pose that shows it to the camera of the first view, and
+enlarged. The paper's simulator enlarges by 1.5 as a rule, thin objects by 3 to 5, boards not at all; ours depart from
+it where its image statistics need it: a view covers 3 to 40% of the image and a tenth on average, half the views span
+less than about 80 mm in depth. Source: own shapes after the names of the YCB and warehouse objects that the paper
+scanned. The unseen ones are drawn at the size that they have in the scene.
 """
 
 import difflib
@@ -11,9 +12,9 @@ import difflib
 import numpy as np
 import trimesh
 
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MM_PER_M, UNSEEN
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.objects import containers, household, tools
+from fpp_ml_bench.loaders.render.objects import containers, household, tools, unseen
 from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
 
 __all__ = ["ENLARGED", "object_mesh"]
@@ -34,18 +35,20 @@ ENLARGED: dict[str, float] = {
     "chalk_stick": 4.9, "pen": 4.2, "cork": 4.5, "clamp": 2.0, "boxcutter": 2.5, "hammer": 1.8, "duct_tape": 2.4,
 }  # fmt: skip
 """How much larger than life each object stands in the scene; a function of its name draws it."""
-_DRAWN = {**vars(containers), **vars(household), **vars(tools)}
+_SCALE = {**ENLARGED, **dict.fromkeys(UNSEEN, 1.0)}
+_DRAWN = {**vars(containers), **vars(household), **vars(tools), **vars(unseen)}
 
 
 def object_mesh(name: str) -> trimesh.Trimesh:
-    """Mesh of one of the 50 objects at the size it has in the scene: metres, z up, watertight, centred at the origin.
-    The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an unknown name."""
-    if name not in ENLARGED:
-        near = difflib.get_close_matches(name, ENLARGED, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(ENLARGED)}"
-        raise MeshError(f"expected one of the benchmark's {len(ENLARGED)} objects, got {name!r}; {hint}")
+    """Mesh of a benchmark's or an unseen object, at the size it has in the scene: metres, z up, watertight, centred
+    at the origin. The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an
+    unknown name."""
+    if name not in _SCALE:
+        near = difflib.get_close_matches(name, _SCALE, n=3, cutoff=0.4)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(_SCALE)}"
+        raise MeshError(f"expected one of the benchmark's {len(_SCALE)} objects, got {name!r}; {hint}")
     drawn: Solid = _DRAWN[name]()
-    solid = on_grid(drawn.scale((ENLARGED[name],) * 3), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
+    solid = on_grid(drawn.scale((_SCALE[name],) * 3), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
     mesh = solid.to_mesh64()
     vertices_m = mesh.vert_properties[:, :3] / MM_PER_M
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
