@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import FULL_SIZE, MINI_OBJECTS, MINI_SIZE, MM_PER_M, OBJECTS, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.projector import check_focus
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
@@ -78,6 +79,7 @@ class BuildSettings:
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
+        check_focus(self.rig, self.light.projector)
 
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
