@@ -74,7 +74,7 @@ def test_contrast_sets_how_dark_the_dark_parts_are():
     material = material_of(mesh("mug"), PLACE_MM / 1000, NORMAL, surface)  # a mug has checks
     np.testing.assert_allclose(np.unique(material.albedo), [0.2, 0.8])
     glosses = {name: material_of(mesh(name), PLACE_MM[:1] / 1000, NORMAL[:1], surface).gloss for name in OBJECTS}
-    assert 0 <= min(glosses.values()) and max(glosses.values()) < 0.5 and len(set(glosses.values())) == 50
+    assert min(glosses.values()) >= 0 and max(glosses.values()) < 0.5 and len(set(glosses.values())) == 50
 
 
 def test_a_map_sticks_to_its_object_in_every_view():
