@@ -123,7 +123,8 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
         return rig
     draws = [2 * uniform(seed, "calibration", part) - 1 for part in ("x", "y", "z", "u", "v")]
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    x, y = (axis[::16, ::16].ravel() for axis in rig.camera.rays())
+    across, down = ((np.arange(16) + 0.5) * (length / 16) - 0.5 for length in (rig.camera.width, rig.camera.height))
+    x, y = (axis.ravel() for axis in rig.camera.normalised(*np.meshgrid(across, down)))
     points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * depth for depth in (near_m, far_m)])
     before = rig.project(points)
     scale = 1.0 / rig.projector.fx

@@ -119,8 +119,8 @@ class Studio:
         return sum(self.expose(self.trace(mesh, view, step_m * frame), (frame,)) for frame in frames)
 
     def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
-        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless the lens
-        blurs. Returns the shadow rays of the background."""
+        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless it moves
+        or the lens blurs. Returns the shadow rays of the background."""
         exposure, images = self.exposure, self._frames.reshape(len(self._frames), -1)
         behind = self.lighting.behind(scene.traced, scene.hits.pixels)
         parts = [(scene.hits.pixels, scene.lit)]
@@ -140,7 +140,9 @@ class Studio:
                 blur_image(image, self._lens, between)
                 exposure.sense((frame,), image.reshape(1, -1), self._pixels, scene.stream, images[frame : frame + 1])
             return behind.shadow_rays
-        whole = tuple(frame for frame in frames if frame not in self.unstored or not skipping_enabled())
+        # An object that moves leaves pixels of the first frame, where all are decoded.
+        everything = not skipping_enabled() or self.light.motion_mm > 0
+        whole = tuple(frame for frame in frames if everything or frame not in self.unstored)
         for run in _runs(whole):
             exposure.expose(run, behind, self._pixels, scene.stream, images[run.start : run.stop])
         for pixels, lit in parts:
