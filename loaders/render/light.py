@@ -60,7 +60,7 @@ class SurfaceLight(StrictModel):
     albedo; with them ``gloss`` is the most, and each object has its share of it."""
 
     albedo: Annotated[float, Field(gt=0, le=0.95)] = 0.8
-    gloss: Share = 0.0
+    gloss: Annotated[float, Field(ge=0, le=0.95)] = 0.0
     roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.95
     textures: Literal["none", "by_kind", "checks"] = "none"
     contrast: Annotated[float, Field(ge=0, le=0.95)] = 0.0

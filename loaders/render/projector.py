@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics import DIRECTIONS, Rig, pattern_profiles
@@ -20,6 +21,8 @@ from fpp_ml_bench.portable import gaussian_weights, power
 FINE = 4
 """Samples a projector pixel where blur depends on the distance; linear interpolation between them costs a sinusoid of
 18 px 0.06% of its modulation. Without such blur a sample a pixel, which is what the pixels say."""
+MOST_DEFOCUS_PX = 100.0
+"""Largest sigma within the range and on the background plane."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,11 @@ class PatternLight:
 def response_table(response: float | tuple[float, ...]) -> NDArray[np.float64]:
     """Linear light of each 8-bit pattern level, float64 (256,) in [0, 1]: a power of it, or a measured curve given at
     evenly spaced levels from 0 to 255, interpolated."""
-    level = np.arange(GREY_LEVELS + 1) / GREY_LEVELS
+    return respond(response, np.arange(GREY_LEVELS + 1) / GREY_LEVELS)
+
+
+def respond(response: float | tuple[float, ...], level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The response to ``level`` (n,) in [0, 1], float64 (n,) in [0, 1]."""
     if isinstance(response, tuple):
         return np.interp(level, np.linspace(0.0, 1.0, len(response)), response)
     return level if response == 1.0 else power(level, response)
@@ -119,6 +126,18 @@ def defocus_variance_px2(rig: Rig, light: ProjectorLight, distance_m: NDArray[np
     focus = 1.0 / light.focus_m
     sigma = light.defocus_px * (1.0 / distance_m - focus) / (1.0 / far_m - focus)
     return sigma * sigma
+
+
+def check_focus(rig: Rig, light: ProjectorLight) -> None:
+    """Raise `BuildError` where the far end of the range, at which ``defocus_px`` is the blur, is all but in focus."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        most = float(np.sqrt(defocus_variance_px2(rig, light, _distances(rig)).max()))
+    if light.defocus_px > 0 and not most <= MOST_DEFOCUS_PX:
+        raise BuildError(
+            f"projector.focus_m {light.focus_m:g} with defocus_px {light.defocus_px:g} at the far end of the working "
+            f"range, {rig.working_range_mm[1]:g} mm: the blur elsewhere would exceed {MOST_DEFOCUS_PX:g} px; focus "
+            "farther from that end"
+        )
 
 
 def blurred(signal: NDArray[np.float64], variance: float) -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ from fpp_ml_bench.constants import (
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.paint import Paint
+from fpp_ml_bench.loaders.render.projector import check_focus
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
@@ -91,6 +92,7 @@ class BuildSettings:
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
+        check_focus(self.rig, self.light.projector)
 
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
@@ -136,7 +138,8 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
         return rig
     draws = [2 * uniform(seed, "calibration", part) - 1 for part in ("x", "y", "z", "u", "v")]
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    x, y = (axis[::16, ::16].ravel() for axis in rig.camera.rays())
+    across, down = ((np.arange(16) + 0.5) * (length / 16) - 0.5 for length in (rig.camera.width, rig.camera.height))
+    x, y = (axis.ravel() for axis in rig.camera.normalised(*np.meshgrid(across, down)))
     points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * depth for depth in (near_m, far_m)])
     before = rig.project(points)
     scale = 1.0 / rig.projector.fx

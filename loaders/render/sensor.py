@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, Light
-from fpp_ml_bench.loaders.render.projector import PatternLight, fill_pattern, response_table
+from fpp_ml_bench.loaders.render.projector import PatternLight, fill_pattern, respond
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics import Rig
 
@@ -102,11 +102,7 @@ class Sensor:
     @classmethod
     def of(cls, camera: CameraLight) -> "Sensor":
         codes = np.arange(1 << camera.bits)
-        if camera.response == 1.0:
-            grey = codes * (GREY_LEVELS / codes[-1])
-        else:
-            curve = response_table(camera.response)
-            grey = GREY_LEVELS * np.interp(codes / codes[-1], np.arange(GREY_LEVELS + 1) / GREY_LEVELS, curve)
+        grey = GREY_LEVELS * respond(camera.response, codes / codes[-1])
         return cls(camera.black_grey, Noise.of_camera(camera), np.rint(grey).astype(np.uint8))
 
 

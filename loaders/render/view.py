@@ -110,7 +110,7 @@ class Studio:
         return np.float32(exposure) if self._vignetting is None else self._vignetting * np.float32(exposure)
 
     def expose_view(self, mesh: SolidMesh, view: str, scene: TracedView) -> int:
-        """Expose a view into the studio's frames; returns how many shadow rays its background took."""
+        """Expose a view into the studio's frames; returns how many shadow rays its light took."""
         frames = tuple(range(len(self._frames))) if not skipping_enabled() else self.stored + self.unstored
         if self.light.motion_mm == 0:
             return self.expose(scene, frames)
@@ -121,13 +121,14 @@ class Studio:
         return sum(self.expose(self.trace(mesh, view, step_m * frame), (frame,)) for frame in frames)
 
     def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
-        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless the lens
-        blurs. Returns the shadow rays of the background."""
+        """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless it moves
+        or the lens blurs. Returns how many shadow rays their light took."""
         exposure, images = self.exposure, self._frames.reshape(len(self._frames), -1)
         behind = self.lighting.behind(scene.traced, scene.hits.pixels)
         parts = [(scene.hits.pixels, scene.lit)]
         if scene.mixed is not None and scene.mixed_lit is not None:
             parts.append((scene.mixed.pixels, scene.mixed_lit))
+        shadow_rays = behind.shadow_rays + sum(lit.shadow_rays for _, lit in parts)
         plain = np.ndim(scene.brightness) == 0 and scene.brightness == 1
         if not plain:
             behind = behind.brighter(scene.brightness)
@@ -141,15 +142,17 @@ class Studio:
                     image.ravel()[pixels] = exposure.radiance((frame,), lit, scene.stream, light)[0]
                 blur_image(image, self._lens, between)
                 exposure.sense((frame,), image.reshape(1, -1), self._pixels, scene.stream, images[frame : frame + 1])
-            return behind.shadow_rays
-        whole = tuple(frame for frame in frames if frame not in self.unstored or not skipping_enabled())
+            return shadow_rays
+        # An object that moves leaves pixels of the first frame, where all are decoded.
+        everything = not skipping_enabled() or self.light.motion_mm > 0
+        whole = tuple(frame for frame in frames if everything or frame not in self.unstored)
         for run in _runs(whole):
             exposure.expose(run, behind, self._pixels, scene.stream, images[run.start : run.stop])
         for pixels, lit in parts:
             exposed = exposure.expose(frames, lit, pixels.astype(np.uint32), scene.stream)
             for index, values in zip(frames, exposed, strict=True):
                 images[index, pixels] = values
-        return behind.shadow_rays
+        return shadow_rays
 
     @staticmethod
     def _of(

@@ -42,7 +42,7 @@ def test_the_switch_is_the_environment_and_comes_back(monkeypatch):
     assert not skipping_enabled()
 
 
-@pytest.mark.parametrize("change", [{}, {"shadows": True, "stored": "single_shot"}])
+@pytest.mark.parametrize("change", [{}, {"light": named_light("workshop"), "stored": "single_shot"}])
 def test_a_build_gives_the_same_files_with_skipping_off(tmp_path, change):
     settings = tiny_settings(objects=("power_drill",), **change)
     build(tmp_path / "on", settings, workers=1)

@@ -11,11 +11,16 @@ from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 from fpp_ml_bench.constants import MINI_OBJECTS, OBJECTS, SPLITS, TEST_OBJECTS, VALIDATION_OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build, plan_build
+from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.meshes import single_mesh
 from fpp_ml_bench.loaders.render.scene import PRESETS, BuildSettings
+from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
 from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
 from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
+
+PAPER = named_light("paper")
+NOISY = PAPER.changed("camera", **camera_noise(2.0))
 
 
 def differing_files(files, other_files):
@@ -42,7 +47,7 @@ def test_storing_one_frame_keeps_the_bytes_of_frame_and_depth(opened, tmp_path):
         assert dataset.measured(sample) == opened.measured(sample)
 
 
-@pytest.mark.parametrize("change", [{"seed": 43}, {"noise_sigma_grey": 2.0}, {"placement": "varied"}])
+@pytest.mark.parametrize("change", [{"seed": 43}, {"light": NOISY}, {"placement": "varied"}])
 def test_what_decides_the_bytes_changes_them(opened, tmp_path, change):
     build(tmp_path / "other", tiny_settings(objects=("cork",), stored="single_shot", **change), workers=1)
     dataset = DatasetFolder(tmp_path / "other")
@@ -171,9 +176,7 @@ def test_groups_hold_every_frame_once(stored, count, configs):
         ({"stored": "both"}, "single_shot"),
         ({"seed": -1}, "0 to 2"),
         ({"seed": 2**63}, "0 to 2"),
-        ({"noise_sigma_grey": -0.1}, "0 to 50"),
-        ({"noise_sigma_grey": float("nan")}, "0 to 50"),
-        ({"noise_sigma_grey": 51}, "0 to 50"),
+        ({"light": PAPER.changed("projector", focus_m=2.1, defocus_px=1.0)}, "focus_m"),
     ],
 )
 def test_bad_settings(change, message):

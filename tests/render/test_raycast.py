@@ -280,6 +280,42 @@ def test_what_lies_between_two_points(name):
     np.testing.assert_array_equal(traced(vertices_m, mesh.faces).blocked(starts, ends), blocked)
 
 
+@pytest.mark.parametrize("name", SHAPES)
+def test_where_a_line_first_meets_the_object(name):
+    """`met` against Moeller-Trumbore over every line and triangle."""
+    mesh, rng = SHAPES[name], np.random.default_rng(8)
+    vertices_m = np.add(mesh.vertices, [0.0, 0.0, 1.8])
+    starts, ends = rng.normal([0, 0, 1.8], 0.12, (2, 3000, 3))
+    ends[:300, 0] = starts[:300, 0]  # in the plane of the boxes' sides
+    way, nearest = ends - starts, np.ones(len(starts))
+    for a, b, c in vertices_m[mesh.faces]:
+        p = np.cross(way, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = 1 / (p @ (b - a))
+            u = (p * (starts - a)).sum(axis=1) * share
+            q = np.cross(starts - a, b - a)
+            v = (way * q).sum(axis=1) * share
+            along = q @ (c - a) * share
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (along > 0) & (along < nearest)
+        nearest[hit] = along[hit]
+    obj = traced(vertices_m, mesh.faces)
+    along, triangle = obj.met(starts, ends)
+    np.testing.assert_array_equal(triangle >= 0, nearest < 1)
+    np.testing.assert_allclose(along, nearest, atol=1e-10)
+    assert 0.2 < (triangle >= 0).mean() < 0.95 and (along[triangle < 0] == 1).all()
+    # The triangle named is the one that holds the point.
+    a, b, c = np.moveaxis(obj.tree_corners[triangle[triangle >= 0]], 1, 0)
+    point = (starts + along[:, None] * way)[triangle >= 0]
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    parts = sum(np.linalg.norm(np.cross(q - p, point - p), axis=1) for p, q in ((a, b), (b, c), (c, a)))
+    np.testing.assert_allclose(parts, area, rtol=1e-6)
+    # Any hit is a hit of some triangle, where there is one.
+    some = obj.met(starts, ends, any_suffices=True)
+    np.testing.assert_array_equal(some[1] >= 0, triangle >= 0)
+    assert (some[0] >= along).all()
+
+
 def test_nothing_beyond_the_light_casts_a_shadow():
     behind = traced([[-1, -1, -0.5], [1, -1, -0.5], [0, 1, -0.5]], [[0, 1, 2]])
     assert not behind.shadowed(np.array([[0.0, 0.0, 1.8]]), np.array([0.0, 0.0, 0.0])).any()

@@ -9,7 +9,15 @@ from scipy import stats
 
 from fpp_ml_bench.constants import VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.loaders.render.scene import SolidMesh, distance_bounds_m, place, turned
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.scene import (
+    SolidMesh,
+    distance_bounds_m,
+    modulation_at,
+    photographing_rig,
+    place,
+    turned,
+)
 from fpp_ml_bench.optics import paper_rig
 
 RIG = paper_rig(176)
@@ -130,3 +138,35 @@ def test_range_not_image_limits_a_deep_object():
     with pytest.raises(MeshError, match=r"1500-2100 mm.*view A0"):
         place(deep, "A0", RIG, "fixed", 1)
     place(box(0.59, 0.05, 0.05), "A0", RIG, "fixed", 1)
+
+
+def test_modulation_is_half_of_white_by_the_inverse_square():
+    assert modulation_at(RIG, 1500.0) == 90
+    assert modulation_at(RIG, 2100.0) == pytest.approx(90 * (1.5 / 2.1) ** 2)
+    dim = named_light("paper").changed("camera", reference_grey=100.0)
+    assert modulation_at(RIG, 3000.0, dim) == pytest.approx(12.5)
+
+
+# ---- calibration
+
+
+@pytest.mark.parametrize("calibration_px", [0.05, 0.25, 2.0, 20.0])
+def test_calibration_error_has_the_size_asked_for(calibration_px):
+    """RMS distance of where the two rigs put points all through the working range, on a grid of this test's own."""
+    rng = np.random.default_rng(0)
+    x, y = (axis.ravel() for axis in RIG.camera.rays())
+    near, far = np.ones_like(x) * 1.5, np.ones_like(x) * 2.1
+    points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * d[:, None] for d in (near, far)])
+    for seed in (1, 42):
+        other = photographing_rig(RIG, calibration_px, seed)
+        (u, v), (u2, v2) = RIG.project(points), other.project(points)
+        assert np.sqrt(np.mean((u - u2) ** 2 + (v - v2) ** 2)) == pytest.approx(calibration_px, rel=0.01)
+        between = points * rng.uniform(0.5, 1, (len(points), 1))
+        between *= np.clip(between[:, 2:], 1.5, 2.1) / between[:, 2:]
+        (u, v), (u2, v2) = RIG.project(between), other.project(between)
+        assert np.sqrt(np.mean((u - u2) ** 2 + (v - v2) ** 2)) == pytest.approx(calibration_px, rel=0.05)
+        np.testing.assert_allclose(other.R @ other.R.T, np.eye(3), atol=1e-12)
+        assert other.camera == RIG.camera and other.sequence == RIG.sequence
+    assert photographing_rig(RIG, calibration_px, 1) == photographing_rig(RIG, calibration_px, 1)
+    assert photographing_rig(RIG, calibration_px, 1) != photographing_rig(RIG, calibration_px, 2)
+    assert photographing_rig(RIG, 0.0, 1) is RIG

@@ -212,7 +212,6 @@ def test_leftovers_of_a_kill_and_files_of_others_do_not_become_part_of_the_datas
         ({"placement": "varied"}, "placement"),
         ({"stored": "all"}, "stored"),
         ({"light": named_light("hard")}, "light"),
-        ({"shadows": True}, "shadows"),
     ],
 )
 def test_other_settings_are_refused_by_name_before_and_after_the_end(half_built, change, message):

@@ -1,0 +1,296 @@
+"""Further bounces against theory: integrating sphere, form factors of rectangles, a groove, light from the plane.
+
+Rays are a fixed sequence, so every deviation below is a constant of this code. Form factors by Howell's catalogue
+(C-11, C-14) and by Lambert's contour formula.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from rendering import CENTRE, PAPER, RIG, sheet, solid
+
+from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.loaders.render.surfels import RAYS, Surfels
+
+WHITE = RIG.sequence.white
+
+
+@cache
+def hollow_sphere():
+    """A shell of 5 cm radius with a cavity of 4 cm: surfels, and which are of the cavity."""
+    outer, inner = trimesh.creation.icosphere(4, 0.05), trimesh.creation.icosphere(4, 0.04)
+    vertices = np.concatenate([outer.vertices, inner.vertices])
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]).astype(np.int32)
+    surfels = Surfels.of(SolidMesh("shell", vertices, faces))
+    cavity = np.linalg.norm(surfels.grid.position_m, axis=1) < 0.0449
+    return surfels, cavity
+
+
+def matrix(surfels):
+    """Form factors as a full matrix (K, K)."""
+    count = len(surfels.grid.area_m2)
+    full = np.zeros((count, count))
+    row = np.repeat(np.arange(count), np.diff(surfels.starts))
+    np.add.at(full, (row, surfels.seen), surfels.share)
+    return full
+
+
+def bounced(surfels, direct, rho):
+    """Irradiance by bounces (K,) of one pattern, without other light."""
+    return between_surfels(surfels, direct[:, None], np.zeros((len(direct), 1)), np.full(len(direct), rho))[:, 0]
+
+
+@pytest.mark.parametrize("rho", [0.2, 0.8, 0.95])
+def test_integrating_sphere_in_uniform_light(rho):
+    """Inside a closed sphere E = rho (1 + E), by theory exact: rho / (1 - rho)."""
+    surfels, cavity = hollow_sphere()
+    assert 500 < cavity.sum() < 900
+    total = bounced(surfels, cavity.astype(float), rho)
+    # Every ray of the cavity meets the cavity; 64 bounces leave rho^64 of it.
+    np.testing.assert_allclose(total[cavity], rho / (1 - rho) * (1 - rho**64), rtol=1e-3)
+    np.testing.assert_array_equal(total[~cavity], 0)
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.8])
+def test_integrating_sphere_with_a_lit_cap(rho):
+    """Every part of a sphere sees every other alike: a lit share phi of it gives rho phi / (1 - rho) everywhere."""
+    surfels, cavity = hollow_sphere()
+    cap = cavity & (surfels.grid.position_m[:, 2] > 0.015)
+    area = surfels.grid.area_m2
+    phi = area[cap].sum() / area[cavity].sum()
+    assert phi == pytest.approx((1 - 0.015 / 0.04) / 2, abs=0.02)
+    total = bounced(surfels, cap.astype(float), rho)[cavity]
+    expected = rho * phi / (1 - rho)
+    assert np.average(total, weights=area[cavity]) == pytest.approx(expected, rel=5e-3)
+    assert np.sqrt(np.mean((total / expected - 1) ** 2)) < 0.05
+    # As it reaches the surface, between surfels.
+    points = surfels.points.position_m[::40]
+    inside = np.linalg.norm(points, axis=1) < 0.045
+    normals = surfels.points.normal[::40]
+    full = np.zeros((len(area), 1))
+    full[cavity, 0] = total
+    smooth = at_points(surfels.grid, full, points[inside], normals[inside])[0]
+    assert np.sqrt(np.mean((smooth / expected - 1) ** 2)) < 0.03
+
+
+def from_to(surfels, source, target):
+    """Share of the light of the surfels ``source`` that arrives at ``target``, both bool (K,)."""
+    area = surfels.grid.area_m2
+    return np.average(matrix(surfels)[np.ix_(source, target)].sum(axis=1), weights=area[source])
+
+
+def parallel_squares(distance):
+    """C-11: equal parallel squares, side / distance = x."""
+    x = 1 / distance
+    s = np.sqrt(1 + x * x)
+    inner = np.log(np.sqrt((1 + x * x) ** 2 / (1 + 2 * x * x))) + 2 * x * s * np.arctan(x / s) - 2 * x * np.arctan(x)
+    return 2 / (np.pi * x * x) * inner
+
+
+def perpendicular(h, w):
+    """C-14: rectangles with a common edge; h: height of the target, w: depth of the source, by the edge's length."""
+    a, b, root = h * h, w * w, np.sqrt(h * h + w * w)
+    logs = (1 + b) * (1 + a) / (1 + b + a)
+    logs *= (b * (1 + b + a) / ((1 + b) * (b + a))) ** b * (a * (1 + a + b) / ((1 + a) * (a + b))) ** a
+    return (w * np.arctan(1 / w) + h * np.arctan(1 / h) - root * np.arctan(1 / root) + np.log(logs) / 4) / (np.pi * w)
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
+def test_two_parallel_squares(distance):
+    sides = [0.1, 0, 0], [0, 0.1, 0]
+    surfels = Surfels.of(sheet(([0, 0, 0], *sides), ([0, 0, 0.1 * distance], *sides)))
+    z, n = surfels.grid.position_m[:, 2], surfels.grid.normal[:, 2]
+    low, high = (z < 0.05 * distance) & (n > 0), (z > 0.05 * distance) & (n < 0)
+    expected = parallel_squares(distance)
+    assert parallel_squares(1.0) == pytest.approx(0.19982, abs=1e-5)
+    assert from_to(surfels, low, high) == pytest.approx(expected, rel=0.02)
+    assert from_to(surfels, high, low) == pytest.approx(expected, rel=0.02)
+    # The outer sides see nothing of each other.
+    assert matrix(surfels)[~(low | high)].sum() == 0
+    assert surfels.open_share[~(low | high)].min() == 1
+
+
+def right_angle(depth, height):
+    """A floor and a wall with a common edge of 10 cm, their other sides given by it."""
+    edge = [0.1, 0, 0]
+    return sheet(([0, 0, 0], edge, [0, 0.1 * depth, 0]), ([0, 0, 0], edge, [0, 0, 0.1 * height]))
+
+
+@pytest.mark.parametrize(("height", "depth"), [(1.0, 1.0), (0.5, 1.0), (1.0, 0.4)])
+def test_two_perpendicular_rectangles(height, depth):
+    surfels = Surfels.of(
+        sheet(([0, 0, 0], [0.1, 0, 0], [0, 0.1 * depth, 0]), ([0, 0, 0], [0.1, 0, 0], [0, 0, 0.1 * height]))
+    )
+    floor, wall = surfels.grid.normal[:, 2] > 0.5, surfels.grid.normal[:, 1] > 0.5
+    assert perpendicular(1.0, 1.0) == pytest.approx(0.20004, abs=1e-5)
+    assert from_to(surfels, floor, wall) == pytest.approx(perpendicular(height, depth), rel=0.03)
+    assert from_to(surfels, wall, floor) == pytest.approx(perpendicular(height, depth) * depth / height, rel=0.03)
+
+
+def contour(points, normals, corners):
+    """Form factor from points (n, 3) to a polygon (m, 3) that lies above their horizons: Lambert 1760, exact."""
+    total = np.zeros(len(points))
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        to_a, to_b = a - points, b - points
+        to_a, to_b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (to_a, to_b))
+        cross = np.cross(to_a, to_b)
+        length = np.linalg.norm(cross, axis=1)
+        angle = np.arctan2(length, (to_a * to_b).sum(axis=1))
+        total += (cross * normals).sum(axis=1) * angle / np.maximum(length, 1e-30)
+    return np.abs(total) / (2 * np.pi)
+
+
+def groove(side=0.1, n=12):
+    """Radiosity of a right-angled groove, floor y and wall z, by n x n patches a side and Lambert's formula: patch
+    centres (n n, 2) along the edge and away from it, and the form factors (n n, n n) of either side to the other."""
+    across, away = np.meshgrid((np.arange(n) + 0.5) / n * side, (np.arange(n) + 0.5) / n * side, indexing="ij")
+    centres = np.column_stack([across.ravel(), away.ravel(), np.zeros(n * n)])
+    up = np.tile([0.0, 0.0, 1.0], (n * n, 1))
+    factors = np.empty((n * n, n * n))
+    half = side / n / 2
+    for k, (x, z) in enumerate(zip(across.ravel(), away.ravel(), strict=True)):
+        patch = [[x - half, 0, z - half], [x + half, 0, z - half], [x + half, 0, z + half], [x - half, 0, z + half]]
+        factors[:, k] = contour(centres, up, np.array(patch))
+    return centres[:, :2], factors
+
+
+def test_groove_of_two_squares():
+    """All bounces between two sides at a right angle in uniform light, place by place."""
+    rho, (centres, factors) = 0.8, groove()
+    assert factors.sum(axis=1).mean() == pytest.approx(perpendicular(1.0, 1.0), rel=0.01)
+    # Both sides are alike: E = F rho (1 + E).
+    n = len(centres)
+    expected = np.linalg.solve(np.eye(n) - rho * factors, rho * factors.sum(axis=1))
+    surfels = Surfels.of(right_angle(1.0, 1.0))
+    normal = surfels.grid.normal
+    inner = (normal[:, 2] > 0.5) | (normal[:, 1] > 0.5)
+    values = bounced(surfels, inner.astype(float), rho)[:, None]
+    floor = np.column_stack([centres, np.zeros(n)])
+    wall = np.column_stack([centres[:, 0], np.zeros(n), centres[:, 1]])
+    for points, facing in ((floor, [0, 0, 1.0]), (wall, [0, 1.0, 0])):
+        found = at_points(surfels.grid, values, points, np.tile(facing, (n, 1)))[0]
+        assert found.mean() == pytest.approx(expected.mean(), rel=0.02)
+        # A place's own error: noise of 128 rays and the width of a surfel, as a share of the groove's largest value.
+        assert np.sqrt(np.mean((found - expected) ** 2)) < 0.03 * expected.max()
+        outside = at_points(surfels.grid, values, points, np.tile(np.negative(facing), (n, 1)))[0]
+        np.testing.assert_array_equal(outside, 0)
+
+
+SHAPES = {
+    "torus": solid(trimesh.creation.torus(0.08, 0.03, 48, 24)),
+    "box": solid(trimesh.creation.box((0.1, 0.2, 0.15))),
+    "two boxes": solid(trimesh.util.concatenate(
+        [trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([x, 0, z]) for x, z in ((0, 0), (0.14, 0.03))]
+    )),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["shell", "torus", "box", "two boxes"])
+def test_rows_and_reciprocity(name):
+    surfels = hollow_sphere()[0] if name == "shell" else Surfels.of(SHAPES[name])
+    factors, area = matrix(surfels), surfels.grid.area_m2
+    np.testing.assert_allclose(factors.sum(axis=1) + surfels.open_share, 1, atol=1e-12)
+    assert 1000 < len(area) < 2600
+    # A_i F_ij = A_j F_ji: single pairs are noise, so by halves of the object, along each axis, within three standard
+    # errors of the rays that go across. Each carries the area of a surfel, by the number of rays.
+    crossing = []
+    for axis in range(3):
+        place = surfels.grid.position_m[:, axis]
+        upper = place > np.median(place)
+        there, back = (
+            (area[one] @ factors[np.ix_(one, other)]).sum() for one, other in ((upper, ~upper), (~upper, upper))
+        )
+        error = np.sqrt((there + back) * area.mean() / RAYS)
+        assert abs(there - back) <= 3 * error
+        crossing.append(there / error if there else 0)
+    assert max(crossing) == 0 if name == "box" else max(crossing) > 20
+
+
+@pytest.mark.parametrize("mesh", [SHAPES["box"], solid(trimesh.creation.icosphere(4, 0.08)),
+                                  solid(trimesh.creation.cylinder(0.05, 0.2, sections=64))])  # fmt: skip
+def test_a_convex_object_gets_nothing_from_itself(mesh):
+    surfels = Surfels.of(mesh)
+    assert surfels.open_share.min() == 1 and surfels.share.size == 0
+    outside = np.random.default_rng(0).random((len(surfels.grid.area_m2), 2))
+    np.testing.assert_array_equal(between_surfels(surfels, outside, outside, np.full(len(outside), 0.9)), outside)
+
+
+def test_surfels_share_out_the_surface():
+    surfels = hollow_sphere()[0]
+    grid, points = surfels.grid, surfels.points
+    assert grid.area_m2.sum() == pytest.approx(4 * np.pi * (0.05**2 + 0.04**2), rel=3e-3)
+    assert surfels.open_directions.shape == (surfels.open_starts[-1], 3)
+    np.testing.assert_allclose(np.linalg.norm(surfels.open_directions, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(points.mean(points.position_m), grid.position_m)
+    # Open rays lie about their normal like the cosine: the mean of their cosine is 2/3.
+    cosine = (surfels.open_directions * np.repeat(grid.normal, np.diff(surfels.open_starts), axis=0)).sum(axis=1)
+    assert cosine.mean() == pytest.approx(2 / 3, rel=2e-3)
+
+
+def test_both_sides_of_a_sheet_that_encloses_nothing():
+    """Half a spherical shell: its inside sees itself with half of its hemisphere (A_opening / A_inside), its outside
+    nothing, whichever way its triangles are turned."""
+    ball = trimesh.creation.icosphere(4, 0.06)
+    half = ball.faces[(ball.triangles_center[:, 2] < 0)]
+    for faces in (half, half[:, ::-1]):
+        surfels = Surfels.of(SolidMesh("bowl", np.asarray(ball.vertices), np.ascontiguousarray(faces, dtype=np.int32)))
+        grid = surfels.grid
+        inside = (grid.normal * grid.position_m).sum(axis=1) < 0
+        assert grid.area_m2[inside].sum() == pytest.approx(grid.area_m2[~inside].sum(), rel=0.02)
+        assert np.average(surfels.open_share[inside], weights=grid.area_m2[inside]) == pytest.approx(0.5, abs=0.01)
+        assert surfels.open_share[~inside].min() == 1
+
+
+def test_interpolation_reproduces_a_constant_and_is_smooth():
+    mesh = trimesh.creation.icosphere(4, 0.08)
+    surfels = Surfels.of(solid(mesh))
+    grid = surfels.grid
+    rng = np.random.default_rng(0)
+    points, triangle = trimesh.sample.sample_surface(mesh, 3000, seed=1)
+    values = np.column_stack([np.full(len(grid.area_m2), 0.37), grid.position_m[:, 0]])
+    constant, x = at_points(grid, values, np.asarray(points), mesh.face_normals[triangle])
+    np.testing.assert_allclose(constant, 0.37, rtol=1e-6)
+    assert np.abs(x - points[:, 0]).max() < 0.5 * grid.cell_m
+    # A step of a hundredth of a cell changes nothing by more than a few hundredths of a cell.
+    step = points + rng.normal(size=points.shape) * 0.01 * grid.cell_m
+    moved = at_points(grid, values, step, mesh.face_normals[triangle])[1]
+    assert np.abs(moved - x).max() < 0.1 * grid.cell_m
+    far = at_points(grid, values, np.array([[0.5, 0.5, 0.5], [np.nan] * 3]), np.array([[0.0, 0, 1], [0, 0, 1]]))
+    assert (far == 0).all()
+
+
+def test_light_from_the_background_plane_against_an_integral():
+    """Irradiance of a ball's back from the lit part of the plane, by the midpoint rule with the inverse square and the
+    cosines written out."""
+    light = PAPER
+    plane = PlaneLight.of(RIG, light, PatternLight.of(RIG, light.projector))
+    surfels = Surfels.of(solid(trimesh.creation.icosphere(4, 0.08)))
+    offset = np.array([0.05, -0.02, 1.9])
+    degrees = 120
+    found = plane.upon(surfels, degrees, offset)[:, WHITE]
+    a = np.radians(degrees)
+    rotation = np.array([[-np.sin(a), -np.cos(a), 0], [0, 0, -1], [np.cos(a), -np.sin(a), 0]])
+    position, normal = surfels.grid.position_m @ rotation.T + offset, surfels.grid.normal @ rotation.T
+    # The pattern's outer pixel edges, sent from the projector to 3.2 m.
+    x = CENTRE[0] + 3.2 * (np.array([-0.5, 911.5]) - 455.5) / 1824
+    y = CENTRE[1] + 3.2 * (np.array([-0.5, 1139.5]) - 569.5) / 1824
+    n = 80
+    gx, gy = np.meshgrid(x[0] + (np.arange(n) + 0.5) / n * np.ptp(x), y[0] + (np.arange(n) + 0.5) / n * np.ptp(y))
+    gx, gy = gx.ravel(), gy.ravel()
+    from_light = np.sqrt((gx - CENTRE[0]) ** 2 + (gy - CENTRE[1]) ** 2 + 3.2**2)
+    leaving = 0.8 * 1.5**2 / from_light**2 * 3.2 / from_light
+    expected = np.zeros(len(found))
+    for k in range(len(found)):
+        to = np.stack([gx - position[k, 0], gy - position[k, 1], np.full(gx.size, 3.2 - position[k, 2])])
+        squared = (to**2).sum(axis=0)
+        cosines = np.clip(normal[k] @ to, 0, None) * to[2] / squared
+        expected[k] = (leaving * cosines / squared).sum() / np.pi * np.ptp(x) * np.ptp(y) / n**2
+    assert expected.max() > 0.05 and (found[normal[:, 2] < -0.9] == 0).all()
+    assert np.average(found, weights=surfels.grid.area_m2) == pytest.approx(
+        np.average(expected, weights=surfels.grid.area_m2), rel=0.01
+    )
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.05 * expected.max()

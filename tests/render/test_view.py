@@ -1,0 +1,422 @@
+"""Whole views: what is lit, dark, flagged and decoded, how well, and what is left out without changing a byte."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from rendering import CENTRE, DIRECT, PAPER, RIG, X, Y, kept, sheet, solid, studio
+
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.depth import edge_distance_px, object_mask
+from fpp_ml_bench.loaders.render import lighting, view
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.raycast import TracedObject
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.sensor import camera_noise
+from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
+from fpp_ml_bench.loaders.sample import Flag
+from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
+from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.skipping import skipping
+
+BALL = solid(trimesh.creation.icosphere(3, 0.12))
+SHADOWS = DIRECT.changed("bounces", shadows=True)
+SMALL = replace(RIG, sequence=Sequence(steps=3))
+"""Fewer frames, where their number doesn't matter."""
+
+
+def noisy(sigma_grey, light=DIRECT):
+    return light.changed("camera", **camera_noise(sigma_grey))
+
+
+def test_shadows_off_traces_no_shadow_ray_and_on_darkens_what_is_hidden():
+    mesh = solid(trimesh.util.concatenate(
+        [trimesh.creation.box((0.02, 0.3, 0.3)).apply_translation([0.1, 0, 0]),
+         trimesh.creation.box((0.02, 0.06, 0.06)).apply_translation([-0.1, 0.0, 0])]
+    ))  # fmt: skip
+    without, shaded = studio(), studio(SHADOWS)
+    plain = without.photograph(mesh, "A0")
+    white, depth = plain.frames[51].copy(), plain.depth_exact_mm.copy()
+    assert plain.measured["shadow_rays"] == 0
+    row = shaded.photograph(mesh, "A0")
+    # Shadow rays of the background start where the object can cast a shadow; nowhere else.
+    assert 500 < row.measured["shadow_rays"] < X.size / 10
+    np.testing.assert_array_equal(row.depth_exact_mm, depth)
+    dark = white.astype(int) - row.frames[51] > 20
+    # By hand: the wall's front is at 1.89 m, the block spans 1.69 to 1.71 m; lines from the light through the block.
+    points = np.stack([X, Y, np.ones_like(X)], axis=-1) * depth[..., None] / 1000
+    wall = np.abs(depth - 1890) < 0.01
+    hidden = np.zeros(X.shape, dtype=bool)
+    surely_lit = np.ones(X.shape, dtype=bool)
+    for z in np.linspace(1.69, 1.71, 21):
+        at = CENTRE + (points - CENTRE) * (z / np.maximum(points[..., 2:], 1e-9))
+        size = np.abs(at[..., :2]).max(axis=-1)
+        hidden |= size < 0.03 - 1e-3
+        surely_lit &= size > 0.03 + 1e-3
+    assert (wall & hidden).sum() > 60
+    assert dark[wall & hidden].all()
+    assert not dark[wall & surely_lit].any()
+    assert (row.frames[51][wall & hidden] == 6).all()
+    # The block's and the wall's shadows fall on the background plane too, and nothing there is brighter than before.
+    background = depth == 0
+    assert dark[background].sum() > 100
+    assert (row.frames[51].astype(int) <= white).all()
+    # Hidden surface has no ground truth, and it is counted.
+    assert (row.depth_mm[wall & hidden] == 0).all()
+    assert row.measured["undecoded_px"] >= (wall & hidden).sum()
+
+
+def noise_sigma_mm(rig, gain, ambient, depth_m, sigma_grey, steps):
+    """sigma_Z of one direction by rig.md's formulas; B and the noise at the mean grey level of each pixel."""
+    modulation = gain / 2
+    mean = ambient + gain / 2
+    sigma = np.sqrt(sigma_grey**2 / 2 * (1 + mean / 127.5) + 1 / 12)
+    sigma_phi = np.sqrt(2 / steps) * sigma / modulation
+    out = {}
+    for direction, baseline, focal in (("vertical", 0.125, 1824.0), ("horizontal", 0.1, 1824.0)):
+        sigma_u = rig.pitch(direction) * sigma_phi / (2 * np.pi)
+        out[direction] = 1000 * sigma_u * depth_m**2 / (focal * baseline)
+    return out
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+@pytest.mark.parametrize("sigma_grey", [1.0, 4.0])
+def test_decoded_depth_is_within_theory_of_the_exact_depth(shape, sigma_grey):
+    if shape == "plane":
+        mesh = trimesh.creation.box((0.05, 0.25, 0.25))
+    else:
+        mesh = trimesh.creation.icosphere(5, 0.12)
+    at = studio(noisy(sigma_grey))
+    frames_all = np.stack([at.photograph(solid(mesh), "A0").frames[i] for i in range(52)])
+    row = at.photograph(solid(mesh), "A0")
+    exact = row.depth_exact_mm
+    inside = edge_distance_px(exact) >= 4
+    inside &= object_mask(exact)
+    white, black = frames_all[51].astype(float), frames_all[50].astype(float)
+    bright = inside & (white - black > 60)
+    assert bright.sum() > 300
+    expected = noise_sigma_mm(RIG, (white - black)[bright], black[bright], exact[bright] / 1000, sigma_grey, 18)
+    for direction in ("vertical", "horizontal"):
+        decoded = decode_stack(frames_all, RIG, direction=direction, mask=object_mask(exact))
+        error = decoded.depth_mm[bright].astype(float) - exact[bright]
+        assert (decoded.depth_mm[bright] > 0).all()
+        # The pattern's own rounding to 8 bit and its bilinear blend add a little to the noise of the sensor.
+        ratio = np.sqrt((error**2).mean() / (expected[direction] ** 2).mean())
+        assert 0.9 < ratio < 1.2
+        assert abs(error.mean()) < 4 * expected[direction].mean() / np.sqrt(bright.sum()) + 0.05
+    both = row.depth_mm[bright].astype(float) - exact[bright]
+    # Least squares of both directions: inverse variances add.
+    combined = 1 / np.sqrt(1 / expected["vertical"] ** 2 + 1 / expected["horizontal"] ** 2)
+    assert 0.9 < np.sqrt((both**2).mean() / (combined**2).mean()) < 1.2
+
+
+def test_without_noise_ground_truth_is_nearly_exact():
+    row = studio().photograph(solid(trimesh.creation.icosphere(4, 0.12)), "A0")
+    inside = (edge_distance_px(row.depth_exact_mm) >= 4) & object_mask(row.depth_exact_mm)
+    error = np.abs(row.depth_mm - row.depth_exact_mm)[inside & (row.depth_mm > 0)]
+    assert error.max() < 1.0 and error.mean() < 0.12  # 8 bit leaves 0.29 grey levels RMS
+
+
+def test_depth_never_guesses():
+    """What the camera can't see of the pattern has no decoded depth: such pixels are 0 and counted."""
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.box((0.02, 0.1, 0.1)),
+         trimesh.creation.box((0.3, 0.002, 0.3)).apply_translation([0, 0.11, 0])]  # a fin turned away from the light
+    )  # fmt: skip
+    at = studio(noisy(1.0))
+    row = at.photograph(solid(mesh), "A0")
+    exact, depth = object_mask(row.depth_exact_mm), object_mask(row.depth_mm)
+    assert not (depth & ~exact).any()
+    assert row.measured["exact_px"] == exact.sum()
+    assert row.measured["undecoded_px"] == (exact & ~depth).sum()
+    unlit = exact & (row.frames[51].astype(int) - row.frames[50] < 4)
+    assert unlit.sum() > 10
+    assert not depth[unlit].any()
+    assert np.isfinite(row.depth_mm).all() and (row.depth_mm >= 0).all()
+
+
+def test_ground_truth_error_by_hand():
+    exact = np.zeros((20, 20), np.float32)
+    exact[4:16, 4:16] = 1800
+    decoded = exact.copy()
+    decoded[4, 4:16] = 0  # twelve pixels of the rim
+    decoded[10, 10] += 3
+    decoded[5, 5] -= 1
+    flags = np.zeros(exact.shape, np.uint8)
+    errors = ground_truth_error(decoded, exact, flags)
+    assert errors["exact_px"] == 144 and errors["undecoded_px"] == 12
+    assert errors["gt_mae_mm"] == pytest.approx(4 / 132)
+    assert errors["gt_rmse_mm"] == pytest.approx(np.sqrt(10 / 132))
+    assert errors["gt_bias_mm"] == pytest.approx(2 / 132)
+    assert errors["gt_max_mm"] == 3
+    assert errors["gt_interior_px"] == 36  # 12 - 2 x 3 px on each side
+    assert errors["gt_interior_mae_mm"] == pytest.approx(3 / 36)
+    empty = ground_truth_error(np.zeros_like(exact), exact, flags)
+    assert empty["gt_mae_mm"] is None and empty["gt_max_mm"] is None and empty["undecoded_px"] == 144
+
+
+def test_a_view_is_the_same_with_and_without_numba(monkeypatch):
+    rows = {}
+    for switch in ("1", "0"):
+        monkeypatch.setenv(SWITCH, switch)
+        rows[switch] = studio(noisy(1.0)).photograph(BALL, "A60")
+    for index, frame in rows["1"].frames.items():
+        np.testing.assert_array_equal(frame, rows["0"].frames[index])
+    np.testing.assert_array_equal(rows["1"].depth_exact_mm, rows["0"].depth_exact_mm)
+    np.testing.assert_array_equal(rows["1"].depth_mm, rows["0"].depth_mm)
+
+
+def test_storing_fewer_frames_changes_no_byte_of_the_rest():
+    whole = studio(noisy(1.0)).photograph(BALL, "A120")
+    for stored in ("single_shot", "vertical", "sinusoidal"):
+        row = studio(noisy(1.0), stored=stored).photograph(BALL, "A120")
+        np.testing.assert_array_equal(row.depth_mm, whole.depth_mm)
+        np.testing.assert_array_equal(row.depth_exact_mm, whole.depth_exact_mm)
+        for index, frame in row.frames.items():
+            np.testing.assert_array_equal(frame, whole.frames[index])
+
+
+def test_seed_changes_the_frames_but_not_the_exact_depth():
+    first, second = (studio(noisy(1.0), seed=s).photograph(BALL, "A0") for s in (1, 2))
+    np.testing.assert_array_equal(first.depth_exact_mm, second.depth_exact_mm)
+    for index in first.frames:
+        share = (first.frames[index] != second.frames[index]).mean()
+        assert share > 0.3
+
+
+def test_lens_distortion_of_the_camera_moves_the_picture_and_is_taken_out_again():
+    bent = replace(RIG, camera=replace(RIG.camera, distortion=(-0.2, 0.05, 0.001, -0.001, 0.0)))
+    mesh = solid(trimesh.creation.box((0.05, 0.25, 0.25)))
+    row = Studio(BuildSettings(rig=bent, objects=("mug",), light=noisy(0.5))).photograph(mesh, "A0")
+    inside = (edge_distance_px(row.depth_exact_mm) >= 4) & object_mask(row.depth_mm)
+    np.testing.assert_allclose(row.depth_exact_mm[inside], 1775, atol=1e-3)
+    assert np.abs(row.depth_mm[inside] - 1775).mean() < 0.2
+
+
+def test_traced_object_is_only_asked_for_shadows_when_wanted(monkeypatch):
+    def never(*_):
+        raise AssertionError("a shadow ray was traced")
+
+    monkeypatch.setattr(TracedObject, "shadowed", never)
+    studio().photograph(solid(trimesh.creation.icosphere(2, 0.1)), "A0")
+    with pytest.raises(AssertionError, match="shadow ray"):
+        studio(SHADOWS).photograph(solid(trimesh.creation.icosphere(2, 0.1)), "A0")
+
+
+# ---- stages
+
+
+GROOVE = sheet(([0, 0, -0.1], [-0.1, 0.1, 0], [0, 0, 0.2]), ([0, 0, -0.1], [-0.1, -0.1, 0], [0, 0, 0.2]))
+"""Two squares at a right angle that opens to the camera in view A0."""
+
+
+def flagged(row, flag):
+    return (row.flags & flag) > 0
+
+
+def test_what_faces_away_from_the_projector_is_unlit():
+    """The side of a box that the camera sees, and the projector, further to the left, does or does not."""
+    tall = solid(trimesh.creation.box((0.1, 0.1, 0.2)).apply_translation([0.0, -0.17, 0.0]))
+    row = studio().photograph(tall, "A0")
+    exact, points = row.depth_exact_mm, np.stack([X, Y, np.ones_like(X)], axis=-1)
+    # By hand: the front is at 1.75 m, the side seen at x = 0.12 m; the projector is at x = -0.125 m, left of both.
+    place = points * exact[..., None] / 1000
+    side = (exact > 0) & (np.abs(place[..., 0] - 0.12) < 1e-6) & (exact > 1750.5)
+    front = (exact > 0) & (np.abs(exact - 1750) < 1e-3)
+    assert side.sum() > 50 and front.sum() > 500
+    assert not flagged(row, Flag.UNLIT)[side | front].any()  # the projector sees both from the left
+    right = solid(trimesh.creation.box((0.1, 0.1, 0.2)).apply_translation([0.0, 0.12, 0.0]))
+    row = studio().photograph(right, "A0")
+    exact = row.depth_exact_mm
+    place = points * exact[..., None] / 1000
+    # Its side at x = -0.07 m faces the camera's axis and turns its back on the light.
+    side = (exact > 0) & (np.abs(place[..., 0] + 0.07) < 1e-6) & (exact > 1750.5)
+    front = (exact > 0) & (np.abs(exact - 1750) < 1e-3)
+    assert side.sum() > 20 and front.sum() > 500
+    np.testing.assert_array_equal(flagged(row, Flag.UNLIT), side)
+    assert (row.frames[RIG.sequence.white][side] == 6).all()  # ambient light
+
+
+def test_shadow_is_unlit_where_it_is_asked_for():
+    wall, post = trimesh.creation.box((0.02, 0.3, 0.3)), trimesh.creation.box((0.02, 0.06, 0.06))
+    mesh = solid(trimesh.util.concatenate([wall.apply_translation([0.1, 0, 0]), post.apply_translation([-0.1, 0, 0])]))
+    assert not flagged(studio().photograph(mesh, "A0"), Flag.UNLIT).any()
+    shaded = studio(SHADOWS).photograph(mesh, "A0")
+    assert flagged(shaded, Flag.UNLIT).sum() > 60
+
+
+def test_groove_is_flagged_where_light_comes_from_the_other_side():
+    """Bounces over direct light, in the groove: more than a quarter at its bottom, less at its rim, by Lambert's
+    formula a point x of the way up an endless right-angled side gets (1 - x / sqrt(1 + x^2)) / 2 of the other."""
+    row = studio(PAPER).photograph(GROOVE, "A0")
+    seen, strong = row.depth_exact_mm > 0, flagged(row, Flag.INTERREFLECTION)
+    inside = seen & (np.abs(Y) < 0.02)
+    bottom, rim = inside & (np.abs(X) < 0.01), inside & (np.abs(X) > 0.045)
+    assert bottom.sum() > 50 and rim.sum() > 50
+    assert strong[bottom].all() and not strong[rim].any()
+    plain = studio(DIRECT).photograph(GROOVE, "A0")
+    assert not flagged(plain, Flag.INTERREFLECTION).any()
+
+
+def test_saturation_is_flagged_where_white_is_at_the_end_of_the_range():
+    bright = DIRECT.changed("camera", exposure=2.2, black_grey=5.0)
+    row = studio(bright).photograph(BALL, "A0")
+    seen, white = row.depth_exact_mm > 0, row.frames[RIG.sequence.white]
+    saturated = flagged(row, Flag.SATURATED)
+    assert 100 < saturated.sum() < seen.sum()
+    assert (white[saturated] == 255).all() and (white[seen & ~saturated] <= 255).all()
+    assert (white[seen & ~saturated] == 255).sum() < 0.05 * saturated.sum()  # 254.5 is rounded to 255
+    assert not flagged(studio().photograph(BALL, "A0"), Flag.SATURATED).any()
+
+
+def test_mixed_pixels_are_the_outline_of_a_ball():
+    ball, at = solid(trimesh.creation.icosphere(5, 0.12)), studio(PAPER)
+    row = at.photograph(ball, "A0")
+    seen, mixed = row.depth_exact_mm > 0, flagged(row, Flag.MIXED)
+    near_edge = edge_distance_px(row.depth_exact_mm) <= 2
+    assert mixed.sum() > 100 and not mixed[seen & ~near_edge].any()
+    assert (row.cover[~mixed] == 255).all()
+    # The covered area, rays counted, is that of the outline: of the cone that holds the ball.
+    covered, found = seen.astype(float), at.trace(ball, "A0").mixed
+    covered.ravel()[found.pixels] = found.on_object.reshape(-1, 4).mean(axis=1)
+    sine = 0.12 / 1.8
+    assert covered.sum() == pytest.approx(np.pi * (RIG.camera.fx * sine) ** 2 / (1 - sine**2), rel=5e-3)
+    # Cover counts the rays on the surface of the central one: fewer where the ball curves away within the pixel.
+    assert (row.cover[seen] <= np.rint(255 * covered[seen])).all()
+    np.testing.assert_array_equal(row.cover[~seen], np.rint(255 * (1 - covered[~seen])))
+
+
+def test_bounces_add_light_and_nothing_else():
+    """With all bounces off a view is direct light and the ambient: the closed form, pixel by pixel."""
+    row = studio(DIRECT).photograph(BALL, "A0")
+    white, black, exact = row.frames[51].astype(float), row.frames[50], row.depth_exact_mm / 1000
+    points = np.stack([X, Y, np.ones_like(X)], axis=-1) * exact[..., None]
+    inside = (edge_distance_px(row.depth_exact_mm) > 4) & (exact > 0)
+    mesh_normals = (points - [0, 0, 1.8]) / 0.12
+    to = CENTRE - points
+    distance = np.linalg.norm(to, axis=-1)
+    expected = 6 + 180 * (1.5 / distance) ** 2 * np.clip((mesh_normals * to).sum(axis=-1) / distance, 0, None)
+    assert np.abs(white - expected)[inside].max() < 15  # the ball has facets of 9 degrees
+    assert np.abs((white - expected)[inside].mean()) < 0.5
+    assert (black[inside] == 6).all()
+    more = studio(DIRECT.changed("bounces", interreflection=True)).photograph(BALL, "A0")
+    assert (more.frames[51].astype(float) - white >= 0).all()
+    assert (more.frames[51] == white)[row.depth_exact_mm == 0].all()
+
+
+def test_ambient_occlusion_is_the_open_share_of_the_groove():
+    """In the dark: ambient light times what the other side leaves open of a place's hemisphere."""
+    light = DIRECT.changed("bounces", ambient_occlusion=True).changed(ambient_grey=200.0)
+    row = studio(light, rig=SMALL).photograph(GROOVE, "A0")
+    dark = row.frames[SMALL.sequence.black].astype(float)
+    inside = (row.depth_exact_mm > 0) & (np.abs(Y) < 0.01) & (edge_distance_px(row.depth_exact_mm) > 3)
+    x = np.abs(X * row.depth_exact_mm / 1000)[inside] * np.sqrt(2)  # up the side, of 0.1414 m
+    side = np.hypot(0.1, 0.1)
+    # Endless groove, then its length of 0.2 m: the middle sees arctangents of it (Lambert's contour, two terms of it).
+    half = 0.1
+    reach = np.hypot(x, side)
+    share = (np.arctan(half / x) - x / reach * np.arctan(half / reach)) / np.pi
+    expected = 200 * (1 - share)
+    assert (
+        np.abs(dark[inside] - expected).max() < 10
+    )  # 5% at a single place: noise of 128 rays, and the width of a surfel
+    assert np.abs((dark[inside] - expected).mean()) < 1.5
+    assert dark[inside].min() < 120 and dark[inside].max() > 170
+
+
+def test_stages_that_are_off_are_not_asked(monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a stage that is off was asked")
+
+    for module, name in ((lighting.Surfels, "of"), (lighting.PlaneLight, "of")):
+        monkeypatch.setattr(module, name, never)
+    for name in ("mixed_pixels", "blur_image", "vignetting"):
+        monkeypatch.setattr(view, name, never)
+    studio(rig=SMALL).photograph(BALL, "A0")
+    for light in (DIRECT.changed("bounces", interreflection=True), DIRECT.changed("bounces", ambient_occlusion=True),
+                  DIRECT.changed("camera", rays_across=2), DIRECT.changed("camera", blur_px=1.0),
+                  DIRECT.changed("camera", falloff=2)):  # fmt: skip
+        with pytest.raises(AssertionError, match="a stage that is off"):
+            studio(light, rig=SMALL).photograph(BALL, "A0")
+
+
+@pytest.mark.parametrize("stored", ["single_shot", "all"])
+@pytest.mark.parametrize("name", ["paper", "workshop", "hard", "moving"])
+def test_skipping_changes_no_byte(name, stored):
+    """Frames that are stored, ground truth and flags; twice, so that nothing of another view is left in the memory."""
+    light = PAPER.changed(motion_mm=3.0) if name == "moving" else named_light(name)
+    light = light.changed("projector", defocus_px=0.5) if name == "hard" else light
+    rows = {}
+    for enabled in (True, False):
+        with skipping(enabled):
+            at = studio(light, rig=SMALL, stored=stored)
+            at.photograph(GROOVE, "A60")
+            row = at.photograph(BALL, "A0")
+            rows[enabled] = row, kept(row)
+    (one, frames), (other, other_frames) = rows[True], rows[False]
+    assert frames.keys() == other_frames.keys()
+    for index in frames:
+        np.testing.assert_array_equal(frames[index], other_frames[index])
+    np.testing.assert_array_equal(one.depth_mm, other.depth_mm)
+    np.testing.assert_array_equal(one.flags, other.flags)
+    np.testing.assert_array_equal(one.cover, other.cover)
+    assert one.measured == other.measured
+
+
+def test_exposure_is_drawn_for_each_view_evenly_by_its_logarithm():
+    light = DIRECT.changed("camera", exposure=(0.3, 1.8))
+    at = studio(light, rig=SMALL)
+    draws = [float(at._brightness((seed, "mug", "A0"))) for seed in range(2000)]
+    assert min(draws) >= 0.3 and max(draws) <= 1.8
+    from scipy import stats
+
+    assert stats.kstest(np.log(draws), stats.uniform(np.log(0.3), np.log(6.0)).cdf).pvalue > 1e-3
+    # The same for any order of views, and it is what the frames are multiplied with.
+    first = [at.photograph(BALL, v).frames[21].astype(float).copy() for v in ("A0", "A60")]
+    again = [at.photograph(BALL, v).frames[21].astype(float).copy() for v in ("A60", "A0")]
+    np.testing.assert_array_equal(first[0], again[1])
+    np.testing.assert_array_equal(first[1], again[0])
+    plain = studio(rig=SMALL).photograph(BALL, "A0").frames[21].astype(float)
+    factor = float(at._brightness((42, "thing", "A0")))
+    assert np.abs(first[0] - np.minimum(plain * factor, 255)).max() <= 0.5 + 0.5 * factor + 0.01
+
+
+def test_calibration_error_moves_the_pattern_and_not_the_depth():
+    plain, off = studio(rig=SMALL), studio(DIRECT.changed(calibration_px=2.0), rig=SMALL)
+    row, other = plain.photograph(BALL, "A0"), off.photograph(BALL, "A0")
+    np.testing.assert_array_equal(row.depth_exact_mm, other.depth_exact_mm)
+    both = object_mask(row.depth_mm) & object_mask(other.depth_mm)
+    error = (other.depth_mm - row.depth_exact_mm)[both]
+    # 1 px of disparity is Z^2 / (f b) = 14 mm; two directions, and some of the error is a shift along epipolar lines.
+    assert 1 < np.abs(error).mean() < 40
+    assert plain.rig == SMALL and off.settings.rig == SMALL and off.rig != SMALL
+
+
+def test_the_object_moves_from_frame_to_frame():
+    """By the same step each frame, as long as asked for; the exact depth is that of the first."""
+    step_mm = 4.0
+    at = studio(DIRECT.changed(motion_mm=step_mm), rig=SMALL)
+    row = at.photograph(BALL, "A0")
+    still = studio(rig=SMALL).photograph(BALL, "A0")
+    np.testing.assert_array_equal(row.depth_exact_mm, still.depth_exact_mm)
+    np.testing.assert_array_equal(row.frames[0], kept(studio(rig=SMALL).photograph(BALL, "A0"))[0])
+    # Traced as the view traces it: the step between the frames' scenes.
+    traces = []
+    original = Studio.trace
+
+    def noted(self, mesh, view, moved_m=None):
+        traces.append(np.zeros(3) if moved_m is None else moved_m)
+        return original(self, mesh, view, moved_m)
+
+    at.trace = noted.__get__(at)
+    white = row.frames[21].astype(float).copy()
+    at.photograph(BALL, "A0")
+    moves = np.array(traces[1:])  # the first is the view's own
+    np.testing.assert_allclose(np.linalg.norm(np.diff(moves, axis=0), axis=1), step_mm / 1000, rtol=1e-6)
+    assert len(moves) == len(SMALL.sequence)
+    moved = original(at, BALL, "A0", moves[21])
+    lit = np.zeros(X.size, bool)
+    lit[moved.hits.pixels] = True
+    edge = white > 60
+    assert (edge.ravel() == lit).mean() > 0.98
