@@ -75,7 +75,7 @@ def make_dataset(
                         {},
                         np.zeros(depth.shape, np.uint8),
                         np.full(depth.shape, 255, np.uint8),
-                    )  # fmt: skip
+                    )
                 )
             written, described = writer.write(plan, rows)
             shards += written

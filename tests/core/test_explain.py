@@ -75,7 +75,7 @@ def test_build_and_its_account(tmp_path, capsys):
 def test_a_dataset_of_an_earlier_version_is_refused_in_words(tiny):
     manifest = DatasetFolder(tiny).manifest
     rows = {
-        split: [{key: value for key, value in row.items() if key != "shadow_rays"} for row in part]
+        split: [{key: value for key, value in row.items() if key != "mixed_rays"} for row in part]
         for split, part in manifest.samples.items()
     }
     earlier = replace(manifest, samples=rows, generator={"name": "fpp-ml-bench", "version": "0.1.0"})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rendering import PAPER, RIG, studio
 
-from fpp_ml_bench.constants import OBJECTS, VIEW_DEGREES
+from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEW_DEGREES
 from fpp_ml_bench.loaders.render.light import SurfaceLight
 from fpp_ml_bench.loaders.render.lighting import Lighting
 from fpp_ml_bench.loaders.render.projector import PatternLight
@@ -25,7 +25,7 @@ def mesh(name):
 
 def test_every_object_named_is_one_of_the_benchmarks_and_has_one_kind():
     names = [name for kind in KINDS.values() for name in kind]
-    assert len(names) == len(set(names)) and set(names) <= set(OBJECTS)
+    assert len(names) == len(set(names)) and set(names) <= {*OBJECTS, *UNSEEN}
     assert set(KINDS) | {"stains"} == set(MAPS)
 
 
@@ -93,7 +93,7 @@ def test_a_map_sticks_to_its_object_in_every_view():
             offset = np.array([0.0, 0.0, away_m])
             traced = TracedObject(own, turned(own.vertices_m, degrees) + offset)
             lit = lighting.upon(own, traced, degrees, offset).at(
-                turned(place, degrees) + offset, turned(normal, degrees)
+                turned(place, degrees) + offset, turned(normal, degrees), np.zeros(len(place), dtype=np.int64)
             )
             # Ambient light is not shaped by place or direction: it is the albedo's.
             off = np.abs(lit.ambient - light.ambient_grey * expected / light.surface.albedo) > 1e-4

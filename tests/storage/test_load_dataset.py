@@ -38,7 +38,8 @@ def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, ope
     dataset = load_dataset(tiny, config, split="validation")
     frames = [f"frame_{i:02d}" for i in PAPER_SEQUENCE.config(config)]
     assert dataset.column_names == [
-        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "flags", "cover", "depth_min", "depth_max",
+        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "flags", "cover",
+        "depth_min", "depth_max",
     ]  # fmt: skip
     assert len(dataset) == 6 and dataset.split == "validation"
     assert dataset["sample"][:] == opened.splits["validation"]
