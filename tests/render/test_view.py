@@ -345,7 +345,8 @@ def test_stages_that_are_off_are_not_asked(monkeypatch):
 @pytest.mark.parametrize("name", ["paper", "workshop", "hard", "moving"])
 def test_skipping_changes_no_byte(name, stored):
     """Frames that are stored, ground truth and flags; twice, so that nothing of another view is left in the memory."""
-    light = PAPER.changed(motion_mm=3.0) if name == "moving" else named_light(name)
+    mixing = DIRECT.changed("camera", rays_across=2)
+    light = mixing.changed(motion_mm=3.0) if name == "moving" else named_light(name)
     light = light.changed("projector", defocus_px=0.5) if name == "hard" else light
     rows = {}
     for enabled in (True, False):
