@@ -147,9 +147,8 @@ def test_names_are_told_apart_where_they_are_joined():
     assert len(keys) == 312
 
 
-@pytest.mark.parametrize("seed", [0, 2**40])
-def test_hash_is_a_bijection_of_the_pixel_number(seed):
-    keys = stream_keys(seed, "anything")
+def test_hash_is_a_bijection_of_the_pixel_number():
+    keys = stream_keys(2**40, "anything")
     sample = np.concatenate([PIXELS, np.arange(2**32 - 500_000, 2**32, dtype=np.uint32)])
     hashes = hash_pixels(sample, keys)
     assert np.unique(hashes).size == sample.size

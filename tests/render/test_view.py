@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from rendering import CENTRE, DIRECT, PAPER, RIG, X, Y, kept, sheet, solid, studio
+from scipy import stats
 
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import edge_distance_px, object_mask
@@ -370,8 +371,6 @@ def test_exposure_is_drawn_for_each_view_evenly_by_its_logarithm():
     at = studio(light, rig=SMALL)
     draws = [float(at._brightness((seed, "mug", "A0"))) for seed in range(2000)]
     assert min(draws) >= 0.3 and max(draws) <= 1.8
-    from scipy import stats
-
     assert stats.kstest(np.log(draws), stats.uniform(np.log(0.3), np.log(6.0)).cdf).pvalue > 1e-3
     # The same for any order of views, and it is what the frames are multiplied with.
     first = [at.photograph(BALL, v).frames[21].astype(float).copy() for v in ("A0", "A60")]
