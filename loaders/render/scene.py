@@ -152,8 +152,9 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
         shift_m = [sum(small[i, k] * rig.t[k] for k in range(3)) for i in range(3)]
         shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
         projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
-        rows = tuple(tuple(float(value) for value in row) for row in rotation)
-        other = replace(rig, projector=projector, rotation=rows, translation_m=tuple(map(float, shift_m)))
+        rows = tuple((float(a), float(b), float(c)) for a, b, c in rotation)
+        tx, ty, tz = map(float, shift_m)
+        other = replace(rig, projector=projector, rotation=rows, translation_m=(tx, ty, tz))
         u, v = other.project(points)
         squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
         scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))

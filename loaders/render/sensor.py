@@ -130,7 +130,8 @@ class Exposure:
         ``frames``, written into ``out`` if given.
         """
         result = np.empty((len(frames), pixels.size), dtype=np.uint8) if out is None else out
-        expose_kernel(result, *self._light(frames, lit, stream), pixels, *self._sensor(frames, stream))
+        inputs = (*self._light(frames, lit, stream), pixels, *self._sensor(frames, stream))
+        expose_kernel(result, *inputs)
         return result
 
     def radiance(

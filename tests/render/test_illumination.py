@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rendering import ALL_PIXELS, CENTRE, DIRECT, RIG, TOWARD_CAMERA, X, Y, plane
 
-from fpp_ml_bench.loaders.render.illumination import in_pattern, light_surface, projector_centre_m
+from fpp_ml_bench.loaders.render.illumination import Material, in_pattern, light_surface, projector_centre_m
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
 
@@ -90,8 +90,6 @@ def test_gloss_is_where_the_mirror_direction_is():
     points, normals = plane(1.8)
     matte = lit_by(DIRECT, points, normals).gain
     light = DIRECT.changed("surface", gloss=0.3, roughness=0.25)
-    from fpp_ml_bench.loaders.render.illumination import Material
-
     glossy = light_surface(points, normals, RIG, light, PATTERN, Material(0.8, 0.3)).gain
     lit = matte > 0
     ratio = glossy[lit] / matte[lit]

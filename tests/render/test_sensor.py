@@ -70,7 +70,7 @@ def test_distribution_is_normal(frames, name):
 
 
 def test_a_wrong_distribution_would_be_noticed():
-    uniform_sum = np.random.default_rng(1).random((4, PIXELS.size)).sum(axis=0)
+    uniform_sum = np.random.default_rng(1).random((4, 200_000)).sum(axis=0)
     poor = (uniform_sum - 2) * np.sqrt(3)  # the sum of four uniforms, scaled: a popular cheap normal
     assert stats.kstest(poor, "norm").pvalue < 1e-6
 
@@ -147,18 +147,16 @@ def test_names_are_told_apart_where_they_are_joined():
     assert len(keys) == 312
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2**40])
-def test_hash_is_a_bijection_of_the_pixel_number(seed):
-    keys = stream_keys(seed, "anything")
+def test_hash_is_a_bijection_of_the_pixel_number():
+    keys = stream_keys(2**40, "anything")
     sample = np.concatenate([PIXELS, np.arange(2**32 - 500_000, 2**32, dtype=np.uint32)])
     hashes = hash_pixels(sample, keys)
     assert np.unique(hashes).size == sample.size
     # Each of the 32 bits is set for half of the pixels, and a changed input bit flips each output bit half of the time.
-    for bit in range(32):
-        share = float(((hashes >> np.uint32(bit)) & 1).mean())
-        assert share == pytest.approx(0.5, abs=0.004)
+    shares = np.unpackbits(hashes[:, None].view(np.uint8), axis=1).mean(axis=0)
+    np.testing.assert_allclose(shares, np.full(32, 0.5), atol=0.004)
     for bit in (0, 7, 19):
-        flipped = hashes[: PIXELS.size] ^ hash_pixels(PIXELS ^ np.uint32(1 << bit), keys)
+        flipped = hashes[: 1 << 17] ^ hash_pixels(PIXELS[: 1 << 17] ^ np.uint32(1 << bit), keys)
         shares = [float(((flipped >> np.uint32(k)) & 1).mean()) for k in range(24)]
         assert min(shares) > 0.4 and max(shares) < 0.6
 

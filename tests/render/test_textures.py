@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from rendering import PAPER, RIG, studio
+import trimesh
+from rendering import PAPER, RIG, solid, studio
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEW_DEGREES
 from fpp_ml_bench.loaders.render.light import SurfaceLight
@@ -107,9 +108,7 @@ def test_unturned_undoes_turned():
 
 
 def test_contrast_zero_changes_no_byte_of_a_view():
-    from fpp_ml_bench.loaders.render.meshes import solid_mesh
-
-    mug = solid_mesh("mug")
+    mug = solid(trimesh.creation.icosphere(3, 0.1), "mug")  # a mug has checks
     plain = studio(PAPER, stored="single_shot").photograph(mug, "A60")
     first = plain.frames[0].copy(), plain.depth_mm
     printed = studio(PAPER.changed("surface", textures="by_kind", contrast=0.0), stored="single_shot")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from rendering import CENTRE, DIRECT, PAPER, RIG, X, Y, kept, sheet, solid, studio
+from scipy import stats
 
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import edge_distance_px, object_mask
@@ -347,7 +348,8 @@ def test_stages_that_are_off_are_not_asked(monkeypatch):
 @pytest.mark.parametrize("name", ["paper", "workshop", "hard", "moving"])
 def test_skipping_changes_no_byte(name, stored):
     """Frames that are stored, ground truth and flags; twice, so that nothing of another view is left in the memory."""
-    light = PAPER.changed(motion_mm=3.0) if name == "moving" else named_light(name)
+    mixing = DIRECT.changed("camera", rays_across=2)
+    light = mixing.changed(motion_mm=3.0) if name == "moving" else named_light(name)
     light = light.changed("projector", defocus_px=0.5) if name == "hard" else light
     rows = {}
     for enabled in (True, False):
@@ -371,8 +373,6 @@ def test_exposure_is_drawn_for_each_view_evenly_by_its_logarithm():
     at = studio(light, rig=SMALL)
     draws = [float(at._brightness((seed, "mug", "A0"))) for seed in range(2000)]
     assert min(draws) >= 0.3 and max(draws) <= 1.8
-    from scipy import stats
-
     assert stats.kstest(np.log(draws), stats.uniform(np.log(0.3), np.log(6.0)).cdf).pvalue > 1e-3
     # The same for any order of views, and it is what the frames are multiplied with.
     first = [at.photograph(BALL, v).frames[21].astype(float).copy() for v in ("A0", "A60")]
