@@ -156,7 +156,8 @@ def interpolate(  # type: ignore[no-untyped-def]
     """Weighted means of the surfels within a cell's width of each point: fills ``out`` (F, n).
 
     The weight is the surfel's area, times (1 - d^2)^2 at a distance of d cells, in which the part along the normal
-    counts four times, times the fourth power of the cosine between the normals: it fades to nothing, so the mean is continuous. Without a surfel in reach the nearest counts.
+    counts four times, times the fourth power of the cosine between the normals: it fades to nothing, so the mean is
+    continuous. Without a surfel in reach the nearest counts.
     """
     nearby, weights = np.empty(_MOST, np.int64), np.empty(_MOST)
     sums = np.empty((_TOGETHER, values.shape[1]))
