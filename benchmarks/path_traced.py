@@ -13,8 +13,8 @@ how far they differ. A mean grey level is that of the image in question.
 - direct: RMS difference within 1% of the mean grey level; matte, and glossy (on ``GLOSSY``)
 - with all bounces: within 3%, and the seeds within 1%
 - phase error: phase with all bounces minus phase of direct light, each renderer's own, where bounced light is at least
-  5% of the direct light and direct light at least 5% of its mean. Two figures, relative to Mitsuba's RMS: how far the two
-  RMS are apart, and the RMS of the difference pixel by pixel. Each within 20%, or within a milliradian.
+  5% of the direct light and direct light at least 5% of its mean. Two figures, relative to Mitsuba's RMS: how far the
+  two RMS are apart, and the RMS of the difference pixel by pixel. Each within 20%, or within a milliradian.
 
 Seconds are of one core. Exit status 1 if an agreement is missed. Needs ``pip install 'fpp-ml-bench[pathtrace]'``.
 """
@@ -337,7 +337,7 @@ def picture(name: str, own: Images, other: Images, inside: NDArray, file: Path) 
         axis.set_title(title, fontsize=9)
         axis.axis("off")
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=80)
+    figure.savefig(file, dpi=60)
     plt.close(figure)
 
 
