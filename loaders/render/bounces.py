@@ -16,7 +16,7 @@ from fpp_ml_bench.loaders.render.illumination import projector_centre_m, shine
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.scene import turned
-from fpp_ml_bench.loaders.render.surfels import RAYS, SurfelGrid, Surfels
+from fpp_ml_bench.loaders.render.surfels import OFF_PLANE, RAYS, SIDES, SLABS, SurfelGrid, Surfels
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics import Rig
 
@@ -26,6 +26,7 @@ MOST_BOUNCES = 64
 PLANE_CELLS, PLANE_POINTS = 24, 6
 """Cells along the longer side of the plane's lit part, and points across a cell."""
 _TOGETHER = 64
+_MOST = 27 * SIDES * SLABS
 
 
 @dataclass(frozen=True)
@@ -154,10 +155,11 @@ def interpolate(  # type: ignore[no-untyped-def]
 ):
     """Weighted means of the surfels within a cell's width of each point: fills ``out`` (F, n).
 
-    The weight is the surfel's area, times (1 - d^2)^2 at a distance of d cells, times the fourth power of the cosine
-    between the normals: it fades to nothing, so the mean is continuous. Without a surfel in reach the nearest counts.
+    The weight is the surfel's area, times (1 - d^2)^2 at a distance of d cells, in which the part along the normal
+    counts four times, times the fourth power of the cosine between the normals: it fades to nothing, so the mean is
+    continuous. Without a surfel in reach the nearest counts.
     """
-    nearby, weights = np.empty(27 * 6, np.int64), np.empty(27 * 6)
+    nearby, weights = np.empty(_MOST, np.int64), np.empty(_MOST)
     sums = np.empty((_TOGETHER, values.shape[1]))
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -168,15 +170,13 @@ def interpolate(  # type: ignore[no-untyped-def]
         for jx in range(max(cx - 1, 0), min(cx + 2, table.shape[0])):
             for jy in range(max(cy - 1, 0), min(cy + 2, table.shape[1])):
                 for jz in range(max(cz - 1, 0), min(cz + 2, table.shape[2])):
-                    for side in range(table.shape[3]):
-                        k = table[jx, jy, jz, side]
-                        if k < 0:
-                            continue
+                    for k in range(table[jx, jy, jz, 0], table[jx, jy, jz, 1]):
                         cosine = normal[k, 0] * nx + normal[k, 1] * ny + normal[k, 2] * nz
                         if cosine <= 0.0:
                             continue
                         ex, ey, ez = position[k, 0] - x, position[k, 1] - y, position[k, 2] - z
-                        apart = (ex * ex + ey * ey + ez * ez) / (cell * cell)
+                        off = ex * nx + ey * ny + ez * nz
+                        apart = (ex * ex + ey * ey + ez * ez + OFF_PLANE * off * off) / (cell * cell)
                         if apart < least:
                             nearest, least = k, apart
                         if apart < 1.0:

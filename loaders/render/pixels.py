@@ -1,7 +1,7 @@
 """The camera's optics: pixels with an area, the blur of its lens, vignetting.
 
 A pixel's light is the mean of what the rays across it see. More than the central ray is traced only for pixels that mix
-surfaces: the object and what is behind it, parts at different depths, or sides of an edge.
+surfaces: the object and what is behind it, parts at different depths, sides of an edge, or light and shadow.
 """
 
 from dataclasses import dataclass
@@ -40,8 +40,11 @@ class MixedPixels:
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> MixedPixels:
-    """The pixels of a view that mix surfaces, seen with ``across`` x ``across`` rays each; ``hits`` of the central."""
+def mixed_pixels(
+    traced: TracedObject, hits: Hits, rig: Rig, across: int, lit: NDArray[np.bool_] | None = None
+) -> MixedPixels:
+    """The pixels of a view that mix surfaces, seen with ``across`` x ``across`` rays each; ``hits`` of the central.
+    ``lit`` bool, one a hit: adds the pixels on both sides of where it changes, borders of shadows."""
     camera = rig.camera
     width, count = camera.width, camera.width * camera.height
     fine = PixelRays.of(camera.scaled(width * across))
@@ -75,6 +78,8 @@ def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> Mix
     void = np.where(central >= 0, of_surface < total, on_object > 0)
     needs = void.copy()
     needs[parent[same & edge]] = True
+    if lit is not None:
+        needs |= _at_borders(hits, lit, camera)
     pixels = np.flatnonzero(needs)
     number = np.full(count, -1, dtype=np.int64)
     number[pixels] = np.arange(pixels.size)
@@ -92,6 +97,18 @@ def mixed_pixels(traced: TracedObject, hits: Hits, rig: Rig, across: int) -> Mix
     triangle[hit] = sub.triangle[of[hit]]
     share = np.where(central >= 0, of_surface, total - on_object)[pixels] / total
     return MixedPixels(pixels, direction * depth_m[:, None], normals, triangle, void[pixels], share)
+
+
+def _at_borders(hits: Hits, lit: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
+    """Hit pixels beside one, across or along, that is lit where they are not, or the reverse; bool (H W,)."""
+    state = np.zeros((camera.height, camera.width), dtype=np.int8)
+    state.ravel()[hits.pixels] = np.where(lit, 1, -1)
+    border = np.zeros(state.shape, dtype=bool)
+    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        changes = state[one] * state[other] < 0
+        border[one] |= changes
+        border[other] |= changes
+    return border.ravel()
 
 
 def _fine_pixels(pixels: NDArray[np.int64], width: int, across: int) -> NDArray[np.int64]:

@@ -1,6 +1,7 @@
 """Small surface elements of an object, and which of them see which: the geometry of light between its parts.
 
-A surfel is the surface inside one cell of a grid, with the normals of one of six directions. Form factors are the
+A surfel is the surface inside one cell of a grid, with the normals of one of six directions, and inside one of the
+cell's slabs across that direction, so that the steps of a surface are apart. Form factors are the
 shares of cosine-weighted rays from surfel i that meet surfel j (Cohen and Wallace 1993, Radiosity and Realistic Image
 Synthesis, chapter 4). All of it is in object coordinates, once an object, for all of its views. The rays' directions
 are a fixed sequence, so the same object gives the same bits.
@@ -16,17 +17,19 @@ from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-POINTS = 1 << 14
-"""Points on the surface that carry the projector's light into the surfels: about ten of each."""
-SURFELS = 1500
-"""Aimed at; an object has about this many."""
-RAYS = 128
-"""From each surfel. Their noise is smaller than 3% of the light from other parts, which is up to a third of all."""
+POINTS = 1 << 15
+"""Points on the surface that carry the projector's light into the surfels: several of each."""
+SURFELS = 3000
+"""Aimed at on flat ground; an object has up to three times as many, by its slopes and steps."""
+RAYS = 64
+"""From each surfel. A point's light comes from several surfels, so their noise is small (docs/light.md)."""
 _SECOND, _THIRD = 0.7548776662466927, 0.5698402909980532
 """Steps of the plane-filling sequence R2 (Roberts 2018): the inverse of the plastic number, and its square."""
 _GOLDEN = 0.6180339887498949
 _OFFSET_M = 1e-5
-SIDES = 6
+OFF_PLANE = 15.0
+"""Distance along the normal counts four times: a surfel on another step is not beside the point."""
+SIDES, SLABS = 6, 4
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,9 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class SurfelGrid:
-    """Finds surfels by place and normal: ``table`` int32 (X, Y, Z, 6), -1 where there is none, cells of ``cell_m``
-    from ``corner_m`` (3,) on; of each surfel the mean ``position_m`` and ``normal`` (K, 3), and its ``area_m2``."""
+    """Finds surfels by place: ``table`` int32 (X, Y, Z, 2), the first of each cell's and the one after its last; cells
+    of ``cell_m`` from ``corner_m`` (3,) on; of each surfel the mean ``position_m`` and ``normal`` (K, 3), and its
+    ``area_m2``."""
 
     corner_m: NDArray[np.float64]
     cell_m: float
@@ -146,7 +150,9 @@ def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tup
     cell = np.floor((position - corner) / cell_m).astype(np.int64)
     steepest = np.abs(facing).argmax(axis=1)
     side = 2 * steepest + (facing[number, steepest] < 0)
-    key = np.ravel_multi_index((*cell.T, side), (*shape, SIDES))
+    across = ((position - corner) / cell_m)[number, steepest]
+    slab = np.floor((across - np.floor(across)) * SLABS).astype(np.int64)
+    key = np.ravel_multi_index((*cell.T, side, slab), (*shape, SIDES, SLABS))
     order = np.argsort(key, kind="stable")
     keys, starts = np.unique(key[order], return_index=True)
     points = SurfacePoints(
@@ -154,8 +160,9 @@ def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tup
     )
     mean_normal = points.mean(points.normal)
     mean_normal /= np.sqrt((mean_normal * mean_normal).sum(axis=1))[:, None]
-    table = np.full((*shape, SIDES), -1, dtype=np.int32)
-    table.ravel()[keys] = np.arange(len(keys))
+    bounds = np.arange(np.prod(shape) + 1) * (SIDES * SLABS)
+    first = np.searchsorted(keys, bounds).astype(np.int32)
+    table = np.stack([first[:-1], first[1:]], axis=-1).reshape(*shape, 2)
     area = np.diff(points.starts) * (area_m2 / POINTS)
     return points, SurfelGrid(corner, cell_m, table, points.mean(points.position_m), mean_normal, area)
 
@@ -209,28 +216,18 @@ def assign_hits(  # type: ignore[no-untyped-def]
         length = turn * np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx / length, ny / length, nz / length
         cx, cy, cz = int((x - corner[0]) / cell), int((y - corner[1]) / cell), int((z - corner[2]) / cell)
-        side = 0
-        if abs(ny) > abs(nx) and abs(ny) >= abs(nz):
-            side = 2
-        elif abs(nz) > abs(nx) and abs(nz) > abs(ny):
-            side = 4
-        if (nx, ny, nz)[side // 2] < 0.0:
-            side += 1
-        target[i] = table[cx, cy, cz, side]
-        if target[i] >= 0:
-            continue
-        # No point fell into this cell: the nearest surfel around that faces the same way.
         best = np.inf
-        for jx in range(cx - 1, cx + 2):
-            for jy in range(cy - 1, cy + 2):
-                for jz in range(cz - 1, cz + 2):
-                    for js in range(SIDES):
-                        if not (0 <= jx < table.shape[0] and 0 <= jy < table.shape[1] and 0 <= jz < table.shape[2]):
-                            continue
-                        k = table[jx, jy, jz, js]
-                        if k < 0 or normal[k, 0] * nx + normal[k, 1] * ny + normal[k, 2] * nz < 0.3:
-                            continue
-                        ex, ey, ez = position[k, 0] - x, position[k, 1] - y, position[k, 2] - z
-                        apart = ex * ex + ey * ey + ez * ez
-                        if apart < best:
-                            best, target[i] = apart, k
+        for around in range(2):  # where no point fell into this cell, the cells about it
+            for jx in range(max(cx - around, 0), min(cx + around + 1, table.shape[0])):
+                for jy in range(max(cy - around, 0), min(cy + around + 1, table.shape[1])):
+                    for jz in range(max(cz - around, 0), min(cz + around + 1, table.shape[2])):
+                        for k in range(table[jx, jy, jz, 0], table[jx, jy, jz, 1]):
+                            if normal[k, 0] * nx + normal[k, 1] * ny + normal[k, 2] * nz < 0.3:
+                                continue
+                            ex, ey, ez = position[k, 0] - x, position[k, 1] - y, position[k, 2] - z
+                            off = ex * nx + ey * ny + ez * nz
+                            apart = ex * ex + ey * ey + ez * ez + OFF_PLANE * off * off
+                            if apart < best:
+                                best, target[i] = apart, k
+            if target[i] >= 0:
+                break

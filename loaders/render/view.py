@@ -97,7 +97,8 @@ class Studio:
         lit = object_light.at(points_m, hits.normals, hits.triangle)
         mixed = mixed_lit = None
         if light.camera.rays_across > 1:
-            mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across)
+            shaded = lit.gain > 0 if light.bounces.shadows else None
+            mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across, shaded)
             mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
         return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self._brightness(stream), stream)
 
