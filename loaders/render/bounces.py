@@ -92,7 +92,7 @@ def between_surfels(
     for _ in range(MOST_BOUNCES):
         gather_form_factors(surfels.starts, surfels.seen, surfels.share, leaving, arriving)
         total += arriving
-        if float(arriving.max(initial=0.0)) < SMALLEST:
+        if float(np.abs(arriving).max(initial=0.0)) < SMALLEST:
             break
         leaving = albedo[:, None] * arriving
     return total
@@ -147,6 +147,20 @@ def at_points(
         out,
     )  # fmt: skip
     return out
+
+
+@njit
+def mix_frames(modes, mix, factor, points, out):  # type: ignore[no-untyped-def]
+    """Frames from modes: fills ``out`` float32 (F, N) at ``points`` int64 (n,) with ``factor`` (n,) times the product
+    of ``mix`` (F, J) and ``modes`` (J, n), float32."""
+    for frame in range(mix.shape[0]):
+        target = out[frame]
+        for j in range(mix.shape[1]):
+            weight = mix[frame, j]
+            if weight != 0.0:
+                mode = modes[j]
+                for i in range(points.size):
+                    target[points[i]] += weight * mode[i] * factor[i]
 
 
 @njit

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels
+from fpp_ml_bench.loaders.render.bounces import PlaneLight, at_points, between_surfels, mix_frames
 from fpp_ml_bench.loaders.render.illumination import (
     LitPixels,
     Material,
@@ -34,7 +34,8 @@ class Lighting:
         self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background_m
         self._normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), self._points_m.shape)
         self._empty = self._plane()
-        self._returned = PlaneLight.of(rig, light, pattern) if light.bounces.interreflection else None
+        self.modes, self.mix = pattern.modes(rig.sequence)
+        self._returned = PlaneLight.of(rig, light, self.modes) if light.bounces.interreflection else None
         self._surfels: tuple[SolidMesh, Surfels] | None = None
 
     def _plane(self, occluder: TracedObject | None = None) -> LitPixels:
@@ -76,7 +77,8 @@ class Lighting:
 
 @dataclass(frozen=True)
 class ObjectLight:
-    """The light upon a placed object. ``bounced`` float64 (K, F): irradiance of its surfels by further bounces."""
+    """The light upon a placed object. ``bounced`` float64 (K, J): irradiance of its surfels by further bounces, in the
+    modes of the patterns."""
 
     lighting: Lighting
     mesh: SolidMesh
@@ -108,16 +110,17 @@ class ObjectLight:
             ambient = ambient.copy()
             ambient[own] *= arriving[0]
         if self.bounced is not None:
-            bounced = np.zeros((len(arriving) - 1, len(points_m)), dtype=np.float32)
-            bounced[:, own] = arriving[1:]
-            bounced *= np.asarray((1.0 - material.gloss) * material.albedo * grey_of_white(light), dtype=np.float32)
+            bounced = np.zeros((len(pattern.table), len(points_m)), dtype=np.float32)
+            matte = (1.0 - material.gloss) * material.albedo * grey_of_white(light)
+            factor = np.broadcast_to(np.asarray(matte, dtype=np.float32), len(points_m))[own]
+            mix_frames(arriving[1:], self.lighting.mix, factor, own, bounced)
         return replace(lit, ambient=ambient, bounced=bounced)
 
     def between_surfels(self, plane: PlaneLight) -> NDArray[np.float64]:
-        """Irradiance of the surfels by further bounces in every frame, of light that ``plane`` sends back too; float64
-        (K, F)."""
+        """Irradiance of the surfels by further bounces in every mode, of light that ``plane`` sends back too; float64
+        (K, J)."""
         assert self.surfels is not None
-        rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.pattern
+        rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.modes
         points = self.surfels.points
         placed = turned(points.position_m, self.degrees) + self.offset_m
         arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)

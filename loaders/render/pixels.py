@@ -45,58 +45,66 @@ def mixed_pixels(
 ) -> MixedPixels:
     """The pixels of a view that mix surfaces, seen with ``across`` x ``across`` rays each; ``hits`` of the central.
     ``lit`` bool, one a hit: adds the pixels on both sides of where it changes, borders of shadows."""
-    camera = rig.camera
+    camera, total = rig.camera, across * across
     width, count = camera.width, camera.width * camera.height
-    fine = PixelRays.of(camera.scaled(width * across))
-    sub = traced.primary(fine)
-    row, column = np.divmod(sub.pixels, width * across)
-    parent = row // across * width + column // across
-    inside = parent < count
-    if not inside.all():  # a camera whose height does not scale to a whole number of rays
-        row, column, parent = row[inside], column[inside], parent[inside]
-        sub = Hits(sub.pixels[inside], sub.depth_m[inside], sub.normals[inside], sub.triangle[inside])
+    ray_x, ray_y = (axis.ravel() for axis in camera.rays())
     central = np.full(count, -1, dtype=np.int64)
     central[hits.pixels] = np.arange(hits.pixels.size)
-    seen = central[parent]
-    x, y = fine.x.ravel()[sub.pixels], fine.y.ravel()[sub.pixels]
-    same = seen >= 0
-    at = np.where(same, seen, 0)
-    if hits.pixels.size:
-        normal = hits.normals[at]
-        ray_x, ray_y = (axis.ravel()[hits.pixels] for axis in camera.rays())
-        n = hits.normals
-        distance = hits.depth_m * (n[:, 0] * ray_x + n[:, 1] * ray_y + n[:, 2])
-        plane_m = distance[at] / (normal[:, 0] * x + normal[:, 1] * y + normal[:, 2])
-        apart = ~(np.abs(plane_m - sub.depth_m) * MM_PER_M <= APART_MM)
-        turn = normal[:, 0] * sub.normals[:, 0] + normal[:, 1] * sub.normals[:, 1] + normal[:, 2] * sub.normals[:, 2]
-        edge = ~(turn >= _EDGE_COSINE)
-    else:
-        apart = edge = np.ones(len(parent), dtype=bool)
-    total = across * across
-    on_object = np.bincount(parent, minlength=count)
-    of_surface = np.bincount(parent[same & ~apart], minlength=count)
-    void = np.where(central >= 0, of_surface < total, on_object > 0)
-    needs = void.copy()
-    needs[parent[same & edge]] = True
+    chosen = np.zeros(count, dtype=bool)
+    n = hits.normals
+    distance = hits.depth_m * (n[:, 0] * ray_x[hits.pixels] + n[:, 1] * ray_y[hits.pixels] + n[:, 2])
+    mark_neighbours(width, central, hits.pixels, hits.depth_m, n, distance, ray_x, ray_y, chosen)
     if lit is not None:
-        needs |= _at_borders(hits, lit, camera)
-    pixels = np.flatnonzero(needs)
-    number = np.full(count, -1, dtype=np.int64)
-    number[pixels] = np.arange(pixels.size)
-    slot = number[parent] * total + row % across * across + column % across
-    chosen = np.flatnonzero(number[parent] >= 0)
-    of = np.full(pixels.size * total, -1, dtype=np.int64)
-    of[slot[chosen]] = chosen
+        chosen |= _at_borders(hits, lit, camera)
+    pixels = np.flatnonzero(chosen)
+    fine = PixelRays.of(camera.scaled(width * across))
     ray = _fine_pixels(pixels, width, across)
+    wanted = np.zeros(fine.x.shape, dtype=bool)
+    within = ray < wanted.size  # a camera whose height does not scale to a whole number of rays
+    wanted.ravel()[ray[within]] = True
+    sub = traced.primary(fine, wanted)
+    x, y = (axis.ravel()[np.where(within, ray, 0)] for axis in (fine.x, fine.y))
+    # Rays are sorted by pixel, hits by their place in the finer image: `of` is the hit of each ray, -1 for none.
+    of = np.full(ray.size, -1, dtype=np.int64)
+    if sub.pixels.size:
+        place = np.minimum(np.searchsorted(sub.pixels, ray), sub.pixels.size - 1)
+        of = np.where(sub.pixels[place] == ray, place, -1)
     hit = of >= 0
-    depth_m = np.where(hit, sub.depth_m[of] if sub.depth_m.size else 0.0, rig.background_m)
-    direction = np.column_stack([fine.x.ravel()[ray], fine.y.ravel()[ray], np.ones(ray.size)])
+    depth_m, triangle = np.full(ray.size, rig.background_m), np.full(ray.size, -1, dtype=np.int32)
     normals = np.tile([0.0, 0.0, -1.0], (ray.size, 1))
-    normals[hit] = sub.normals[of[hit]]
-    triangle = np.full(ray.size, -1, dtype=np.int32)
-    triangle[hit] = sub.triangle[of[hit]]
-    share = np.where(central >= 0, of_surface, total - on_object)[pixels] / total
-    return MixedPixels(pixels, direction * depth_m[:, None], normals, triangle, void[pixels], share)
+    depth_m[hit], triangle[hit], normals[hit] = sub.depth_m[of[hit]], sub.triangle[of[hit]], sub.normals[of[hit]]
+    seen = np.repeat(central[pixels], total)
+    same = ~hit  # on the surface that the central ray sees: the background, or near the object's plane there
+    own = np.flatnonzero(seen >= 0)
+    plane = n[seen[own]]
+    plane_m = distance[seen[own]] / (plane[:, 0] * x[own] + plane[:, 1] * y[own] + plane[:, 2])
+    same[own] = hit[own] & (np.abs(plane_m - depth_m[own]) * MM_PER_M <= APART_MM)
+    share = same.reshape(-1, total).mean(axis=1)
+    points = np.column_stack([x, y, np.ones(ray.size)]) * depth_m[:, None]
+    return MixedPixels(pixels, points, normals, triangle, share < 1.0, share)
+
+
+@njit
+def mark_neighbours(width, central, pixels, depth_m, normals, distance, x, y, chosen):  # type: ignore[no-untyped-def]
+    """Mark in ``chosen`` bool (H W,) the pixels of which a neighbour sees another surface, or another side of an edge,
+    and that neighbour. ``central`` int64 (H W,): each pixel's row in the arrays of hits, -1 for none; ``distance`` (n,)
+    of the hits' planes from the camera; rays ``x`` and ``y`` (H W,)."""
+    height = central.size // width
+    for i in range(pixels.size):
+        row, column = pixels[i] // width, pixels[i] % width
+        for down in range(max(row - 1, 0), min(row + 2, height)):
+            for right in range(max(column - 1, 0), min(column + 2, width)):
+                other = down * width + right
+                j = central[other]
+                apart = j < 0
+                if not apart:
+                    a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+                    plane_m = distance[i] / (a * x[other] + b * y[other] + c)
+                    turn = a * normals[j, 0] + b * normals[j, 1] + c * normals[j, 2]
+                    apart = not (abs(plane_m - depth_m[j]) * 1000.0 <= APART_MM and turn >= _EDGE_COSINE)
+                if apart:
+                    chosen[pixels[i]] = True
+                    chosen[other] = True
 
 
 def _at_borders(hits: Hits, lit: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:

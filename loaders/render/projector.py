@@ -6,7 +6,7 @@ with the distance from the focus in dioptres, as a thin lens's blur circle does.
 exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import DIRECTIONS, Rig, pattern_profiles
-from fpp_ml_bench.portable import gaussian_weights, power
+from fpp_ml_bench.optics import DIRECTIONS, Rig, Sequence, pattern_profiles
+from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 
 FINE = 4
 """Samples a projector pixel where blur depends on the distance; linear interpolation between them costs a sinusoid of
@@ -74,6 +74,34 @@ class PatternLight:
             rows.append([blurred(whole, (level + still + area) * per_px**2) for level in levels])
         table = np.pad(np.array(rows, dtype=np.float32), ((0, 0), (0, 0), (0, 1)), mode="edge")
         return cls(table, vertical, levels, per_px)
+
+    def modes(self, sequence: Sequence) -> tuple["PatternLight", NDArray[np.float32]]:
+        """Fewer patterns that stand for all in diffuse light: black is left out, and the steps of a direction's
+        sinusoids are their mean and first harmonic. Higher harmonics, of a response that is no line, do not survive the
+        way over another surface. Returns them and the weights ``mix`` float32 (F, J) that give every frame again."""
+        rows, of_row, mixed = [], [], []
+        for direction in DIRECTIONS:
+            frames = sequence.sinusoids(direction)
+            steps = np.arange(len(frames)) / len(frames)
+            cosine, sine = cosine_of_turns(steps), sine_of_turns(steps)
+            for weights in (np.ones(len(frames)) / 2, cosine, sine):
+                row = np.zeros(self.table.shape[1:])
+                for frame, weight in zip(frames, weights, strict=True):
+                    row += 2.0 / len(frames) * weight * self.table[frame]
+                rows.append(row)
+                of_row.append(direction == "vertical")
+                mixed.append(dict(zip(frames, np.ceil(weights) if weights[0] == 0.5 else weights, strict=True)))
+        sinusoids = {frame for weights in mixed for frame in weights}
+        for frame in range(len(self.table)):
+            if frame not in sinusoids and frame != sequence.black:
+                rows.append(self.table[frame].astype(np.float64))
+                of_row.append(bool(self.vertical[frame]))
+                mixed.append({frame: 1.0})
+        mix = np.zeros((len(self.table), len(rows)), dtype=np.float32)
+        for row, frame_weights in enumerate(mixed):
+            for frame, weight in frame_weights.items():
+                mix[frame, row] = weight
+        return replace(self, table=np.array(rows, dtype=np.float32), vertical=np.array(of_row)), mix
 
     def place(
         self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,

@@ -82,8 +82,8 @@ class TracedObject:
         self._offsets = _dot(self._normals, self._corners[:, 0])
         self._vertices_m = vertices_m
 
-    def primary(self, rays: PixelRays) -> Hits:
-        """What the camera's rays meet first."""
+    def primary(self, rays: PixelRays, wanted: NDArray[np.bool_] | None = None) -> Hits:
+        """What the camera's rays meet first; with ``wanted`` bool (H, W) only those."""
         window = self._window(rays)
         (top, bottom), (left, right) = window
         shape = (max(bottom - top, 0), max(right - left, 0))
@@ -91,7 +91,7 @@ class TracedObject:
         if triangle.size:
             rasterise(
                 self._corners, self._normals, self._offsets, rays.x, rays.y, rays.columns, rays.rows, left, top,
-                depth_m, triangle,
+                np.ones(rays.x.shape, dtype=bool) if wanted is None else wanted, depth_m, triangle,
             )  # fmt: skip
         row, column = np.nonzero(triangle >= 0)
         seen = triangle[row, column]
@@ -187,13 +187,13 @@ def _first_at_least(values, limit):  # type: ignore[no-untyped-def]
 
 @njit
 def rasterise(  # type: ignore[no-untyped-def]
-    corners, normals, offsets, x, y, columns, rows, left, top, depth_m, triangle
+    corners, normals, offsets, x, y, columns, rows, left, top, wanted, depth_m, triangle
 ):
     """Nearest triangle of each pixel in a window, and its depth. Fills ``depth_m`` (inf before) and ``triangle`` (-1).
 
     ``corners`` (F, 3, 3) in m, camera at the origin; unit ``normals`` (F, 3) and plane ``offsets`` (F,); rays ``x`` and
     ``y`` (H, W), of which the window starts at column ``left`` and row ``top``. ``columns`` (2, W): the greatest x up
-    to each column, and the least x from it on; ``rows`` (2, H): the same of y.
+    to each column, and the least x from it on; ``rows`` (2, H): the same of y. Only the rays ``wanted`` bool (H, W).
     """
     height, width = depth_m.shape
     reach_x = max(abs(columns[0, -1]), abs(columns[1, 0]))
@@ -241,6 +241,8 @@ def rasterise(  # type: ignore[no-untyped-def]
                 begin = max(first, _first_at_least(columns[0], low - SLACK) - left)
                 end = min(last, _first_at_least(columns[1], high + SLACK) - left)
             for column in range(begin, end + 1):
+                if not wanted[top + row, left + column]:
+                    continue
                 dx, dy = x[top + row, left + column], y[top + row, left + column]
                 e0 = gx0 * dx + gy0 * dy + gz0
                 e1 = gx1 * dx + gy1 * dy + gz1
