@@ -11,7 +11,7 @@ from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import Entry
-from fpp_ml_bench.loaders.storage import benchmark_of
+from fpp_ml_bench.loaders.storage import EARLIER, benchmark_of
 from fpp_ml_bench.optics import CONFIGS
 
 LEGACY_FINGERPRINTS = (
@@ -67,7 +67,7 @@ class GroupKey:
 
     @property
     def is_legacy(self) -> bool:
-        return benchmark_of(self.fingerprint) is None and self.fingerprint in LEGACY_FINGERPRINTS
+        return self.fingerprint in LEGACY_FINGERPRINTS or benchmark_of(self.fingerprint) in EARLIER
 
     @property
     def order(self) -> tuple[object, ...]:
@@ -80,7 +80,7 @@ class GroupKey:
         """``fpp-bench-full version 0, 960 x 960 px``; other data by size and the fingerprint's first 8 digits."""
         benchmark, pixels = benchmark_of(self.fingerprint), f"{self.size[1]} x {self.size[0]} px"
         if benchmark is not None:
-            return f"{benchmark.title}, {pixels}"
+            return f"{benchmark.title}, {pixels}" + (", legacy" if self.is_legacy else "")
         return f"{pixels}, data {self.fingerprint[:8]}" + (", legacy" if self.is_legacy else "")
 
     @property

@@ -133,7 +133,7 @@ class DatasetInfo(SparseModel):
         if self.benchmark is None:
             return self
         claim = self.benchmark.name, self.benchmark.version
-        claimed = next((b for b in benchmarks.BENCHMARKS if (b.name, b.version) == claim), None)
+        claimed = next((b for b in (*benchmarks.BENCHMARKS, *benchmarks.EARLIER) if (b.name, b.version) == claim), None)
         actual = benchmarks.benchmark_of(self.fingerprint)
         if claimed != actual:
             expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""

@@ -54,9 +54,8 @@ def mixed_pixels(
     n = hits.normals
     distance = hits.depth_m * (n[:, 0] * ray_x[hits.pixels] + n[:, 1] * ray_y[hits.pixels] + n[:, 2])
     mark_neighbours(width, central, hits.pixels, hits.depth_m, n, distance, ray_x, ray_y, chosen)
-    if lit is not None:
-        chosen |= _at_borders(hits, lit, camera)
-    pixels = np.flatnonzero(chosen)
+    borders = np.zeros(count, dtype=bool) if lit is None else _at_borders(hits, lit, camera)
+    pixels = np.flatnonzero(chosen | borders)
     fine = PixelRays.of(camera.scaled(width * across))
     ray = _fine_pixels(pixels, width, across)
     wanted = np.zeros(fine.x.shape, dtype=bool)
@@ -79,9 +78,14 @@ def mixed_pixels(
     plane = n[seen[own]]
     plane_m = distance[seen[own]] / (plane[:, 0] * x[own] + plane[:, 1] * y[own] + plane[:, 2])
     same[own] = hit[own] & (np.abs(plane_m - depth_m[own]) * MM_PER_M <= APART_MM)
+    alike = np.ones(ray.size, dtype=bool)
+    alike[own] = (plane * normals[own]).sum(axis=1) >= _EDGE_COSINE
     share = same.reshape(-1, total).mean(axis=1)
-    points = np.column_stack([x, y, np.ones(ray.size)]) * depth_m[:, None]
-    return MixedPixels(pixels, points, normals, triangle, share < 1.0, share)
+    mixes = (share < 1.0) | ~alike.reshape(-1, total).all(axis=1) | borders[pixels]
+    of_mixed = np.repeat(mixes, total)
+    points = (np.column_stack([x, y, np.ones(ray.size)]) * depth_m[:, None])[of_mixed]
+    pixels, share = pixels[mixes], share[mixes]
+    return MixedPixels(pixels, points, normals[of_mixed], triangle[of_mixed], share < 1.0, share)
 
 
 @njit

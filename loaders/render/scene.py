@@ -107,10 +107,10 @@ class BuildSettings:
         }  # fmt: skip
 
 
-def preset_settings(preset: str, size: int | None = None) -> BuildSettings:
-    """The settings of ``fpp-bench build --preset PRESET [--size SIZE]`` with everything else left at its default."""
+def preset_settings(preset: str, size: int | None = None, light: str = "paper") -> BuildSettings:
+    """The settings of ``fpp-bench build --preset PRESET [--size SIZE] [--light LIGHT]``, all else at its default."""
     objects, preset_size = PRESETS[preset]
-    return BuildSettings(rig=paper_rig(size or preset_size), objects=objects)
+    return BuildSettings(rig=paper_rig(size or preset_size), objects=objects, light=named_light(light))
 
 
 def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:

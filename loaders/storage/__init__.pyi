@@ -1,6 +1,7 @@
 from .assembly import Assembly as Assembly
 from .assembly import Progress as Progress
 from .assembly import assemble as assemble
+from .benchmark import EARLIER as EARLIER
 from .benchmark import Benchmark as Benchmark
 from .benchmark import benchmark_of as benchmark_of
 from .benchmark import benchmark_sentence as benchmark_sentence

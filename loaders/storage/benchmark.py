@@ -12,13 +12,14 @@ from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 @dataclass(frozen=True)
 class Benchmark:
     """A named dataset: ``name``, ``version``, the SHA-256 ``fingerprint`` of its content (64 hex digits), and the
-    ``preset`` and image ``size`` in px that build it."""
+    ``preset``, image ``size`` in px and ``light`` that build it."""
 
     name: str
     version: int
     preset: str
     size: int
     fingerprint: str
+    light: str = "paper"
 
     @property
     def title(self) -> str:
@@ -27,6 +28,15 @@ class Benchmark:
 
 
 BENCHMARKS = (
+    Benchmark("fpp-bench-full", 1, "full", FULL_SIZE, "F0"),
+    Benchmark("fpp-bench-full-224", 1, "full", 224, "F1"),
+    Benchmark("fpp-bench-mini", 1, "mini", MINI_SIZE, "F2"),
+    Benchmark("fpp-bench-unseen", 1, "unseen", FULL_SIZE, "F3"),
+    Benchmark("fpp-bench-workshop", 1, "full", FULL_SIZE, "F4", "workshop"),
+    Benchmark("fpp-bench-hard", 1, "full", FULL_SIZE, "F5", "hard"),
+)  # fmt: skip
+"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
+EARLIER = (
     Benchmark(
         "fpp-bench-full", 0, "full", FULL_SIZE, "d46eed4271d91e8887863420ca08dff148db61abc135a24233d7757135d5683f"
     ),
@@ -35,12 +45,12 @@ BENCHMARKS = (
         "fpp-bench-mini", 0, "mini", MINI_SIZE, "0ba15100b657c8b0edfde78d1833ecefc0ebc42d219a96727f83fe604ba55440"
     ),
 )
-"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
+"""Versions that this package no longer builds: one albedo, direct light alone, one ray a pixel."""
 
 
 def benchmark_of(fingerprint: str) -> Benchmark | None:
-    """The benchmark with this fingerprint; None for any other dataset."""
-    return next((benchmark for benchmark in BENCHMARKS if benchmark.fingerprint == fingerprint), None)
+    """The benchmark with this fingerprint, of today or earlier; None for any other dataset."""
+    return next((benchmark for benchmark in (*BENCHMARKS, *EARLIER) if benchmark.fingerprint == fingerprint), None)
 
 
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
@@ -49,7 +59,7 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
         return None
     content = (manifest.settings, manifest.rig, manifest.stored)
     for benchmark in BENCHMARKS:
-        settings = preset_settings(benchmark.preset, benchmark.size)
+        settings = preset_settings(benchmark.preset, benchmark.size, benchmark.light)
         if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
             return benchmark
     return None
