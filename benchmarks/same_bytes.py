@@ -4,7 +4,7 @@
 
 Each build is a process of its own that is denied some of this processor's instruction sets: numba compiles for a
 generic x86-64, NumPy and the C library leave out AVX2, AVX-512 and fused multiply-adds, OpenBLAS takes its oldest
-kernels. Prints a fingerprint for each, and a hash of all 50 meshes in float64; exit status 1 if two differ. With no
+kernels. Prints a fingerprint for each, and a hash of all 70 meshes in float64; exit status 1 if two differ. With no
 options a minute or two; ``--preset full --size 960`` is the whole benchmark.
 """
 
@@ -38,16 +38,16 @@ WAYS: dict[str, dict[str, str]] = {
 MESHES = """\
 import hashlib, sys
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.constants import OBJECTS
+from fpp_ml_bench.constants import OBJECTS, UNSEEN
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 digest = hashlib.sha256()
-for name in OBJECTS:
+for name in (*OBJECTS, *UNSEEN):
     mesh = solid_mesh(name)
     digest.update(mesh.vertices_m.tobytes() + mesh.faces.tobytes())
 print(digest.hexdigest())
 sys.exit(main(sys.argv[1:]))
 """
-"""Prints a hash of all 50 meshes in float64, whose last bits float32 depths would hide, and runs `fpp-bench`."""
+"""Prints a hash of all 70 meshes in float64, whose last bits float32 depths would hide, and runs `fpp-bench`."""
 
 
 def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str]:
@@ -68,16 +68,15 @@ def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", choices=("mini", "full"), default="mini", help="preset (default: mini)")
+    parser.add_argument("--preset", choices=("mini", "full", "unseen"), default="mini", help="preset (default: mini)")
     parser.add_argument("--size", type=int, default=176, metavar="PX", help="image size (default: 176)")
     parser.add_argument("--objects", metavar="A,B", help="objects (default: the preset's)")
-    parser.add_argument("--shadows", action="store_true", help="with cast shadows")
+    parser.add_argument("--light", default="paper", metavar="NAME|FILE", help="light (default: paper)")
     parser.add_argument("--work", type=Path, help="folder to work in (default: a temporary one, removed afterwards)")
     parser.add_argument("--only", nargs="+", choices=WAYS, metavar="WAY", help="some of the ways")
     args = parser.parse_args()
-    settings = ["--preset", args.preset, "--size", str(args.size)]
+    settings = ["--preset", args.preset, "--size", str(args.size), "--light", args.light]
     settings += ["--objects", args.objects] if args.objects else []
-    settings += ["--shadows"] if args.shadows else []
     prints = {}
     with tempfile.TemporaryDirectory(dir=args.work) as folder:
         for way in args.only or WAYS:
