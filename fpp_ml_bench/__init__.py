@@ -12,7 +12,7 @@ from pathlib import Path as _Path
 
 import lazy_loader as _lazy_loader
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _ROOT = _Path(__file__).resolve().parent.parent
 _ROOMS = frozenset(f"{__name__}.{room}" for room in ("loaders", "evaluation", "baselines", "leaderboard"))
