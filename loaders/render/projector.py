@@ -79,29 +79,28 @@ class PatternLight:
         """Fewer patterns that stand for all in diffuse light: black is left out, and the steps of a direction's
         sinusoids are their mean and first harmonic. Higher harmonics, of a response that is no line, do not survive the
         way over another surface. Returns them and the weights ``mix`` float32 (F, J) that give every frame again."""
-        rows, of_row, mixed = [], [], []
+        count = len(self.table)
+        taken, given, vertical = [], [], []  # per mode: the weight of each frame in it, and its weight in each frame
         for direction in DIRECTIONS:
-            frames = sequence.sinusoids(direction)
+            frames = list(sequence.sinusoids(direction))
             steps = np.arange(len(frames)) / len(frames)
             cosine, sine = cosine_of_turns(steps), sine_of_turns(steps)
-            for weights in (np.ones(len(frames)) / 2, cosine, sine):
-                row = np.zeros(self.table.shape[1:])
-                for frame, weight in zip(frames, weights, strict=True):
-                    row += 2.0 / len(frames) * weight * self.table[frame]
-                rows.append(row)
-                of_row.append(direction == "vertical")
-                mixed.append(dict(zip(frames, np.ceil(weights) if weights[0] == 0.5 else weights, strict=True)))
-        sinusoids = {frame for weights in mixed for frame in weights}
-        for frame in range(len(self.table)):
-            if frame not in sinusoids and frame != sequence.black:
-                rows.append(self.table[frame].astype(np.float64))
-                of_row.append(bool(self.vertical[frame]))
-                mixed.append({frame: 1.0})
-        mix = np.zeros((len(self.table), len(rows)), dtype=np.float32)
-        for row, frame_weights in enumerate(mixed):
-            for frame, weight in frame_weights.items():
-                mix[frame, row] = weight
-        return replace(self, table=np.array(rows, dtype=np.float32), vertical=np.array(of_row)), mix
+            for weights, scale in ((np.ones(len(frames)), 1.0), (cosine, 2.0), (sine, 2.0)):
+                taken.append(np.zeros(count))
+                given.append(np.zeros(count))
+                taken[-1][frames], given[-1][frames] = scale / len(frames) * weights, weights
+                vertical.append(direction == "vertical")
+        sinusoids = {*sequence.sinusoids("horizontal"), *sequence.sinusoids("vertical")}
+        for frame in (frame for frame in range(count) if frame not in sinusoids and frame != sequence.black):
+            taken.append(np.eye(count)[frame])
+            given.append(np.eye(count)[frame])
+            vertical.append(bool(self.vertical[frame]))
+        table = np.zeros((len(taken), *self.table.shape[1:]))
+        for row, weights in zip(table, taken, strict=True):
+            for place in np.flatnonzero(weights):  # in order, on every processor
+                row += weights[place] * self.table[place]
+        mix = np.stack(given, axis=1).astype(np.float32)
+        return replace(self, table=table.astype(np.float32), vertical=np.array(vertical)), mix
 
     def place(
         self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,

@@ -216,7 +216,7 @@ def ground_truth_error(
         "exact_px": int(seen.sum()),
         "undecoded_px": int((seen & ~decoded).sum()),
         "void_px": int((seen & void).sum()),
-        **{f"{flag.name.lower()}_px": int(((flags & flag) > 0).sum()) for flag in Flag},
+        **{f"{str(flag.name).lower()}_px": int(((flags & flag) > 0).sum()) for flag in Flag},
         "gt_mae_mm": _mean(np.abs(error)),
         "gt_rmse_mm": _root_mean_square(error),
         "gt_bias_mm": _mean(error),
