@@ -62,9 +62,10 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile
 
 class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
-    ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects.
-    Raises `WeightsError` for weights that can't be used, and `PredictionError` for an invalid option and for a rig
-    whose fringe period in the image is far from that of the training data."""
+    ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects;
+    ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
+    for weights that can't be used, and `PredictionError` for an invalid option and for a rig whose fringe period in the
+    image is far from that of the training data."""
 
     name = "phase-net"
     target = "depth"
@@ -73,8 +74,12 @@ class PhaseNetMethod(Method):
     def __init__(
         self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile = DEFAULT,
         min_confidence: float = 0.0, shading: bool = True, levers: Levers | None = None, threads: int = 1,
+        white_grey: float | None = None, ambient_grey: float | None = None,
     ) -> None:  # fmt: skip
-        self.options = Settings(direction=direction, min_confidence=min_confidence, shading=shading)
+        self.options = Settings(
+            direction=direction, min_confidence=min_confidence, shading=shading, white_grey=white_grey,
+            ambient_grey=ambient_grey,
+        )  # fmt: skip
         self.file = weights if isinstance(weights, NetFile) else load_net(weights)
         self.rig, self.threads = rig, threads
         trained_period_px = self.file.config.period_px.get(direction)
@@ -102,7 +107,7 @@ class PhaseNetMethod(Method):
         self.settings = {
             "direction": direction, "shading": shading, "min_confidence": min_confidence, "weights": config.name,
             "weights_sha256": self.file.sha256, "mask_threshold": config.threshold, "order_lead": config.lead,
-            "threads": threads,
+            "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
         }  # fmt: skip
 
     def measure(self, frames: Frames) -> Measurement:

@@ -44,7 +44,8 @@ def fit_uncertainty_rad(
 
 def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) -> Image:
     """Expected absolute error of the phase of each pixel, float32 (h, w): noise through the weights of the steps, and
-    the difference of mean and modulation beyond it (a pixel that covers two surfaces, or is clipped)."""
+    the difference of mean and modulation beyond it (a pixel that covers two surfaces, or is clipped). Of modulation a
+    pixel that averages the fringe over its area loses a share that is known, without an error of the phase."""
     background = capture.background
     _, cosine, sine = phase_weights(capture.shifts_rad)
     bright = np.maximum(fit.brightness, 0.5)
@@ -52,7 +53,9 @@ def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) ->
     c, s = np.cos(fit.phase_rad), np.sin(fit.phase_rad)
     variance = c * c * (sine @ sine) + s * s * (cosine @ cosine) + 2 * c * s * (sine @ cosine)
     noise = background.noise_grey * np.sqrt(variance * 2 / np.pi)
-    disagreement = np.abs(mean_grey - background.ambient_grey - fit.brightness)
+    mean = mean_grey - background.ambient_grey
+    before_pixel = fit.brightness / np.float32(np.sinc(1 / capture.period_px))
+    disagreement = np.maximum(mean - before_pixel, fit.brightness - mean)
     allowed = 3 * background.noise_grey * np.sqrt(3 / len(capture.shifts_rad))
     return ((noise + np.maximum(disagreement - allowed, 0) / 2) / bright).astype(np.float32)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
@@ -59,10 +60,11 @@ class Settings:
             raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
         if not 0 <= self.min_confidence < 1:
             raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
-        given = [name for name in ("white_grey", "ambient_grey") if getattr(self, name) is not None]
-        for name in (*_POSITIVE, *given):
-            if not getattr(self, name) > 0:
+        for name in (*_POSITIVE, *(["white_grey"] if self.white_grey is not None else [])):
+            if not 0 < getattr(self, name) < np.inf:
                 raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
+        if self.ambient_grey is not None and not 0 <= self.ambient_grey <= GREY_LEVELS:
+            raise PredictionError(f"ambient_grey {self.ambient_grey!r}: expected 0 to {GREY_LEVELS} grey levels")
 
 
 class Watch:

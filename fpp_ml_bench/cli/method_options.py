@@ -17,11 +17,13 @@ METHOD_HELP = (
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
-    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence"),
-    "phase-net": ("fringe", "no_shading", "min_confidence", "weights"),
+    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence", "white_grey", "ambient_grey"),
+    "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
     "trained networks": ("depth_range", "frame", "device"),
 }
 """Options that belong to one kind of method only, by their name in the parsed arguments."""
+_SHARED = "min_confidence", "white_grey", "ambient_grey"
+"""Options that phase and phase-net have as they are."""
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +50,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--no-shading", action="store_const", const=True, help="choose the fringe order without brightness")
     add("--min-confidence", type=float, metavar="C",
         help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
+    add("--white-grey", type=float, metavar="GREY",
+        help="for images without a lit background: grey level of a white pattern on a surface that faces the projector "
+             "at the near end of the working range")  # fmt: skip
+    add("--ambient-grey", type=float, metavar="GREY",
+        help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
+             "image's darkest)")  # fmt: skip
     add("--weights", metavar="FILE",
         help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
              "phase-net-fresh, trained on additional objects)")  # fmt: skip
@@ -131,14 +139,19 @@ def _classical(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dic
 
 
 def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int:
-    """Steps for ``--depth-noise``, by the noise that the dataset was built with."""
+    """Steps for ``--depth-noise``, by the light and the camera that the dataset was built with."""
+    from fpp_ml_bench.schema import validate
+
     depth_noise_mm = args.depth_noise
-    noise_grey = opened.manifest.settings.get("noise_sigma_grey")
+    described = opened.manifest.settings.get("light")
     if args.steps is not None or not (depth_noise_mm > 0 and depth_noise_mm < float("inf")):
         raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
-    if noise_grey is None:
+    if not isinstance(described, dict):
         raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
-    modulation = render.modulation_at(opened.rig, opened.rig.working_range_mm[1])
+    light = validate(render.Light, described, opened.path / "manifest.json", "light", PredictionError)
+    far_mm = opened.rig.working_range_mm[1]
+    modulation = render.modulation_at(opened.rig, far_mm, light)
+    noise_grey = render.fringe_noise_at(opened.rig, far_mm, light)
     steps = decoding.fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
     if steps is None:
         raise PredictionError(
@@ -151,12 +164,12 @@ def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int
 def _phase(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    options = {name: getattr(args, name) for name in ("prior", "min_confidence", "frames", "error_mm")}
+    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
 def _phase_net(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
-    options = {name: getattr(args, name) for name in ("threads", "min_confidence", "weights")}
+    options = {name: getattr(args, name) for name in ("threads", "weights", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 

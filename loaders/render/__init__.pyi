@@ -29,4 +29,5 @@ from .scene import turned as turned
 from .sensor import Exposure as Exposure
 from .sensor import Sensor as Sensor
 from .sensor import camera_noise as camera_noise
+from .sensor import fringe_noise_at as fringe_noise_at
 from .view import Studio as Studio

@@ -115,9 +115,10 @@ def preset_settings(preset: str, size: int | None = None, light: str = "paper") 
 
 def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:
     """Modulation in grey levels of a surface at ``depth_mm`` that faces the projector: half of what white adds there,
-    by the inverse square of the distance."""
-    white = (light or named_light("paper")).camera.reference_grey
-    return white / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
+    by the inverse square of the distance, at the least exposure of a view."""
+    camera = (light or named_light("paper")).camera
+    exposure = camera.exposure[0] if isinstance(camera.exposure, tuple) else camera.exposure
+    return exposure * camera.reference_grey / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, fill_pattern, respond
+from fpp_ml_bench.loaders.render.scene import modulation_at
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics import Rig
 
@@ -52,6 +53,13 @@ def camera_noise(sigma_grey: float) -> dict[str, float | None]:
         return {"full_well_e": None, "read_noise_e": 0.0}
     electrons = 2 * _MID_GREY / float(sigma_grey) ** 2
     return {"full_well_e": electrons * GREY_LEVELS, "read_noise_e": float(sigma_grey) / np.sqrt(2) * electrons}
+
+
+def fringe_noise_at(rig: Rig, depth_mm: float, light: Light) -> float:
+    """Standard deviation in grey levels of the camera's noise at the mean grey level of a fringe on a surface at
+    ``depth_mm`` that faces the projector."""
+    noise, grey = Noise.of_camera(light.camera), modulation_at(rig, depth_mm, light) + light.ambient_grey
+    return float(np.sqrt(noise.read_variance + noise.shot_per_grey * grey))
 
 
 @cache

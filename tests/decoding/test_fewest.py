@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE
+from flat_planes import DIRECT
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.blocks import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, orders_from_phases
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.sample import VOID, Flag
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import DIRECTIONS, paper_rig
@@ -125,6 +128,19 @@ def test_steps_follow_the_square_root_law():
     assert steps[0.4] == pytest.approx(steps[0.6] * (0.6 / 0.4) ** 2, abs=1.5)
 
 
+@pytest.mark.parametrize("view", ["A0", "A60", "A120"])
+def test_an_object_in_direct_light_has_the_same_depth_with_six_frames(view):
+    """On one ray a pixel: what every pixel sees is one surface, and its phases are those of the pattern."""
+    rig = paper_rig(TINY_SIZE)
+    row = Studio(BuildSettings(rig, ("power_drill",), stored="all", light=DIRECT)).photograph(
+        solid_mesh("power_drill"), view
+    )
+    frames = [row.frames[index] for index in range(52)]
+    six, twenty = (ClassicalMethod(rig, "both", 3, fewest=fewest).predict(frames) for fewest in (True, False))
+    assert (twenty > 0).sum() > 1500
+    np.testing.assert_array_equal(six, twenty)
+
+
 def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
     dataset = DatasetFolder(tiny)
     method = ClassicalMethod(dataset.rig, "both", 3, fewest=True)
@@ -136,7 +152,10 @@ def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
         assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "3", *options]) == 0
     for sample in dataset.samples("test"):
         six, twenty = (np.load(tmp_path / name / f"{sample}.npy") for name in ("six", "all"))
-        np.testing.assert_array_equal(six, twenty)
+        # A pixel of two surfaces, or of bounced light, has no one phase: there the two may differ.
+        special = (dataset.flags(sample) & (VOID | Flag.INTERREFLECTION)) > 0
+        np.testing.assert_array_equal(six[~special], twenty[~special])
+        assert (six != twenty).sum() < 0.005 * six.size
     command = ["predict", "classical", str(tiny), "--out", str(tmp_path / "noise"), "--depth-noise", "0.8", "--fewest"]
     assert main(command) == 0
     assert "no Gray code" in capsys.readouterr().out

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from flat_planes import PAPER, USERS_WORD
 from synthetic import make
 
 from fpp_ml_bench.baselines.method import Method, load_method
@@ -19,7 +20,7 @@ from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.evaluation.submission import REPORTS_FILE, read_submission
-from fpp_ml_bench.loaders.render import Exposure, camera_noise, light_surface, named_light
+from fpp_ml_bench.loaders.render import Exposure, camera_noise, light_surface
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import paper_rig
 
@@ -39,7 +40,7 @@ def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) 
     """All fringes and Gray frames of one direction on a plane that fills the frame."""
     x, y = RIG.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
-    light = named_light("paper").changed("camera", **camera_noise(noise))
+    light = PAPER.changed("camera", **camera_noise(noise))
     exposure = Exposure.of(RIG, light)
     lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern)
     indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
@@ -111,7 +112,7 @@ def test_two_frames_solve_the_tied_fringe() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("frames", [3, 4, 18])
 def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> None:
-    measurement = made(frames, direction).measure(plane(1.8, direction))
+    measurement = made(frames, direction, **USERS_WORD).measure(plane(1.8, direction))
     middle = (slice(150, 330), slice(150, 330))
     error = (measurement.depth_mm - 1800)[middle].astype(np.float64)
     expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation_grey[middle].mean()), 1.0)
@@ -126,7 +127,7 @@ def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> Non
 @pytest.mark.parametrize("distance_m", [1.55, 1.8, 2.05])
 @pytest.mark.parametrize("frames", [2, 3])
 def test_a_plane_is_at_its_distance_without_gray_code(frames: int, distance_m: float) -> None:
-    measurement = made(frames).measure(plane(distance_m))
+    measurement = made(frames, **USERS_WORD).measure(plane(distance_m))
     lit = measurement.modulation_grey > 5
     assert lit.mean() > 0.7
     assert np.abs(measurement.depth_mm - distance_m * 1000)[lit].mean() < 1.5

@@ -5,15 +5,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
+from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
-from fpp_ml_bench.baselines.phase_route.observation import Settings
+from fpp_ml_bench.baselines.phase_route.object_mask import image_noise_grey
+from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import Rig
 
 SIZE = RIG.camera.width
@@ -37,7 +37,7 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
     tilt = (0.1, -0.06)
     depth_m = plane_depth_m(rig, distance_m if distance_m == 1.8 else distance_m + (1.8 - distance_m) * 0.2, tilt)
     for exact_m, slope in ((plane_depth_m(rig, distance_m), (0.0, 0.0)), (depth_m, tilt)):
-        measurement = route(direction, rig).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
+        measurement = route(direction, rig, **USERS_WORD).measure(plane_fringe(rig, FIRST[direction], exact_m, slope))
         lit = measurement.modulation_grey > 5
         assert lit.mean() > 0.7  # the projector's field ends before the camera's
         error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
@@ -47,18 +47,21 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
 
 def test_a_projector_that_is_turned_and_ahead() -> None:
     exact_m = plane_depth_m(TURNED_RIG, 1.7, (0.1, 0.3))
-    measurement = route("horizontal", TURNED_RIG).measure(plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3)))
+    measurement = route("horizontal", TURNED_RIG, **USERS_WORD).measure(
+        plane_fringe(TURNED_RIG, 0, exact_m, (0.1, 0.3))
+    )
     lit = measurement.modulation_grey > 5
     assert lit.mean() > 0.7
     assert np.abs(measurement.depth_mm - exact_m * 1000)[lit].mean() < 1.0
 
 
 def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
+    # One ray a pixel: a pixel with an area keeps 99.6% of the modulation, which moves the phase by 0.1 mm of its own.
     exact_m = plane_depth_m(RIG, 1.8)
     middle = (slice(180, 300), slice(180, 300))
     spread = {}
     for noise in (1.0, 3.0):
-        measurement = route("vertical").measure(plane_fringe(RIG, 18, exact_m, noise=noise))
+        measurement = route("vertical", **USERS_WORD).measure(plane_fringe(RIG, 18, exact_m, noise=noise, light=DIRECT))
         error = (measurement.depth_mm - exact_m * 1000)[middle]
         spread[noise] = error.std()
         sigma_px = Settings().second_window * RIG.image_px_per_period("vertical")
@@ -118,20 +121,20 @@ def test_nothing_is_measured_where_nothing_is() -> None:
     measurement = route("horizontal").measure(empty)
     assert not measurement.depth_mm.any()
     assert measurement.counts["background"] == empty.size
-    dark = np.full((SIZE, SIZE), round(named_light("paper").ambient_grey), np.uint8)
+    dark = np.full((SIZE, SIZE), round(PAPER.ambient_grey), np.uint8)
     assert not route("horizontal").measure(dark).depth_mm.any()
 
 
 def test_saturated_ambiguous_and_thin_are_said() -> None:
     exact_m = plane_depth_m(RIG, 1.8)
     image = plane_fringe(RIG, 0, exact_m)
-    bright = np.clip(image.astype(int) * 2, 0, 255).astype(np.uint8)
+    bright = np.clip(image * 2.5, 0, 255).astype(np.uint8)  # white at the near end of the range: grey level 450
     assert route("horizontal").measure(bright).counts["saturated"] > 0.2 * image.size
     # Without brightness and without a prior a plane can't be told from one a period away: no margin, and it says so.
-    blind = route("horizontal", shading=False).measure(image)
+    blind = route("horizontal", shading=False, **USERS_WORD).measure(image)
     assert blind.counts["ambiguous"] > 0.5 * image.size
     assert blind.confidence.max() < 0.2
-    near = route("horizontal", shading=False, prior="standoff").measure(image)
+    near = route("horizontal", shading=False, prior="standoff", **USERS_WORD).measure(image)
     lit = near.modulation_grey > 5
     assert np.abs(near.depth_mm - 1800)[lit].mean() < 1
     pole = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m)).copy()
@@ -141,13 +144,72 @@ def test_saturated_ambiguous_and_thin_are_said() -> None:
     assert thin.counts["measured"] < 200
 
 
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_without_background_brightness_needs_the_users_word(frames: int, direction: str) -> None:
+    exact_m = plane_depth_m(RIG, 1.8)
+    first = FIRST[direction]
+    told = route(direction, frames=frames, **USERS_WORD)
+    fringes = [plane_fringe(RIG, first + step, exact_m) for step in told.steps]
+    blind = route(direction, frames=frames).measure(fringes)
+    assert blind.background_share == 0
+    several = (blind.depth_mm > 0) & (blind.candidates.count > 1)
+    assert several.mean() > 0.7
+    # Another reason may come before AMBIGUOUS: no pixel there is to be trusted.
+    assert (blind.reason[several] != Reason.MEASURED).all()
+    assert (blind.reason[several] == Reason.AMBIGUOUS).mean() > 0.95
+    assert blind.confidence[several].max() < 0.5
+    measurement = told.measure(fringes)
+    lit = measurement.modulation_grey > 5
+    assert np.abs(measurement.depth_mm - 1800)[lit].mean() < 1.5
+    assert (measurement.reason[lit] == Reason.MEASURED).mean() > 0.9
+    assert np.median(measurement.confidence[lit]) > 0.5
+
+
+def test_the_users_word_gives_way_to_the_images_own_background() -> None:
+    image = photograph("cork", "A60").frames[0]
+    own = route("horizontal").measure(image)
+    told = route("horizontal", **USERS_WORD).measure(image)
+    assert own.background_share > 0.2
+    np.testing.assert_array_equal(told.depth_mm, own.depth_mm)
+    np.testing.assert_array_equal(told.confidence, own.confidence)
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("name", ["cork", "mug"])
+def test_exposure_does_not_matter(name: str, direction: str) -> None:
+    """The lamp's strength is read from the image. Noise stays as it is, so dim pixels at the silhouette go missing."""
+    errors, found = {}, {}
+    for exposure in (1.0, 0.5, 0.25):
+        row = photograph(name, "A60", light=PAPER.changed("camera", exposure=exposure))
+        depth_mm = route(direction).measure(row.frames[FIRST[direction]]).depth_mm
+        assert row.depth_exact_mm is not None
+        target = row.depth_exact_mm > 0
+        both = target & (depth_mm > 0)
+        errors[exposure] = np.abs(depth_mm - row.depth_exact_mm)[both].mean(dtype=np.float64)
+        found[exposure] = both.sum() / target.sum()
+    for exposure in (0.5, 0.25):
+        assert abs(errors[exposure] - errors[1.0]) < 0.10 * errors[1.0] + 0.5
+        assert found[exposure] > found[1.0] - 0.01
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_noise_of_an_image_is_found_in_it(sigma: float) -> None:
+    # Read noise alone: shot noise has another sigma at every grey level.
+    electrons = 1e6
+    light = PAPER.changed("camera", full_well_e=255 * electrons, read_noise_e=sigma * electrons)
+    row = photograph("mug", "A60", light=light)
+    for first in FIRST.values():
+        assert image_noise_grey(row.frames[first]) == pytest.approx(sigma, rel=0.15)
+
+
 @pytest.mark.parametrize("span", [(1700.0, 1900.0), (1100.0, 2600.0)], ids=["one period or none", "ten periods"])
 def test_ranges_of_one_period_and_of_ten(span: tuple[float, float]) -> None:
     pitch = 18.0 if span[0] > 1500 else 12.0
     sequence = replace(RIG.sequence, bits_vertical=8)
     rig = replace(RIG, working_range_mm=span, pitch_vertical_px=pitch, sequence=sequence)
     image = plane_fringe(rig, 18, plane_depth_m(rig, 1.8))
-    measurement = route("vertical", rig).measure(image)
+    measurement = route("vertical", rig, **USERS_WORD).measure(image)
     lit = measurement.modulation_grey > 5
     assert measurement.candidates.count.max() in ((1, 2) if pitch == 18 else (10, 11))
     assert np.median(np.abs(measurement.depth_mm - 1800)[lit]) < 1

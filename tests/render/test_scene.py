@@ -145,6 +145,7 @@ def test_modulation_is_half_of_white_by_the_inverse_square():
     assert modulation_at(RIG, 2100.0) == pytest.approx(90 * (1.5 / 2.1) ** 2)
     dim = named_light("paper").changed("camera", reference_grey=100.0)
     assert modulation_at(RIG, 3000.0, dim) == pytest.approx(12.5)
+    assert modulation_at(RIG, 3000.0, dim.changed("camera", exposure=(0.5, 2.0))) == pytest.approx(6.25)
 
 
 # ---- calibration
