@@ -184,9 +184,9 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
 
 
 def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
-    lookup = {key: replace(one, index=one.index[selection], weight=one.weight[selection])
-              for key, one in lit.lookup.items()}  # fmt: skip
-    return replace(lit, lookup=lookup, gain=lit.gain[selection], ambient=lit.ambient[selection])
+    every = vars(lit.place).items()
+    place = replace(lit.place, **{name: values[selection] for name, values in every if values.size})
+    return replace(lit, place=place, gain=lit.gain[selection], ambient=lit.ambient[selection])
 
 
 def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
