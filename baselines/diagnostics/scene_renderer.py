@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
@@ -243,6 +244,17 @@ class SceneRenderer:
             image.ravel()[scene.pixels] = values
             frames[index] = image * scene.mask if masked else image
         return frames
+
+    def decoded_mm(self, scene: Scene) -> NDArray[np.float32]:
+        """Depth (H, W) in mm decoded from the whole sequence on the scene's pixels, as a dataset's is; 0 beyond."""
+        frames = np.zeros((len(self.rig.sequence), *self.shape), dtype=np.uint8)
+        every = range(len(frames))
+        frames.reshape(len(frames), -1)[:, scene.pixels] = self.exposure.expose(
+            every, scene.lit, scene.pixels, scene.stream
+        )
+        seen = np.zeros(self.shape, dtype=bool)
+        seen.ravel()[scene.pixels] = True
+        return decode_stack(frames, self.rig, direction="both", mask=seen, reasons=False).depth_mm
 
     def _background(self, stream: tuple[object, ...], index: int, exposure: render.Exposure) -> NDArray[np.uint8]:
         if self._background_stream != stream:

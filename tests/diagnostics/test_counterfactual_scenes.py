@@ -57,6 +57,8 @@ def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
             difference = np.abs(frame.astype(int) - dataset.frame(sample, index))
             assert difference.max() <= 1
             assert (difference > 0).sum() <= 5
+        same = sample_scene.target == (dataset.depth_mm(sample) > 0)
+        assert (~same).sum() <= 1
 
 
 def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
