@@ -32,11 +32,12 @@ from fpp_ml_bench.loaders.render import (
     Studio,
     TracedObject,
     build,
-    hit_points_m,
-    lit_object,
+    load_light,
     place,
     solid_mesh,
-)
+)  # fmt: skip
+from fpp_ml_bench.loaders.render.pixels import mixed_pixels
+from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import paper_rig, pattern_image
 

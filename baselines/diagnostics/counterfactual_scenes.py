@@ -35,7 +35,8 @@ KEPT_SHARE = 0.5
 @dataclass(frozen=True)
 class Original:
     """An unchanged sample: its ``object``, ``surface`` and ``scene``, exact ``depth_mm`` float64 (H, W), and ``target``
-    bool (H, W): the pixels with a decoded depth, which are scored."""
+    bool (H, W): the pixels with a decoded depth, which are scored. They are decoded from the scene: in a dataset with
+    further bounces or mixed pixels, others have a depth."""
 
     sample: str
     object: str
@@ -46,12 +47,13 @@ class Original:
 
 
 def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Original:
-    """``sample`` as the dataset shows it."""
+    """``sample`` as the dataset shows it, in the renderer's light."""
     record, surface = dataset.measured(sample), rendering.surface_of_sample(dataset, sample)
-    target = object_mask(dataset.depth_mm(sample))
     stream = (dataset.manifest.settings.get("seed", 0), record["object"], record["view"])
-    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), target, stream)
-    return Original(sample, record["object"], surface, scene, target, surface.depth_mm(renderer.shape))
+    depth_mm = surface.depth_mm(renderer.shape)
+    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), object_mask(depth_mm), stream)
+    target = object_mask(renderer.decoded_mm(scene))
+    return Original(sample, record["object"], surface, replace(scene, mask=target), target, depth_mm)
 
 
 @dataclass(frozen=True)
@@ -184,9 +186,9 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
 
 
 def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
-    lookup = {key: replace(one, index=one.index[selection], weight=one.weight[selection])
-              for key, one in lit.lookup.items()}  # fmt: skip
-    return replace(lit, lookup=lookup, gain=lit.gain[selection], ambient=lit.ambient[selection])
+    every = vars(lit.place).items()
+    place = replace(lit.place, **{name: values[selection] for name, values in every if values.size})
+    return replace(lit, place=place, gain=lit.gain[selection], ambient=lit.ambient[selection])
 
 
 def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:

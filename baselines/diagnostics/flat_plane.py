@@ -165,7 +165,7 @@ def control_of(
     for sample in samples:
         unchanged = original(dataset, renderer, sample)
         predicted = shown_to(subject, renderer, unchanged.scene)[1][unchanged.target].astype(np.float64)
-        true = dataset.depth_mm(sample)[unchanged.target].astype(np.float64)
+        true = unchanged.depth_mm[unchanged.target]
         if scale.normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
         shares.append([(values < scale.limit).mean() for values in (predicted, true)])

@@ -1,8 +1,10 @@
 """Surfaces seen by a rig's camera, and rendered frames of scenes with them that are not in a dataset.
 
-Light and sensor are the dataset's own: an unchanged scene gives the frames of its dataset, noise included, except for a
-few pixels in 50,000 that differ by a grey level (tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel
-depends only on the dataset's seed, the object, view, frame and pixel, so it is the same in a changed scene.
+Scenes are in direct light (`direct_light`): a changed scene is compared with its sample in the same light, never with
+the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a dataset
+in direct light, noise included, except for a few pixels in 50,000 that differ by a grey level
+(tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel depends only on the dataset's seed, the object,
+view, frame and pixel, so it is the same in a changed scene.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
@@ -162,21 +165,34 @@ class Scene:
     projected: Projected = "sequence"
 
 
+def direct_light(light: render.Light) -> render.Light:
+    """What a surface without a mesh or pixels around it can show of ``light``: no further bounces, shadows, gloss,
+    albedo maps, lens or movement, and one exposure, the middle of a range; ambient light is that in the open. A
+    camera pixel's width still blurs the pattern where the light has pixels with an area."""
+    exposure = light.camera.exposure
+    middle = float(np.sqrt(exposure[0] * exposure[1])) if isinstance(exposure, tuple) else exposure
+    return (
+        light.changed(motion_mm=0.0, calibration_px=0.0)
+        .changed("surface", gloss=0.0, textures="none")
+        .changed("bounces", interreflection=False, ambient_occlusion=False, shadows=False)
+        .changed("camera", blur_px=0.0, falloff=0, exposure=middle)
+    )
+
+
 class SceneRenderer:
-    """Renders scenes with the light, sensor and empty background of a rig; caches the last background."""
+    """Renders scenes with the direct light, sensor and empty background of a rig; caches the last background."""
 
     def __init__(self, rig: Rig, light: render.Light | None = None) -> None:
-        self.rig, self.lamp = rig, light or render.named_light("paper")
+        self.rig, self.lamp = rig, direct_light(light or render.named_light("paper"))
         self.shape = (rig.camera.height, rig.camera.width)
         self._background_stream: tuple[object, ...] = ()
         self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
-        """The renderer for ``dataset``: the paper's light, with the noise of the dataset's camera where it says so."""
-        camera = dataset.manifest.settings.get("light", {}).get("camera", {})
-        noise = {key: camera[key] for key in ("full_well_e", "read_noise_e") if key in camera}
-        return cls(dataset.rig, render.named_light("paper").changed("camera", **noise))
+        """The renderer for ``dataset``: its light, and the paper's for an imported one."""
+        light = dataset.manifest.settings.get("light")
+        return cls(dataset.rig, None if light is None else render.Light.model_validate(light))
 
     @cached_property
     def exposure(self) -> render.Exposure:
@@ -184,9 +200,14 @@ class SceneRenderer:
 
     @cached_property
     def _uniform(self) -> render.Exposure:
+        """The mean light of each frame over the projector's pixels, which end where the pattern is carried on."""
         pattern = self.exposure.pattern
-        table = np.broadcast_to(pattern.table.mean(axis=2, keepdims=True), pattern.table.shape)
-        return replace(self.exposure, pattern=replace(pattern, table=np.ascontiguousarray(table)))
+        table = np.empty_like(pattern.table)
+        for frame, vertical in enumerate(pattern.vertical):
+            length = self.rig.projector.width if vertical else self.rig.projector.height
+            known = pattern.table[frame, :, : (length - 1) * pattern.per_px + 1]
+            table[frame] = known.mean(axis=1, keepdims=True)
+        return replace(self.exposure, pattern=replace(pattern, table=table))
 
     @cached_property
     def _other_pitch(self) -> render.Exposure:
@@ -201,11 +222,13 @@ class SceneRenderer:
         return self._lit(points_m, np.broadcast_to([0.0, 0.0, -1.0], points_m.shape))
 
     def light(self, surface: Surface) -> render.LitPixels:
-        """The direct light on ``surface``; no cast shadows, as in the paper."""
+        """The direct light on ``surface``."""
         return self._lit(surface.points_m(), surface.normals)
 
     def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> render.LitPixels:
-        return render.light_surface(points_m, normals, self.rig, self.lamp, self.exposure.pattern)
+        lit = render.light_surface(points_m, normals, self.rig, self.lamp, self.exposure.pattern)
+        exposure = self.lamp.camera.exposure
+        return lit if exposure == 1 else lit.brighter(np.float32(exposure))
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
@@ -221,6 +244,17 @@ class SceneRenderer:
             image.ravel()[scene.pixels] = values
             frames[index] = image * scene.mask if masked else image
         return frames
+
+    def decoded_mm(self, scene: Scene) -> NDArray[np.float32]:
+        """Depth (H, W) in mm decoded from the whole sequence on the scene's pixels, as a dataset's is; 0 beyond."""
+        frames = np.zeros((len(self.rig.sequence), *self.shape), dtype=np.uint8)
+        every = range(len(frames))
+        frames.reshape(len(frames), -1)[:, scene.pixels] = self.exposure.expose(
+            every, scene.lit, scene.pixels, scene.stream
+        )
+        seen = np.zeros(self.shape, dtype=bool)
+        seen.ravel()[scene.pixels] = True
+        return decode_stack(frames, self.rig, direction="both", mask=seen, reasons=False).depth_mm
 
     def _background(self, stream: tuple[object, ...], index: int, exposure: render.Exposure) -> NDArray[np.uint8]:
         if self._background_stream != stream:

@@ -1,7 +1,8 @@
 """The paper's two theorems (Section 4.2), checked numerically (docs/reliance.md); the subject is not used.
 
 *A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
-direction, noise included, if at each pixel the brighter one gets a lower albedo. *An error of one period costs Z^2*,
+direction, noise included, if at each pixel the brighter one gets a lower albedo (in direct light from a projector in
+focus at both: its blur would be a hint). *An error of one period costs Z^2*,
 and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
 """
 
@@ -20,6 +21,7 @@ from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.render import camera_noise
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction, Rig
 
@@ -104,6 +106,7 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
 
 
 def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surface], direction: Direction) -> Twins:
+    renderer = SceneRenderer(renderer.rig, renderer.lamp.changed("projector", defocus_px=0.0))
     lights = [renderer.light(surface) for surface in pair]
     gains = [light.gain.astype(np.float64) for light in lights]
     # Albedo can only be lowered, so at each pixel it is lowered on the brighter surface.
@@ -115,8 +118,9 @@ def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surfa
         return [np.asarray(camera.frames(scene, [index])[index]) for scene in scenes]
 
     sinusoids = renderer.rig.sequence.sinusoids
+    quiet = SceneRenderer(renderer.rig, renderer.lamp.changed("camera", **camera_noise(0.0)))
     frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
-    noiseless = frames(frame, SceneRenderer(renderer.rig, noise_sigma_grey=0.0))
+    noiseless = frames(frame, quiet)
     depths_mm = [surface.depth_mm(renderer.shape) for surface in pair]
     return Twins(first.sample, direction, frame, across, depths_mm, frames(frame), noiseless, frames(across), paint)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import tiny_settings
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
     LARGEST_SHIFT_RAD,
@@ -17,6 +18,8 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     plane,
 )
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.render import build, named_light
+from fpp_ml_bench.loaders.storage import DatasetFolder
 
 SAMPLE, OTHER = "power_drill_A0", "mug_A60"
 
@@ -31,14 +34,31 @@ def scenes(opened, renderer):
     return counterfactuals(opened, renderer, SAMPLE, "horizontal", [OTHER])
 
 
-def test_an_unchanged_scene_is_the_datasets_own(opened, renderer):
+WORN = (
+    named_light("hard").changed("surface", gloss=0.0, textures="none").changed(calibration_px=0.0)
+    .changed("camera", blur_px=0.0, falloff=0, exposure=0.8)
+)  # fmt: skip
+"""A defocused, flickering projector and a sensor with a response: stages that scenes share with their dataset."""
+
+
+@pytest.mark.parametrize("light", [named_light("paper"), WORN], ids=["paper", "hard"])
+def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
+    """Of a dataset in direct light, one ray a pixel: bounces and mixed pixels need the mesh, which a scene has not."""
+    direct = light.changed("bounces", interreflection=False, ambient_occlusion=False, shadows=False)
+    settings = tiny_settings(light=direct.changed("camera", rays_across=1), objects=("mug", "power_drill"))
+    build(tmp_path / "direct", settings, workers=1)
+    dataset = DatasetFolder(tmp_path / "direct")
+    renderer = SceneRenderer.of(dataset)
+    assert renderer.lamp == settings.light
     for sample in (SAMPLE, OTHER):
-        sample_scene = original(opened, renderer, sample)
-        frames = renderer.frames(sample_scene.scene, range(len(opened.sequence)))
+        sample_scene = original(dataset, renderer, sample)
+        frames = renderer.frames(sample_scene.scene, range(len(dataset.sequence)))
         for index, frame in enumerate(frames):
-            difference = np.abs(frame.astype(int) - opened.frame(sample, index))
+            difference = np.abs(frame.astype(int) - dataset.frame(sample, index))
             assert difference.max() <= 1
             assert (difference > 0).sum() <= 5
+        same = sample_scene.target == (dataset.depth_mm(sample) > 0)
+        assert (~same).sum() <= 1
 
 
 def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
@@ -114,6 +134,13 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
 
     bright = np.ptp(usual, axis=0) > 30
     assert (swing("no fringe inside")[bright & inside] < 15).all()
+    # The mean of whole periods is half of white light.
+    level = renderer.frames(scenes.reprojected["no fringe inside"], steps)[steps[0]][inside].astype(float)
+    white, black = (
+        renderer.frames(sample_scene.scene, [index])[index][inside].astype(float)
+        for index in (sequence.white, sequence.black)
+    )
+    assert np.median(level - (white + black) / 2) == pytest.approx(0, abs=1.0)
     np.testing.assert_array_equal(swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside])
     np.testing.assert_array_equal(swing("no fringe outside")[inside], np.ptp(usual, axis=0)[inside])
     swapped = renderer.frames(scenes.reprojected["other direction"], [0, sequence.white])
