@@ -32,12 +32,9 @@ from fpp_ml_bench.loaders.render import (
     Studio,
     TracedObject,
     build,
-    load_light,
     place,
     solid_mesh,
 )  # fmt: skip
-from fpp_ml_bench.loaders.render.pixels import mixed_pixels
-from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import paper_rig, pattern_image
 

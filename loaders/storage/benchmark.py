@@ -28,13 +28,34 @@ class Benchmark:
 
 
 BENCHMARKS = (
-    Benchmark("fpp-bench-full", 1, "full", FULL_SIZE, "F0"),
-    Benchmark("fpp-bench-full-224", 1, "full", 224, "F1"),
-    Benchmark("fpp-bench-mini", 1, "mini", MINI_SIZE, "F2"),
-    Benchmark("fpp-bench-unseen", 1, "unseen", FULL_SIZE, "F3"),
-    Benchmark("fpp-bench-workshop", 1, "full", FULL_SIZE, "F4", "workshop"),
-    Benchmark("fpp-bench-hard", 1, "full", FULL_SIZE, "F5", "hard"),
-)  # fmt: skip
+    Benchmark(
+        "fpp-bench-full", 1, "full", FULL_SIZE, "394c1522fe3442ef4e2afbbe6ea76b42ac6477cfbad62eb9a6d6445a3935379f"
+    ),
+    Benchmark("fpp-bench-full-224", 1, "full", 224, "a5dbf28a2e1ee5d2d772711f45a4f0481dd27c075d45b42a4543fa86099d82f7"),
+    Benchmark(
+        "fpp-bench-mini", 1, "mini", MINI_SIZE, "6dc6e35e4d5c2f194ba052443086af16bbc4d6b46f45d524655ebaa21cc9b1db"
+    ),
+    Benchmark(
+        "fpp-bench-unseen", 1, "unseen", FULL_SIZE, "d865570932e66a32c8f381880dd98f1b7cbe4bd7e3f0577c68f8ec08664a4b05"
+    ),
+    # The same objects and views under other lights.
+    Benchmark(
+        "fpp-bench-workshop",
+        1,
+        "full",
+        FULL_SIZE,
+        "fc627a8a95ad848c68a08a46415ebfa669f765be7bead0539df3b026de13bfc6",
+        "workshop",
+    ),
+    Benchmark(
+        "fpp-bench-hard",
+        1,
+        "full",
+        FULL_SIZE,
+        "23ee324d806d73b97d40e9ffe849f2be7e1efb61985312d9ea7adc03b8d10644",
+        "hard",
+    ),
+)
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 EARLIER = (
     Benchmark(

@@ -9,21 +9,31 @@ from conftest import tiny_settings
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.render import assembly_of, build, named_light, preset_settings
 from fpp_ml_bench.loaders.storage import benchmark as module
-from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, benchmark_of, benchmark_sentence, intended_benchmark
+from fpp_ml_bench.loaders.storage.benchmark import (
+    BENCHMARKS,
+    EARLIER,
+    benchmark_of,
+    benchmark_sentence,
+    intended_benchmark,
+)
 
 
 def test_names_and_fingerprints_are_told_apart():
-    assert len({(b.name, b.version) for b in BENCHMARKS}) == len({b.fingerprint for b in BENCHMARKS}) == len(BENCHMARKS)
-    for benchmark in BENCHMARKS:
+    known = (*BENCHMARKS, *EARLIER)
+    assert len({(b.name, b.version) for b in known}) == len({b.fingerprint for b in known}) == len(known)
+    assert len({b.name for b in BENCHMARKS}) == len(BENCHMARKS)
+    for benchmark in known:
         assert len(bytes.fromhex(benchmark.fingerprint)) == 32
         assert benchmark_of(benchmark.fingerprint) is benchmark
     assert benchmark_of("0" * 64) is None
-    assert BENCHMARKS[0].title == "fpp-bench-full version 0"
+    assert BENCHMARKS[0].title == "fpp-bench-full version 1"
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
 def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
-    manifest = assembly_of(preset_settings(benchmark.preset, benchmark.size)).manifest  # no rows yet: other bytes
+    manifest = assembly_of(
+        preset_settings(benchmark.preset, benchmark.size, benchmark.light)
+    ).manifest  # no rows yet: other bytes
     assert intended_benchmark(manifest) is benchmark
     as_expected, sentence = benchmark_sentence(manifest)
     assert not as_expected
@@ -34,7 +44,7 @@ def test_settings_of_ones_own_are_no_benchmark():
     settings = preset_settings("mini")
     for other in (
         replace(settings, seed=1),
-        replace(settings, light=named_light("workshop")),
+        replace(settings, light=named_light("workshop")),  # a light of the full set alone
         replace(settings, stored="single_shot"),
     ):
         manifest = assembly_of(other).manifest
@@ -50,13 +60,13 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     assert "benchmark: a dataset of its own" in capsys.readouterr().out
     known = replace(BENCHMARKS[0], name="fpp-bench-tiny", fingerprint=manifest.fingerprint)
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
-    monkeypatch.setattr(module, "preset_settings", lambda preset, size: settings)
+    monkeypatch.setattr(module, "preset_settings", lambda preset, size, light: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
-    assert "benchmark: this is fpp-bench-tiny version 0" in capsys.readouterr().out
+    assert "benchmark: this is fpp-bench-tiny version 1" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 0}
+    assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 1}
     monkeypatch.setattr(module, "BENCHMARKS", (replace(known, fingerprint="ab" * 32),))
     assert main(["verify", str(tmp_path / "data")]) == 0
     output = capsys.readouterr()
-    assert "warning: built with the settings of fpp-bench-tiny version 0, but not its bytes" in output.err
+    assert "warning: built with the settings of fpp-bench-tiny version 1, but not its bytes" in output.err
     assert "benchmark" not in output.out
