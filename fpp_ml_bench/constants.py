@@ -47,6 +47,10 @@ UNSEEN = (
 MINI_OBJECTS = ("bowl", "cracker_box", "banana", "mug", "power_drill", "wooden_boards")
 MINI_SIZE = 480
 FULL_SIZE = 960
+PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
+    "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
+}  # fmt: skip
+"""Objects and image width of each."""
 
 
 def split_of(name: str) -> str:

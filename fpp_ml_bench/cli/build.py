@@ -8,6 +8,7 @@ from time import perf_counter
 from fpp_ml_bench import optics
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
+from fpp_ml_bench.constants import PRESETS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.machine import usable_cores
@@ -27,9 +28,7 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or one whose build was interrupted")
-    parser.add_argument(
-        "--preset", choices=tuple(render.PRESETS), default="mini", help="objects and size (default: mini)"
-    )
+    parser.add_argument("--preset", choices=tuple(PRESETS), default="mini", help="objects and size (default: mini)")
     parser.add_argument("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
@@ -54,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     """Build settings that the arguments ask for; raises `BuildError`, `MeshError` or `RigError`."""
-    objects, size = render.PRESETS[args.preset]
+    objects, size = PRESETS[args.preset]
     if args.size is not None and not 1 <= args.size <= 8192:
         raise BuildError(f"--size {args.size}: expected 1 to 8192 px")
     rig = optics.paper_rig(args.size or size) if args.rig is None else optics.load_rig(args.rig)

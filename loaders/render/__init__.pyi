@@ -18,7 +18,6 @@ from .projector import PatternLight as PatternLight
 from .raycast import Hits as Hits
 from .raycast import PixelRays as PixelRays
 from .raycast import TracedObject as TracedObject
-from .scene import PRESETS as PRESETS
 from .scene import BuildSettings as BuildSettings
 from .scene import SolidMesh as SolidMesh
 from .scene import UserMesh as UserMesh

@@ -13,16 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import (
-    FULL_SIZE,
-    MINI_OBJECTS,
-    MINI_SIZE,
-    MM_PER_M,
-    OBJECTS,
-    UNSEEN,
-    VIEW_DEGREES,
-    VIEWS,
-)  # fmt: skip
+from fpp_ml_bench.constants import MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.paint import Paint
@@ -30,9 +21,6 @@ from fpp_ml_bench.loaders.render.projector import check_focus
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
-    "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
-}  # fmt: skip
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
 

@@ -23,8 +23,8 @@ STEPS = (3, 4, 6, 9, 18)
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory):
-    """A cork at 240 px and noise of 3 grey levels, where sensor noise and not the 8-bit pattern decides. In direct light
-    on one ray a pixel: further bounces and mixed pixels move the phase by something that no step averages away."""
+    """A cork at 240 px and noise of 3 grey levels, where sensor noise and not the 8-bit pattern decides. In direct
+    light on one ray a pixel: further bounces and mixed pixels move the phase by what no step averages away."""
     folder = tmp_path_factory.mktemp("noisy") / "set"
     noisy = DIRECT.changed("camera", **camera_noise(3.0))
     build(folder, BuildSettings(paper_rig(240), ("bowl", "cork"), light=noisy), workers=1)

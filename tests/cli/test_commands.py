@@ -15,6 +15,7 @@ from conftest import TINY_SIZE
 
 from fpp_ml_bench.cli import COMMANDS, evaluate, main
 from fpp_ml_bench.constants import VIEWS
+from fpp_ml_bench.loaders.sample import VOID
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "torch", "datasets", "pyarrow", "scipy", "cv2", "numba", "matplotlib", "pydantic", "yaml", "trimesh")
@@ -116,8 +117,8 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["build", "OUT", "--seed", "9" * 20], "seed 9999"),
         (["build", "OUT", "--workers", "0"], "--workers 0"),
         (["build", "OUT", "--workers", "two"], "--workers"),
-        (["build", "OUT", "--noise-sigma", "nan"], "noise of nan"),
-        (["build", "OUT", "--noise-sigma", "-1"], "noise of -1"),
+        (["build", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
+        (["build", "OUT", "--noise-sigma", "-1"], "--noise-sigma -1: expected 0 to 50"),
         (["build", "OUT", "--pitch", "nan"], "pitch"),
         (["build", "OUT", "--pitch", "inf"], "pitch"),
         (["build", "OUT", "--pitch", "0"], "pitch"),
@@ -212,7 +213,7 @@ def test_info_json_says_what_is_there(tiny, opened, capsys):
         errors, covers = [], []
         for sample in names:
             depth, exact = (opened.depth_mm(sample, c).astype(np.float64) for c in ("depth", "depth_exact"))
-            decoded = (depth > 0) & (exact > 0)
+            decoded = (depth > 0) & (exact > 0) & ((opened.flags(sample) & VOID) == 0)
             errors.append(np.abs(depth - exact)[decoded].mean())
             covers.append((depth > 0).mean())
         assert split["samples"] == len(names)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 from fpp_ml_bench.baselines.phase_route.object_mask import image_noise_grey
 from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.evaluation.submission import read_submission
+from fpp_ml_bench.loaders.render import BuildSettings, build
 from fpp_ml_bench.optics import Rig
 
 SIZE = RIG.camera.width
@@ -226,6 +230,26 @@ def test_method_is_registered_and_reports_itself() -> None:
     assert depth_mm.dtype == np.float32 and depth_mm.shape == (SIZE, SIZE)
 
 
+def test_the_users_word_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = str(tmp_path / "set")
+    build(Path(dataset), BuildSettings(RIG, ("cork",), stored="single_shot"), workers=1)
+    word = ["--white-grey", "180", "--ambient-grey", "0"]
+    for method in ("phase", "phase-net"):
+        out = tmp_path / method
+        assert main(["predict", method, dataset, "--out", str(out), "--split", "all", *word]) == 0
+        settings = read_submission(out).settings
+        assert (settings["white_grey"], settings["ambient_grey"]) == (180.0, 0.0)
+    for arguments, message in (
+        (["phase", dataset, "--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
+        (["phase-net", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
+        (["classical", dataset, "--ambient-grey", "6"], "--ambient-grey is an option of phase, not of classical"),
+    ):
+        capsys.readouterr()
+        assert main(["predict", *arguments, "--out", str(tmp_path / "wrong")]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "wrong").exists()
+
+
 def test_refusals_name_what_came() -> None:
     with pytest.raises(DecodeError, match="frame 0 is missing"):
         PhaseMethod(RIG).predict([None] * 52)
@@ -233,6 +257,10 @@ def test_refusals_name_what_came() -> None:
         route("horizontal").measure(np.zeros((SIZE, SIZE)))
     with pytest.raises(DecodeError, match=r"\(100, 480\)"):
         route("horizontal").measure(np.zeros((100, SIZE), np.uint8))
-    for wrong in ({"direction": "both"}, {"prior": "shape"}, {"min_confidence": 1.0}, {"jump_rad": 0.0}, {"pitch": 3}):
+    for wrong in (
+        {"direction": "both"}, {"prior": "shape"}, {"min_confidence": 1.0}, {"jump_rad": 0.0}, {"pitch": 3},
+        {"white_grey": 0.0}, {"white_grey": float("nan")}, {"white_grey": float("inf")}, {"ambient_grey": -1.0},
+        {"ambient_grey": float("nan")}, {"ambient_grey": 300.0},
+    ):  # fmt: skip
         with pytest.raises(PredictionError, match=next(iter(wrong))):
             PhaseMethod(RIG, **wrong)

@@ -8,12 +8,21 @@ import pytest
 import trimesh
 from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 
-from fpp_ml_bench.constants import MINI_OBJECTS, OBJECTS, SPLITS, TEST_OBJECTS, VALIDATION_OBJECTS, VIEWS, split_of
+from fpp_ml_bench.constants import (
+    MINI_OBJECTS,
+    OBJECTS,
+    PRESETS,
+    SPLITS,
+    TEST_OBJECTS,
+    VALIDATION_OBJECTS,
+    VIEWS,
+    split_of,
+)
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.builder import assembly_of, build, plan_build
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.meshes import single_mesh
-from fpp_ml_bench.loaders.render.scene import PRESETS, BuildSettings
+from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
 from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
