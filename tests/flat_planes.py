@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.loaders.render import (
     BuildSettings,
     Exposure,
+    Light,
     Studio,
     camera_noise,
     light_surface,
@@ -25,12 +26,17 @@ OTHER_RIG = replace(
 )  # fmt: skip
 FIRST = {"horizontal": 0, "vertical": 18}
 """The first fringe of each direction."""
+PAPER = named_light("paper")
+DIRECT = PAPER.changed("bounces", interreflection=False, ambient_occlusion=False).changed("camera", rays_across=1)
+"""Light of one bounce, on the central ray of each pixel: closed forms of noise and modulation hold in it."""
+USERS_WORD = {"white_grey": PAPER.camera.reference_grey, "ambient_grey": PAPER.ambient_grey}
+"""Photometric calibration of a plane that fills the frame: no background is left to calibrate its brightness."""
 
 
 @cache
-def photograph(name: str, view: str, rig: Rig = RIG):
+def photograph(name: str, view: str, rig: Rig = RIG, light: Light = PAPER):
     """An object of the benchmark, anywhere in the working range."""
-    studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied"))
+    studio = Studio(BuildSettings(rig=rig, objects=(name,), placement="varied", light=light))
     row = studio.photograph(solid_mesh(name), view)
     return replace(row, frames={index: frame.copy() for index, frame in row.frames.items()})
 
@@ -42,14 +48,15 @@ def plane_depth_m(rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0,
 
 
 def plane_fringe(
-    rig: Rig, frame: int, depth_m: NDArray[np.float64], tilt: tuple[float, float] = (0.0, 0.0), noise: float = 1.0
-) -> NDArray[np.uint8]:
+    rig: Rig, frame: int, depth_m: NDArray[np.float64], tilt: tuple[float, float] = (0.0, 0.0), noise: float = 1.0,
+    light: Light = PAPER,
+) -> NDArray[np.uint8]:  # fmt: skip
     """Frame ``frame`` of a matte plane, uint8 (H, W)."""
     x, y = rig.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None]
     normal = np.array([tilt[0], tilt[1], -1.0])
     normals = np.broadcast_to(normal / np.linalg.norm(normal), points.shape)
-    light = named_light("paper").changed("camera", **camera_noise(noise))
+    light = light.changed("camera", **camera_noise(noise))
     exposure = Exposure.of(rig, light)
     lit = light_surface(points.reshape(-1, 3), normals.reshape(-1, 3), rig, light, exposure.pattern)
     pixels = np.arange(x.size, dtype=np.uint32)

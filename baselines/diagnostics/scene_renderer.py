@@ -1,8 +1,8 @@
 """Surfaces seen by a rig's camera, and rendered frames of scenes with them that are not in a dataset.
 
 Scenes are in direct light (`direct_light`): a changed scene is compared with its sample in the same light, never with
-the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a dataset
-in direct light, noise included, except for a few pixels in 50,000 that differ by a grey level
+the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a
+dataset in direct light, noise included, except for a few pixels in 50,000 that differ by a grey level
 (tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel depends only on the dataset's seed, the object,
 view, frame and pixel, so it is the same in a changed scene.
 """
