@@ -1,12 +1,13 @@
 """Surfaces seen by a rig's camera, and rendered frames of scenes with them that are not in a dataset.
 
 Scenes are in direct light (`direct_light`): a changed scene is compared with its sample in the same light, never with
-the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a dataset
-in direct light, noise included, except for a few pixels in 50,000 that differ by a grey level
+the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a
+dataset in direct light, noise included, except for a few pixels in 50,000 that differ by a grey level
 (tests/diagnostics/test_counterfactual_scenes.py). The noise of a pixel depends only on the dataset's seed, the object,
 view, frame and pixel, so it is the same in a changed scene.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -227,8 +228,9 @@ class SceneRenderer:
 
     def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> render.LitPixels:
         lit = render.light_surface(points_m, normals, self.rig, self.lamp, self.exposure.pattern)
-        exposure = self.lamp.camera.exposure
-        return lit if exposure == 1 else lit.brighter(np.float32(exposure))
+        exposure = self.lamp.camera.exposure  # of a range that views draw from, the middle of its logarithms
+        factor = math.sqrt(math.prod(exposure)) if isinstance(exposure, tuple) else exposure
+        return lit if factor == 1 else lit.brighter(np.float32(factor))
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""

@@ -154,12 +154,15 @@ def _dataset(folder: Path, objects: int, size: int, stored: str = "single_shot",
     frames = {index: rng.integers(0, 255, (size, size), np.uint8) for index in stored_frames(PAPER_SEQUENCE, stored)}
     depth_mm = 1800 + rng.random((size, size), np.float32)
     depth_mm[:, : size // 2] = 0
+    nothing = np.zeros((size, size), np.uint8)  # no flags, no cover
     shards, samples = [], []
     names = [f"object_{number:04d}" for number in range(objects)]
     samples_by_object = {name: [(sample_name(name, view), name, view) for view in VIEWS[:views]] for name in names}
     writer = ShardWriter(target, scratch, PAPER_SEQUENCE, stored, True, (size, size))
     for plan in plan_shards("test", samples_by_object):
-        files, rows = writer.write(plan, (Row(*where, frames, depth_mm, depth_mm) for where in plan.samples))
+        files, rows = writer.write(
+            plan, (Row(*where, frames, depth_mm, depth_mm, {}, nothing, nothing) for where in plan.samples)
+        )
         shards += files
         samples += rows
     Manifest(

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from flat_planes import FIRST, OTHER_RIG, RIG, photograph, plane_depth_m, plane_fringe
+from flat_planes import FIRST, OTHER_RIG, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod, load_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Settings
+from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Reason, Settings
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
 from fpp_ml_bench.optics import Rig, paper_rig
 
@@ -78,12 +78,25 @@ def test_an_empty_scene_has_no_depth() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("distance_m", [1.5, 1.8, 2.1])
 def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None:
-    """Where the UNet collapses to background; at the benchmark's resolution, without background in view."""
-    rig = part_of(paper_rig(960), 240)
+    """Where the UNet collapses to background; at the benchmark's resolution, without background in view, so the user
+    says how bright the lamp is."""
+    rig, file = part_of(paper_rig(960), 240), load_net()
+    told = Settings(direction, **USERS_WORD)  # type: ignore[arg-type]
     image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
-    measurement = PhaseNetMethod(rig, direction).route.measure(image)
+    measurement = NetworkRoute(rig, told, file.network, file.config.threshold, lead=file.config.lead).measure(image)
     assert (measurement.depth_mm > 0).mean() > 0.98
     assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_a_plane_in_unknown_light_is_ambiguous(direction: str) -> None:
+    """The same without background in view and without the user's word: no order can be told from brightness."""
+    rig = part_of(paper_rig(960), 240)
+    measurement = PhaseNetMethod(rig, direction).route.measure(  # type: ignore[arg-type]
+        plane_fringe(rig, FIRST[direction], plane_depth_m(rig, 1.8))
+    )
+    several = (measurement.candidates.count > 1) & (measurement.depth_mm > 0)
+    assert several.mean() > 0.9 and (measurement.reason[several] == Reason.AMBIGUOUS).all()
 
 
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 import torch
-from flat_planes import plane_depth_m, plane_fringe
+from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
@@ -35,14 +35,15 @@ CONFIG = NetConfig(
 
 
 def geometry(direction: str = "horizontal") -> Geometry:
-    return Geometry.of(RIG, Settings(direction=direction))  # type: ignore[arg-type]
+    """Of a calibrated lamp: planes that fill the frame show no background to take its strength from."""
+    return Geometry.of(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
 
 
 def plane(distance_m: float, direction: str = "horizontal") -> Sample:
-    """A tilted plane that fills the frame."""
+    """A tilted plane that fills the frame; one ray a pixel, since the fringe is to be as deep as it is bright."""
     tilt = (0.1, -0.1)
     depth_m = plane_depth_m(RIG, distance_m, tilt)
-    image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3)
+    image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT)
     return sample_of(image, (1000 * depth_m).astype(np.float32), "plane_A0", geometry(direction))
 
 

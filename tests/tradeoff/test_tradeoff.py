@@ -276,7 +276,8 @@ def test_sizes_are_photographed_and_scored(tiny):
     )
     assert first.title == second.title.replace("vertical", "both").replace("=3", "=18") and third.key.endswith("phase")
     scored_point = measured(first, QUICK)
-    assert scored_point.image_px == 240 and scored_point.frames == 50 and 0.05 < scored_point.measured_mae_mm < 0.5
+    # 0.76 mm with pixels that mix surfaces and bounced light; 0.18 mm in direct light, one ray a pixel.
+    assert scored_point.image_px == 240 and scored_point.frames == 50 and 0.5 < scored_point.measured_mae_mm < 1.2
 
 
 def test_refusals(small, tiny, tmp_path, capsys):
