@@ -67,7 +67,8 @@ class GroupKey:
 
     @property
     def is_legacy(self) -> bool:
-        return self.fingerprint in LEGACY_FINGERPRINTS or benchmark_of(self.fingerprint) in EARLIER
+        benchmark = benchmark_of(self.fingerprint)
+        return self.fingerprint in LEGACY_FINGERPRINTS if benchmark is None else benchmark in EARLIER
 
     @property
     def order(self) -> tuple[object, ...]:
