@@ -118,6 +118,14 @@ def test_data_of_a_named_benchmark_is_not_legacy(files, monkeypatch):
     assert not group.key.is_legacy and group.key.title.startswith("fpp-bench-full-224 version 0")
 
 
+def test_data_of_an_earlier_version_is_named_and_legacy(files):
+    entry = read_entries(files[:1])[0]
+    for earlier in benchmark.EARLIER:
+        (group,) = rank([with_fingerprint(entry, earlier.fingerprint)])
+        assert group.key.is_legacy
+        assert group.key.title.startswith(f"{earlier.title}, ") and ", legacy: " in group.key.title
+
+
 def test_shipped_rows_are_of_a_benchmark_or_legacy(shipped):
     for group in rank(shipped):
         assert group.key.is_legacy or benchmark_of(group.key.fingerprint) is not None
