@@ -11,7 +11,8 @@ those. Results are compared bit by bit as they come. The first round compiles an
 - build: the real builder, six views, all 52 frames stored, and frame 0 alone.
 - decode: 52 frames to depth from both directions without the reasons of invalid pixels (as ``predict classical`` does);
   and inside the object mask alone, against the whole image.
-- the fewest frames: the same depth from 36 frames, and from 6 instead of 20.
+- the fewest frames: the same depth from 36 frames, and from 6 instead of 20, where a pixel sees one lit surface: of a
+  mixed pixel each frame may show another one, and the frames that are left out would have refused it.
 - phase: the single-shot phase route in its crop around the object, against the whole image. The crop is part of that
   method, so its maps are not compared.
 - eval: every score of the six samples.
@@ -37,6 +38,7 @@ from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.render import BuildSettings, build, single_mesh
+from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import paper_rig
@@ -119,9 +121,14 @@ def measure(
     add("decode, depth alone", *switched(lambda: depth(reasons=False)))
     add("decode in the mask, against whole and masked", lambda: depth(mask=mask, reasons=False),
         lambda: np.where(mask, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes())  # fmt: skip
-    add("36 frames against 50", lambda: depth(fewest=True, reasons=False), lambda: depth(reasons=False))
-    add("6 frames against 20", lambda: depth(steps=3, fewest=True, reasons=False),
-        lambda: depth(steps=3, reasons=False))  # fmt: skip
+    void = (dataset.flags(samples[0]) & VOID) > 0
+
+    def unmixed(**options: Any) -> bytes:
+        depth_mm = decode_stack(frames, rig, reasons=False, **options).depth_mm
+        return np.where(void, np.float32(0), depth_mm).tobytes()
+
+    add("36 frames against 50", lambda: unmixed(fewest=True), unmixed)
+    add("6 frames against 20", lambda: unmixed(steps=3, fewest=True), lambda: unmixed(steps=3))
     cropped, whole = PhaseRoute(rig), PhaseRoute(rig)
     whole._crop = lambda region: (slice(0, size), slice(0, size))  # type: ignore[method-assign]
     add("phase route in its crop, against whole", lambda: cropped.measure(frames[0]).counts,
