@@ -182,7 +182,9 @@ def test_the_users_word_gives_way_to_the_images_own_background() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("name", ["cork", "mug"])
 def test_exposure_does_not_matter(name: str, direction: str) -> None:
-    """The lamp's strength is read from the image. Noise stays as it is, so dim pixels at the silhouette go missing."""
+    """The lamp's strength is read from the image, so pixels that are found have the same error. Noise stays as it is,
+    so dim pixels go missing: of the cork 23, 34 and 61 in 8,260. The benchmark's object MAE counts each with its whole
+    depth, so that one rises, from 7.6 to 16.6 mm."""
     errors, found = {}, {}
     for exposure in (1.0, 0.5, 0.25):
         row = photograph(name, "A60", light=PAPER.changed("camera", exposure=exposure))
