@@ -13,6 +13,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     PITCH_FACTOR,
     SceneRenderer,
+    direct_light,
     moved,
     normals_of_depth,
     plane,
@@ -59,6 +60,18 @@ def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
             assert (difference > 0).sum() <= 5
         same = sample_scene.target == (dataset.depth_mm(sample) > 0)
         assert (~same).sum() <= 1
+
+
+def test_direct_light_keeps_projector_sensor_and_brightness():
+    hard = named_light("hard")
+    direct = direct_light(hard)
+    assert direct.projector == hard.projector and direct.ambient_grey == hard.ambient_grey
+    off = {"gloss", "textures", "interreflection", "shadows", "ambient occlusion", "lens blur", "vignetting",
+           "calibration error"}  # fmt: skip
+    assert {name for name, on in hard.stages().items() if on and not direct.stages()[name]} <= off
+    assert not any(direct.stages()[name] for name in off)
+    low, high = hard.camera.exposure
+    assert direct.camera.exposure == pytest.approx(np.sqrt(low * high)) and direct_light(direct) == direct
 
 
 def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
