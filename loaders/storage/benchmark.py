@@ -5,7 +5,7 @@ result is only comparable with results on the same bytes. A benchmark therefore 
 from dataclasses import dataclass
 
 from fpp_ml_bench.constants import FULL_SIZE, MINI_SIZE
-from fpp_ml_bench.loaders.render import preset_settings
+from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 
 
@@ -80,7 +80,7 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
         return None
     content = (manifest.settings, manifest.rig, manifest.stored)
     for benchmark in BENCHMARKS:
-        settings = preset_settings(benchmark.preset, benchmark.size, benchmark.light)
+        settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light)
         if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
             return benchmark
     return None

@@ -60,7 +60,7 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     assert "benchmark: a dataset of its own" in capsys.readouterr().out
     known = replace(BENCHMARKS[0], name="fpp-bench-tiny", fingerprint=manifest.fingerprint)
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
-    monkeypatch.setattr(module, "preset_settings", lambda preset, size, light: settings)
+    monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: this is fpp-bench-tiny version 1" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json"]) == 0
