@@ -5,10 +5,12 @@ Object coordinates are metres with z up and the turning axis as z. Camera coordi
 z forward. At angle 0 the object's +x axis points away from the camera (paper Section 3.1: R_z(60 degrees x i)).
 """
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass, field, replace
 from difflib import get_close_matches
 from hashlib import blake2b
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +18,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
-from fpp_ml_bench.loaders.render.paint import Paint
-from fpp_ml_bench.loaders.render.projector import check_focus
 from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+
+if TYPE_CHECKING:  # the name of a benchmark needs settings alone
+    from fpp_ml_bench.loaders.render.paint import Paint
 
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
@@ -80,7 +83,10 @@ class BuildSettings:
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
-        check_focus(self.rig, self.light.projector)
+        if self.light.projector.defocus_px > 0:
+            from fpp_ml_bench.loaders.render.projector import check_focus  # loads numba
+
+            check_focus(self.rig, self.light.projector)
 
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""

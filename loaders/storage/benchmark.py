@@ -79,7 +79,8 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     if manifest.origin != GENERATED:
         return None
     content = (manifest.settings, manifest.rig, manifest.stored)
-    for benchmark in BENCHMARKS:
+    light = manifest.settings.get("light", {}).get("name")
+    for benchmark in (benchmark for benchmark in BENCHMARKS if benchmark.light == light):
         settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light)
         if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
             return benchmark
