@@ -43,6 +43,20 @@ def test_packages_come_from_their_folders():
         assert "/".join(filter(None, (mapping[parent], inner))) == folder
 
 
+def test_every_data_file_is_installed():
+    """Files beside the modules are in the wheel; the rows' pictures, 9 MB, are not."""
+    data = _setuptools()["package-data"]
+    left = []
+    for name, folder in _package_folders().items():
+        patterns = (*data["*"], *data.get(name, ()))
+        inner = [ROOT / other for other in _package_folders().values() if other.startswith(f"{folder}/")]
+        for file in sorted((ROOT / folder).rglob("*")):
+            own = not any(file.is_relative_to(other) for other in inner)
+            if own and file.is_file() and file.suffix not in (".py", ".pyc", ".png", ".nbi", ".nbc"):
+                left += [file] if not any(file.relative_to(ROOT / folder).match(p) for p in patterns) else []
+    assert left == []
+
+
 def test_checkout_as_current_folder_brings_its_own_subpackages():
     code = "import fpp_ml_bench, importlib\n" + "".join(
         f"print(importlib.import_module('fpp_ml_bench.{subpackage}').__file__)\n" for subpackage in SUBPACKAGES

@@ -66,13 +66,15 @@ class Lighting:
         self, mesh: SolidMesh, traced: TracedObject, degrees: float, offset_m: NDArray[np.float64]
     ) -> "ObjectLight":
         """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be ``traced``."""
-        surfels = bounced = None
+        surfels = None
         if self.light.bounces.interreflection or self.light.bounces.ambient_occlusion:
             if self._surfels is None or self._surfels[0] is not mesh:
                 self._surfels = mesh, Surfels.of(mesh)
             surfels = self._surfels[1]
-        upon = ObjectLight(self, mesh, traced, degrees, offset_m, surfels, bounced)
-        return replace(upon, bounced=upon.between_surfels(self._returned)) if self._returned is not None else upon
+        upon = ObjectLight(self, mesh, traced, degrees, offset_m, surfels, None)
+        if surfels is None or self._returned is None:
+            return upon
+        return replace(upon, bounced=upon.between_surfels(surfels, self._returned))
 
 
 @dataclass(frozen=True)
@@ -116,17 +118,16 @@ class ObjectLight:
             mix_frames(arriving[1:], self.lighting.mix, factor, own, bounced)
         return replace(lit, ambient=ambient, bounced=bounced)
 
-    def between_surfels(self, plane: PlaneLight) -> NDArray[np.float64]:
+    def between_surfels(self, surfels: Surfels, plane: PlaneLight) -> NDArray[np.float64]:
         """Irradiance of the surfels by further bounces in every mode, of light that ``plane`` sends back too; float64
         (K, J)."""
-        assert self.surfels is not None
         rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.modes
-        points = self.surfels.points
+        points = surfels.points
         placed = turned(points.position_m, self.degrees) + self.offset_m
         arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)
         direct = np.empty((len(pattern.table), len(placed)))
         pattern.read(arriving.place, arriving.irradiance, direct)
         material = material_of(self.mesh, points.position_m, points.normal, light.surface, points.triangle)
         albedo = points.mean(np.broadcast_to((1.0 - material.gloss) * material.albedo, len(placed)))
-        outside = plane.upon(self.surfels, self.degrees, self.offset_m)
-        return between_surfels(self.surfels, points.mean(direct.T), outside, albedo)
+        outside = plane.upon(surfels, self.degrees, self.offset_m)
+        return between_surfels(surfels, points.mean(direct.T), outside, albedo)
