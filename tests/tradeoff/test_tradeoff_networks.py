@@ -16,6 +16,7 @@ from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured
 from fpp_ml_bench.baselines.tradeoff.networks import calibration, network_settings
 from fpp_ml_bench.baselines.tradeoff.settings import TradeoffSettings, choose_views
 from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.leaderboard.page import board_ladder
 from fpp_ml_bench.optics import paper_rig
 
 SIZE = (32, 48)
@@ -123,11 +124,13 @@ def test_a_processor_without_bf16_is_named(monkeypatch, tmp_path):
 
 def test_every_rung_of_every_ladder_can_be_prepared(tmp_path):
     """The smallest rung is run, and a network takes each of its sizes."""
-    ladders = package_ladders(paper_rig(480))
+    ladders = package_ladders(paper_rig(480), more=(board_ladder(),))
     for number, ladder in enumerate(ladders):
         (folder := tmp_path / str(number)).mkdir()
         rung = ladder.prepare(ladder.steps[0], folder)
-        rung.run()
+        result = rung.run()
+        if isinstance(result, dict):  # the seconds of its parts
+            assert result and all(isinstance(seconds, float) and seconds >= 0 for seconds in result.values())
         assert rung.amount > 0 and list(ladder.steps) == sorted(set(ladder.steps)) and len(ladder.steps) >= 3
     (unet,) = (ladder for ladder in ladders if "UNet" in ladder.stage and ladder.over == "pixels")
     for size in unet.steps:
