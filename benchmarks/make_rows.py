@@ -39,10 +39,6 @@ METHODS: dict[str, tuple[object, ...]] = {
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
     },
     **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
-    **{
-        f"phase-net-fresh-{direction}": ("phase-net", "--weights", "phase-net-fresh", "--fringe", direction)
-        for direction in ("horizontal", "vertical")
-    },
     "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
 """File name of a row: method and options."""

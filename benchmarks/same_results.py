@@ -70,7 +70,7 @@ METHODS = (
     "phase three --split all", "phase shadows", "phase varied", "phase noisy", "phase own-mesh --split all",
     "phase vertical --fringe vertical",
     "phase-net mini", "phase-net mini --fringe vertical", "phase-net mini --no-shading",
-    "phase-net mini --weights phase-net-fresh", "phase-net mini --frames 2", "phase-net three", "phase-net noisy",
+    "phase-net mini --weights phase-net", "phase-net mini --frames 2", "phase-net three", "phase-net noisy",
     "phase-net deep --min-confidence 0.5", "unet-global-rmse small", "unet-global-rmse mini",
     "unet-global-rmse small --range mean", "unet-individual-rmse small", "unet-individual-rmse small --range oracle",
     "unet-individual-rmse small --range mean", "unet-individual-rmse three --split all --frame 20",

@@ -30,10 +30,10 @@ TOLD = {
     "oracle range + mask": "the test sample's depth range and object mask",
 }
 """What the methods of a track are told about the very samples that they are scored on."""
-ASSUMED = "one albedo, known exposure"
+ASSUMED = "one albedo, a lit background"
 _ASSUMES = (
-    "Assumes one albedo for all surfaces and a known exposure (the lamp's strength and the ambient light): the "
-    "brightness of the fringe image decides the fringe order."
+    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
+    "the fringe image decides the fringe order."
 )
 """What the phase route and the learned one assume, in a few words and as a sentence, unless ``shading`` is off."""
 LONGEST_NAME = 36

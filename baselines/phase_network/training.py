@@ -353,8 +353,7 @@ def train_phase_net(
         lead = chosen_lead(answers, validation, geometries)
         means = mean_scores((with_lead(one, lead) for one in answers), validation, geometries, threshold)
     config = training.NetConfig(
-        name=recipe.name if extra_data is None else f"{recipe.name}-fresh",
-        title="Fringe order, mask and bounded phase correction", options=network.options,
+        name=recipe.name, title="Fringe order, mask and bounded phase correction", options=network.options,
         threshold=threshold, lead=lead, period_px={direction: g.route.period_px for direction, g in geometries.items()},
         dataset_fingerprint=opened.fingerprint, benchmark=training.training_benchmark(opened.fingerprint),
         steps=recipe.steps, recipe=described, validation=dict(means),

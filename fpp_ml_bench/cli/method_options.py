@@ -56,9 +56,11 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--ambient-grey", type=float, metavar="GREY",
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
              "image's darkest)")  # fmt: skip
-    add("--weights", metavar="FILE",
-        help="weights of phase-net: a file or a name that comes with the package (phase-net, the default, or "
-             "phase-net-fresh, trained on additional objects)")  # fmt: skip
+    add(
+        "--weights",
+        metavar="FILE",
+        help="weights of phase-net: a file, such as training writes (default: those that come with the package)",
+    )
     add = parser.add_argument_group("trained networks").add_argument
     add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "

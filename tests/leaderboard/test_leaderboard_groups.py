@@ -141,7 +141,6 @@ def test_short_names_of_shipped_rows(shipped):
     expected = {
         "phase-03-vertical": "Phase, 3 vertical",
         "phase-net-horizontal": "phase-net, 1 horizontal",
-        "phase-net-fresh-vertical": "phase-net-fresh, 1 vertical",
         "classical-18-both": "Classical 18+Gray, both",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
         "cpu-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
@@ -210,16 +209,16 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
         for row in group.rows:
             result = row.entry.result
             if result.submission.method in ("phase", "phase-net"):
-                assert assumption(result) == "one albedo, known exposure"
-                assert "one albedo for all surfaces and a known exposure" in assumption_sentences(result)
+                assert assumption(result) == "one albedo, a lit background"
+                assert "one albedo for all surfaces and a lit background" in assumption_sentences(result)
             else:
                 assert assumption(result) == ""
             assert ("Told the test sample's" in assumption_sentences(result)) == (result.track != "metric")
     (group,) = (group for group in rank(shipped) if any(row.entry.path.stem == "phase-vertical" for row in group.rows))
     pages = page_files([group], [])
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
-    assert own and all("known exposure" in text for text in own)
-    assert "phase and phase-net assume one albedo, known exposure." in readme_block([group])
+    assert own and all("a lit background" in text for text in own)
+    assert "phase and phase-net assume one albedo, a lit background." in readme_block([group])
 
 
 def test_the_papers_errors_are_shown_apart(shipped):
