@@ -1,0 +1,17 @@
+from .axes import CLEAN as CLEAN
+from .axes import SETS as SETS
+from .axes import Corruptions as Corruptions
+from .axes import corruptions as corruptions
+from .report import write_page as write_page
+from .report import write_worst as write_worst
+from .run import Setup as Setup
+from .run import View as View
+from .run import measure as measure
+from .scenes import CACHE as CACHE
+from .scenes import Condition as Condition
+from .scenes import FrameCache as FrameCache
+from .scores import SCORES as SCORES
+from .scores import Truth as Truth
+from .scores import score as score
+from .summary import by_severity as by_severity
+from .summary import robustness as robustness
