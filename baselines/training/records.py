@@ -112,7 +112,7 @@ def draw_curves(path: Path, title: str, panels: Sequence[Panel]) -> None:
             axes.plot(x, y, "o" if len(x) == 1 else "-", label=label)
         axes.set(title=panel.title, xlabel=panel.x_label, **({"yscale": "log"} if panel.log else {"ylim": (0, None)}))
         axes.grid(alpha=0.3)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         if not all(label.startswith("_") for label in panel.lines):
             axes.legend(frameon=False)
     figure.suptitle(title, fontsize=10)
