@@ -111,10 +111,10 @@ def slug(setup: "robustness.Setup") -> str:
 
 
 def _table(setup: "robustness.Setup", rows: "dict[str, list[robustness.View]]") -> Table:
-    """Errors by axis, clean and at each severity; shares at the last one."""
-    axes, severities = robustness.corruptions().axes, (0, *setup.severities)
-    columns = [Column("axis"), Column("unit"), Column("clean", justify="right")]
-    columns += [Column(f"severity {severity}", justify="right") for severity in setup.severities]
+    """Errors by axis, clean and at each severity; shares at the last severity."""
+    severities = (0, *setup.severities)
+    columns = [Column("axis", no_wrap=True)]
+    columns += [Column(f"severity {severity}" if severity else "clean", justify="right") for severity in severities]
     columns += [Column(title, justify="right") for title in ("wrong orders", "unanswered", "confident errors")]
     table = Table(*columns, title=f"{setup.method.title}: object MAE in mm", title_justify="left")
     for axis, found in rows.items():
@@ -126,5 +126,5 @@ def _table(setup: "robustness.Setup", rows: "dict[str, list[robustness.View]]") 
             report.percent(last.unanswered_share),
             report.percent(last.confident_share),
         ]
-        table.add_row(axis, "" if axis == robustness.CLEAN else axes[axis].unit, *cells, *shares)
+        table.add_row(axis, *cells, *shares)
     return table
