@@ -1,6 +1,7 @@
 from .axes import CLEAN as CLEAN
 from .axes import SETS as SETS
 from .axes import Corruptions as Corruptions
+from .axes import SetName as SetName
 from .axes import corruptions as corruptions
 from .report import write_page as write_page
 from .report import write_worst as write_worst

@@ -18,7 +18,8 @@ from fpp_ml_bench.loaders.render import Light, named_light
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 FILE = Path(__file__).with_name("axes.yaml")
-SETS = {"test": TEST_OBJECTS, "unseen": UNSEEN}
+SetName = Literal["test", "unseen"]
+SETS: dict[SetName, tuple[str, ...]] = {"test": TEST_OBJECTS, "unseen": UNSEEN}
 """Objects of each set that a method can be measured on."""
 CLEAN = "clean"
 Share = Annotated[float, Field(gt=0, le=1)]

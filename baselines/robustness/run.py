@@ -14,7 +14,7 @@ from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, corruptions
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, conditions_of
 from fpp_ml_bench.baselines.robustness.scores import score
 from fpp_ml_bench.constants import VIEWS, sample_name
@@ -36,7 +36,7 @@ class Setup:
     """A method on a set. ``quick``: one view of each object and three severities, for a look."""
 
     method: Method
-    set_name: str
+    set_name: SetName
     size: int
     quick: bool = False
 

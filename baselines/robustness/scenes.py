@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, corruptions
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.scores import Truth
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
@@ -49,7 +49,7 @@ class Condition:
         return f"{self.axis}-{self.severity}-{_digest(self, tuple(frames))}"
 
 
-def conditions_of(axis: str, severities: Sequence[int], set_name: str, size: int) -> list[Condition]:
+def conditions_of(axis: str, severities: Sequence[int], set_name: SetName, size: int) -> list[Condition]:
     """The conditions of an axis of `corruptions`, or of `CLEAN`, on the objects of a set of `SETS` that it disturbs."""
     objects = tuple(SETS[set_name])
     if axis == CLEAN:

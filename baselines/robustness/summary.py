@@ -14,7 +14,7 @@ def by_severity(rows: Sequence[View]) -> dict[int, SeverityScores]:
     """Means over the views of each severity."""
     severities = sorted({row["severity"] for row in rows})
     return {
-        severity: SeverityScores(**mean_scores([row for row in rows if row["severity"] == severity]))
+        severity: SeverityScores.model_validate(mean_scores([row for row in rows if row["severity"] == severity]))
         for severity in severities
     }
 

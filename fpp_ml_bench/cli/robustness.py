@@ -82,7 +82,7 @@ class Scenes:
     settings: "render.BuildSettings"
 
     @classmethod
-    def of(cls, objects: str, size: int) -> "Scenes":
+    def of(cls, objects: "robustness.SetName", size: int) -> "Scenes":
         return cls(robustness.Condition(robustness.CLEAN, 0, tuple(robustness.SETS[objects]), size).settings)
 
     path = Path("the robustness scenes")
