@@ -59,11 +59,13 @@ class Axis(StrictModel):
 
 
 class Corruptions(StrictModel):
-    """``axes.yaml``. A pixel without an answer is charged ``unanswered_mm``; an error above ``wrong_order_mm`` is a
-    wrong order, and a confident one where the stated sigma is below ``confident_below`` of it."""
+    """``axes.yaml``. ``views`` of each object of a set are measured. A pixel without an answer is charged
+    ``unanswered_mm``; an error above ``wrong_order_mm`` is a wrong order, and a confident one where the stated sigma is
+    below ``confident_below`` of it."""
 
     version: Annotated[int, Field(ge=1)]
     light: Text
+    views: dict[SetName, Annotated[list[Text], Field(min_length=1)]]
     unanswered_mm: Above0
     wrong_order_mm: Above0
     confident_below: Share

@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, conditions_of
 from fpp_ml_bench.baselines.robustness.scores import score
-from fpp_ml_bench.constants import VIEWS, sample_name
+from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import exclusive, write_atomically
 from fpp_ml_bench.machine import single_threaded_algebra
@@ -48,7 +48,8 @@ class Setup:
 
     @property
     def views(self) -> tuple[str, ...]:
-        return VIEWS[:1] if self.quick else VIEWS
+        views = tuple(corruptions().views[self.set_name])
+        return views[:1] if self.quick else views
 
     @property
     def severities(self) -> tuple[int, ...]:

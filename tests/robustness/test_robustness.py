@@ -26,6 +26,7 @@ from fpp_ml_bench.baselines.robustness import (
     write_page,
 )
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result import Robustness
 from fpp_ml_bench.optics import paper_rig
@@ -41,7 +42,8 @@ def one_object(monkeypatch):
     """Both sets are a single object of two views."""
     monkeypatch.setitem(SETS, "test", (OBJECT,))
     monkeypatch.setitem(SETS, "unseen", (OBJECT,))
-    monkeypatch.setattr(run, "VIEWS", ("A0", "A60"))
+    for name in SETS:
+        monkeypatch.setitem(RULES.views, name, ["A0", "A60"])
 
 
 def condition(axis: str, severity: int) -> Condition:
@@ -73,6 +75,7 @@ def test_the_issues_severities_are_those_of_the_file():
     assert severities["under-exposure"] == [0.7, 0.5, 0.35, 0.25, 0.15]
     assert severities["motion"] == [0.1, 0.25, 0.5, 1, 2]
     assert len(severities) == 12 and RULES.unanswered_mm == 150
+    assert all(set(views) <= set(VIEWS) for views in corruptions.__wrapped__().views.values())
 
 
 @pytest.mark.parametrize("axis", RULES.axes)
