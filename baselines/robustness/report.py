@@ -30,6 +30,7 @@ _COLOURS = (
     "#ff8ab7",
     "#9498a0",
 )
+_DASHES = ("-", "--", ":")
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,10 @@ def _curves(measured: Sequence[Measured]) -> bytes:
                 continue
             points = {0: one.means.get(CLEAN, {}).get(0, {}), **one.means[name]}
             drawn = {s: scores["mae_mm"] for s, scores in points.items() if scores.get("mae_mm") is not None}
-            label = f"{one.setup['title']}{' (quick)' if one.setup['quick'] else ''}"
-            plot.plot(list(drawn), list(drawn.values()), "o-", ms=3, lw=1.3, label=label, color=_COLOURS[number % 10])
+            label = one.setup["title"] + (", unseen" if one.setup["set"] == "unseen" else "")
+            label += " (quick)" if one.setup["quick"] else ""
+            colour, dashes = _COLOURS[number % len(_COLOURS)], _DASHES[number // len(_COLOURS) % len(_DASHES)]
+            plot.plot(list(drawn), list(drawn.values()), "o", ls=dashes, ms=3, lw=1.3, label=label, color=colour)
         plot.set_yscale("log")
         plot.set_ylim(0.1, 1000)
         plot.set_xticks(range(6), ["clean", *(f"{value:g}" for value in axis.severities)], fontsize=7)
