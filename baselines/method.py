@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,15 @@ Frames = Sequence[NDArray[np.uint8] | None]
 Setting = str | int | float | bool | None
 
 
+class Answer(NamedTuple):
+    """``depth`` float32 (H, W) in the method's units, 0 = background or not measured; ``sigma_mm``: its standard
+    uncertainty, float32 (H, W), 0 where none is stated, None of a method that states none; ``report``: plain data."""
+
+    depth: NDArray[np.float32]
+    sigma_mm: NDArray[np.float32] | None = None
+    report: Mapping[str, Any] = MappingProxyType({})
+
+
 class Method(ABC):
     """A frame stack in, a depth map out.
 
@@ -32,7 +41,7 @@ class Method(ABC):
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
     packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
     says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports:
-    whether `predict_reported` reports.
+    whether `answer` reports.
     """
 
     name: str
@@ -61,9 +70,9 @@ class Method(ABC):
         """`predict` of several samples, one after another unless `batched`."""
         return [self.predict(frames) for frames in stacks]
 
-    def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """`predict`, and a report of the sample as JSON."""
-        return self.predict(frames), {}
+    def answer(self, frames: Frames) -> Answer:
+        """`predict`, and what else the method says of the sample."""
+        return Answer(self.predict(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice] | None:
         """Rows and columns outside which nothing is computed; None for a method that computes everywhere."""
@@ -86,6 +95,7 @@ METHODS: Mapping[str, Callable[..., Method]] = {
         rig, **options
     ),
     "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **options),
+    "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
 `NetworkMethod`."""

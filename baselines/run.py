@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SUBMISSION_FILE, check_submission
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, check_submission
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -37,8 +37,9 @@ def predict_split(
     opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
 ) -> Run:
     """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or the method's own units,
-    and ``submission.yaml`` last. The reports of a method that ``reports`` are written beside, by sample, as
-    `REPORTS_FILE`, and its summary of them into the submission's settings.
+    ``{sample}.sigma.npy`` of a method that states its uncertainty, and ``submission.yaml`` last. The reports of a
+    method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them into the
+    submission's settings.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
     the median over the split. Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the
@@ -52,9 +53,12 @@ def predict_split(
         if number == 0:
             method.predict(frames)
         started = perf_counter()
-        depth_mm, reports[sample] = method.predict_reported(frames)
+        answer = method.answer(frames)
         seconds.append(perf_counter() - started)
-        _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", depth_mm, opened.size)
+        reports[sample] = dict(answer.report)
+        _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", answer.depth, opened.size)
+        if answer.sigma_mm is not None:
+            _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
         progress(1)
     median = statistics.median(seconds)
     summary: dict[str, Any] = {}
@@ -81,7 +85,7 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
 
 def _prepare(out: Path, samples: list[str]) -> None:
     """Make ``out``, or take over one that a stopped run of the same samples left (it has no submission.yaml)."""
-    expected = {f"{sample}{PREDICTION_SUFFIX}" for sample in samples} | {REPORTS_FILE}
+    expected = {f"{sample}{suffix}" for sample in samples for suffix in (PREDICTION_SUFFIX, SIGMA)} | {REPORTS_FILE}
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

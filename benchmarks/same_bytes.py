@@ -4,8 +4,9 @@
 
 Each build is a process of its own that is denied some of this processor's instruction sets: numba compiles for a
 generic x86-64, NumPy and the C library leave out AVX2, AVX-512 and fused multiply-adds, OpenBLAS takes its oldest
-kernels. Prints a fingerprint for each, and a hash of all 70 meshes in float64; exit status 1 if two differ. With no
-options a minute or two; ``--preset full --size 960`` is the whole benchmark.
+kernels. Prints a fingerprint for each, a hash of all 70 meshes in float64, and one of two frames of every robustness
+axis at its last severity; exit status 1 if two differ. With no options a minute or two; ``--preset full --size 960`` is
+the whole benchmark.
 """
 
 import argparse
@@ -37,6 +38,7 @@ WAYS: dict[str, dict[str, str]] = {
 
 MESHES = """\
 import hashlib, sys
+from fpp_ml_bench.baselines.robustness import Condition, FrameCache, corruptions
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import OBJECTS, UNSEEN
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
@@ -44,14 +46,21 @@ digest = hashlib.sha256()
 for name in (*OBJECTS, *UNSEEN):
     mesh = solid_mesh(name)
     digest.update(mesh.vertices_m.tobytes() + mesh.faces.tobytes())
-print(digest.hexdigest())
+frames = hashlib.sha256()
+for axis in corruptions().axes:
+    condition = Condition(axis, 5, ("v_groove",), 176)
+    for frame in FrameCache(None).frames(condition, "v_groove", "A0", (0, 18)):
+        frames.update(b"" if frame is None else frame.tobytes())
+print(digest.hexdigest(), frames.hexdigest())
 sys.exit(main(sys.argv[1:]))
 """
-"""Prints a hash of all 70 meshes in float64, whose last bits float32 depths would hide, and runs `fpp-bench`."""
+"""Prints a hash of all 70 meshes in float64, whose last bits float32 depths would hide, and one of disturbed frames,
+and runs `fpp-bench`."""
 
 
-def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str]:
-    """Fingerprint of a build by `fpp-bench build` with the environment of ``way``, and the hash of the meshes."""
+def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str, str]:
+    """Fingerprint of a build by `fpp-bench build` with the environment of ``way``, and the hashes of the meshes and of
+    disturbed frames."""
     environment = {**os.environ, **WAYS[way]}
     workers = environment.pop("WORKERS", "2")
     if "NUMBA_CPU_NAME" in WAYS[way]:
@@ -63,7 +72,8 @@ def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str]:
         sys.exit(f"{way}: the build failed:\n{done.stderr}")
     content = json.loads((folder / "manifest.json").read_text())
     shutil.rmtree(folder)
-    return str(content["fingerprint"]), done.stdout.split(maxsplit=1)[0]
+    meshes, frames = done.stdout.split(maxsplit=2)[:2]
+    return str(content["fingerprint"]), meshes, frames
 
 
 def main() -> int:
@@ -81,7 +91,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=args.work) as folder:
         for way in args.only or WAYS:
             prints[way] = fingerprints(way, settings, Path(folder))
-            print(f"{prints[way][0][:16]}  meshes {prints[way][1][:8]}  {way}", flush=True)
+            fingerprint, meshes, frames = prints[way]
+            print(f"{fingerprint[:16]}  meshes {meshes[:8]}  disturbed {frames[:8]}  {way}", flush=True)
     same = len(set(prints.values())) == 1
     print(f"{len(prints)} builds, {'one fingerprint' if same else 'DIFFERENT fingerprints'}")
     return 0 if same else 1

@@ -5,9 +5,10 @@ different protocol versions are never ranked together."""
 from typing import Literal, get_args
 
 PROTOCOL_VERSION = "1.1.0"
-SchemaVersion = Literal["2.0.0", "2.1.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.1.0"
-"""What is written. 2.1.0 adds the optional ``dataset.benchmark``; files of every `SchemaVersion` are read."""
+SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.2.0"
+"""What is written. 2.1.0 adds the optional ``dataset.benchmark``, 2.2.0 the optional ``robustness``; files of every
+`SchemaVersion` are read."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]

@@ -13,7 +13,8 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -143,3 +144,16 @@ def njit(function: Function) -> Function:
         return cast(Function, _numba().njit(cache=True, nogil=True, error_model="numpy")(function))
     except RuntimeError:  # neither the package folder nor the user's cache folder can be written
         return cast(Function, _numba().njit(nogil=True, error_model="numpy")(function))
+
+
+@contextmanager
+def single_threaded_algebra() -> Iterator[None]:
+    """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
+    previous = {name: os.environ[name] for name in THREAD_COUNTS if name in os.environ}
+    os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
+    try:
+        yield
+    finally:
+        for name in THREAD_COUNTS:
+            os.environ.pop(name, None)
+        os.environ.update(previous)

@@ -62,7 +62,8 @@ _MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in
 _README_NOTE = (
     f"{_MADE_BY} Errors in mm. {RANK_NOTE} Intervals: bootstrap over objects. Time: median latency of one image. "
     f"\\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 does not "
-    "follow it (docs/reliance.md)."
+    "follow it (docs/reliance.md). Disturbed: object MAE over all axes and severities of disturbed scenes, with 150 mm "
+    "for a pixel without an answer (docs/robustness.md)."
 )
 _PLAIN = frozenset(" -,+()/%=.")
 
@@ -90,6 +91,7 @@ def columns(sort: str) -> list[Column]:
             errors.append(Column("95% interval", interval, from_width=MIDDLE))
     return [
         _RANK, _METHOD, *errors, Column("s/sample", _seconds), _FRAMES, replace(_RELIANCE, from_width=WIDE),
+        replace(_ROBUSTNESS, from_width=WIDEST),
         replace(_PROVENANCE, from_width=MIDDLE),
         Column("Assumes", lambda row: assumption(row.entry.result) or "-", right=False, from_width=WIDEST),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
@@ -125,6 +127,12 @@ def reliance_interval(entry: Entry) -> str:
     """The ends of its interval; empty without any."""
     low, high = entry.result.reliance.interval if entry.result.reliance else (None, None)
     return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
+
+
+def robustness(entry: Entry) -> str:
+    """Mean error over the disturbed scenes of the test set, mm with one decimal."""
+    measured = (entry.result.robustness or {}).get("test")
+    return NOT_MEASURED if measured is None else f"{measured.mae_mm:.1f}"
 
 
 def device(entry: Entry) -> str:
@@ -236,13 +244,14 @@ def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str)
 def _json_row(row: Ranked) -> dict[str, Any]:
     entry, result = row.entry, row.entry.result
     timing, reliance = (part and part.model_dump(mode="json") for part in (result.timing, result.reliance))
+    disturbed = {name: block.model_dump(mode="json") for name, block in (result.robustness or {}).items()}
     return {
         "best_rank": row.best_rank, "worst_rank": row.worst_rank, "name": entry.name, "short_name": row.short_name,
         "method": result.submission.method, "provenance": entry.provenance,
         "metrics": result.metrics.model_dump(mode="json"), "intervals": result.intervals.model_dump(mode="json"),
         "per_object": [part.model_dump(mode="json") for part in result.per_object],
         "seconds_per_sample": entry.value("seconds_per_sample"), "time_measured_here": entry.time_measured,
-        "timing": timing, "phase_reliance": reliance, "timed_on": device(entry),
+        "timing": timing, "phase_reliance": reliance, "robustness": disturbed, "timed_on": device(entry),
         "assumes": assumption_sentences(result), "frames_used": entry.frames, "samples": result.dataset.samples,
         "created": result.created, "source": entry.path.name,
     }  # fmt: skip
@@ -279,6 +288,7 @@ _RANK = Column("Rank", lambda row: row.ranks)
 _METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
 _FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 _RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
+_ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))
 _PROVENANCE = Column("Provenance", lambda row: row.entry.provenance, right=False)
 _README_ERRORS = (
     Column("Object MAE, mm", partial(_error, "object_mae_mm")),
@@ -287,7 +297,7 @@ _README_ERRORS = (
 )  # fmt: skip
 _README_COLUMNS = (
     _RANK, _METHOD, _README_ERRORS[0], Column("95% interval", partial(_interval, between=" - ")), *_README_ERRORS[1:],
-    Column("Time, ms", _milliseconds), _FRAMES, _RELIANCE, _PROVENANCE,
+    Column("Time, ms", _milliseconds), _FRAMES, _RELIANCE, _ROBUSTNESS, _PROVENANCE,
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
@@ -66,6 +66,10 @@ class PhaseMethod(Method):
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
         return self.measure(frames).depth_mm
+
+    def answer(self, frames: Frames) -> Answer:
+        measurement = self.measure(frames)
+        return Answer(measurement.depth_mm, measurement.sigma_mm)
 
 
 @dataclass(frozen=True)
@@ -168,10 +172,10 @@ class FewestFrames(Method):
                 break
         return FrameChoice(depth_mm, used, tuple(looks))
 
-    def predict_reported(self, frames: Frames) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def answer(self, frames: Frames) -> Answer:
         """Depth as `predict`, and the sample's report (see `FrameChoice.report`)."""
         choice = self.choose(frames)
-        return choice.depth_mm, choice.report()
+        return Answer(choice.depth_mm, report=choice.report())
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background."""

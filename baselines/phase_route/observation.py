@@ -158,3 +158,9 @@ class Measurement:
     counts: dict[str, int]
     background_share: float
     seconds: dict[str, float]
+
+    @property
+    def sigma_mm(self) -> Image:
+        """Standard uncertainty of the depth, float32 (H, W), 0 where there is none: that of a normal error whose
+        expected size is ``expected_error_mm``."""
+        return np.where(self.depth_mm > 0, self.expected_error_mm * np.float32(np.sqrt(np.pi / 2)), np.float32(0))

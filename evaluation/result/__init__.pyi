@@ -21,7 +21,9 @@ from .parts import Interval as Interval
 from .parts import Intervals as Intervals
 from .parts import Reliance as Reliance
 from .parts import RelianceParts as RelianceParts
+from .parts import Robustness as Robustness
 from .parts import SampleResult as SampleResult
+from .parts import SeverityScores as SeverityScores
 from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
 from .parts import dataset_identity as dataset_identity

@@ -6,14 +6,14 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.result import parts
-from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, SampleResult
+from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.schema import Count, SparseModel, Text
@@ -27,7 +27,7 @@ Scores = dict[str, float | None]
 class Result(SparseModel):
     """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
 
-    SPARSE = ("reliance",)
+    SPARSE = ("reliance", "robustness")
 
     schema_version: SchemaVersion
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
@@ -50,6 +50,7 @@ class Result(SparseModel):
     seeds: dict[Text, Count]
     environment: parts.Environment
     reliance: Reliance | None = None
+    robustness: dict[Literal["test", "unseen"], Robustness] | None = None
 
     @property
     def track(self) -> Track:
@@ -79,6 +80,10 @@ class Result(SparseModel):
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
         if self.reliance is not None:
             _check_reliance(self.reliance, self.submission)
+        for name, block in (self.robustness or {}).items():
+            _check_weights("robustness", block.weights_sha256, self.submission)
+            if name != block.set:
+                raise ValueError(f"robustness.{name} is that of the set {block.set}")
         for row in self.per_sample:
             _check_sample(row, height * width)
         stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
@@ -181,13 +186,19 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
 
 def _check_reliance(reliance: Reliance, submission: Submission) -> None:
     """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
-    weights, units = submission.settings.get("weights_sha256"), submission.units
-    if weights != reliance.weights_sha256:
-        pair = f"weights {str(reliance.weights_sha256)[:12]}, scored were {str(weights)[:12]}"
-        raise ValueError(f"reliance was measured on {pair}; measure it again")
+    units = submission.units
+    _check_weights("reliance", reliance.weights_sha256, submission)
     if (reliance.units == "normalised") != (units == "normalised"):
         pair = f"an answer in {reliance.units}, scored was one in {units}"
         raise ValueError(f"reliance is that of {pair}; measure it again")
+
+
+def _check_weights(part: str, measured: str | None, submission: Submission) -> None:
+    """Refuse (ValueError) a part that was measured with other weights than were scored."""
+    weights = submission.settings.get("weights_sha256")
+    if weights != measured:
+        pair = f"weights {str(measured)[:12]}, scored were {str(weights)[:12]}"
+        raise ValueError(f"{part} was measured on {pair}; measure it again")
 
 
 def _check_same(name: str, stored: Any, computed: Any) -> None:

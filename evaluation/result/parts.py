@@ -1,5 +1,7 @@
-"""The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance."""
+"""The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance,
+robustness."""
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -272,6 +274,58 @@ class Reliance(StrictModel):
             raise ValueError("interval: expected two numbers or two nulls")
         if (interval := ends(self.interval)) and not 0 <= interval[0] <= interval[1] <= 1:
             raise ValueError("interval: expected 0 <= low <= high <= 1")
+        if self.objects > self.samples:
+            raise ValueError("objects is above samples")
+        return self
+
+
+class SeverityScores(StrictModel):
+    """Means over the views of a severity. ``mae_mm`` charges a fixed error for a pixel without an answer,
+    ``protocol_mae_mm`` its whole depth. Shares of the scored pixels: of wrong orders, of pixels without an answer, of
+    confident errors and of pixels that state a sigma (null both where a method states none)."""
+
+    mae_mm: NonNegative
+    protocol_mae_mm: NonNegative
+    wrong_share: Share
+    unanswered_share: Share
+    confident_share: Share | None
+    coverage: Share | None
+
+
+class Robustness(StrictModel):
+    """What disturbed scenes do to a method: ``mae_mm`` is the mean over ``axes`` and their five severities, with its
+    95% interval (bootstrap over objects; nulls below two objects); ``clean`` is the undisturbed scene. ``version`` is
+    that of the axes."""
+
+    version: Whole
+    set: Literal["test", "unseen"]
+    mae_mm: NonNegative
+    interval: Interval
+    clean: SeverityScores
+    axes: Annotated[dict[Text, Annotated[list[SeverityScores], Field(min_length=5, max_length=5)]], Field(min_length=1)]
+    samples: Whole
+    objects: Whole
+    size_px: Whole
+    weights_sha256: Sha256 | None
+
+    @property
+    def ratio(self) -> float | None:
+        """``mae_mm`` over that of the clean scene."""
+        return self.mae_mm / self.clean.mae_mm if self.clean.mae_mm else None
+
+    def mean(self, key: str) -> float | None:
+        """Mean of a score over axes and severities; None where there is none."""
+        values = [getattr(scores, key) for axis in self.axes.values() for scores in axis]
+        return None if None in values else math.fsum(values) / len(values)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Robustness":
+        if not math.isclose(self.mae_mm, self.mean("mae_mm") or 0.0, rel_tol=1e-9, abs_tol=1e-12):
+            raise ValueError("mae_mm does not follow from axes")
+        if self.interval.count(None) == 1:
+            raise ValueError("interval: expected two numbers or two nulls")
+        if (interval := ends(self.interval)) and not 0 <= interval[0] <= interval[1]:
+            raise ValueError("interval: expected 0 <= low <= high")
         if self.objects > self.samples:
             raise ValueError("objects is above samples")
         return self

@@ -63,7 +63,8 @@ def evaluate(
     outcomes: Iterable[Outcome] = ()
     if units in get_args(Units):
         reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
-        outcomes = _scored(reader, listing.present, dataset, target, units, cast(Mode, mode), edge_band_px)
+        sigmas = folder if listing.sigmas else None
+        outcomes = _scored(reader, listing.present, dataset, target, units, cast(Mode, mode), edge_band_px, sigmas)
     description = None
     if content is not None:
         try:
@@ -139,10 +140,11 @@ def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode
 
 def _scored(
     reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units, mode: Mode,
-    edge_band_px: int,
+    edge_band_px: int, sigmas: Path | None,
 ) -> Iterable[Outcome]:  # fmt: skip
-    """Problems and row of each sample that has a prediction, in order. Work begins with this call, in threads, before
-    the first outcome is taken from the iterator."""
+    """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
+    ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
+    iterator."""
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
@@ -161,8 +163,11 @@ def _scored(
             problems = [str(error)]
         with dataset_lock:
             dataset.release(sample)
+        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
+        if sigmas is not None:
+            problems += submission.sigma_problems(sigmas, sample, dataset.size)
         if problems:
-            return [f"{reader.named(sample)}: {problem}" for problem in problems], []
+            return problems, []
         pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
         return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
 

@@ -2,6 +2,7 @@ from .description import Submission as Submission
 from .description import check_submission as check_submission
 from .description import read_submission as read_submission
 from .prediction_files import REPORTS_FILE as REPORTS_FILE
+from .prediction_files import SIGMA as SIGMA
 from .prediction_files import SUBMISSION_FILE as SUBMISSION_FILE
 from .prediction_files import Listing as Listing
 from .prediction_files import Reader as Reader
@@ -9,3 +10,4 @@ from .prediction_files import list_folder as list_folder
 from .prediction_files import read_plain as read_plain
 from .prediction_files import read_plain_file as read_plain_file
 from .prediction_files import reader_for as reader_for
+from .prediction_files import sigma_problems as sigma_problems

@@ -11,7 +11,8 @@ import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.submission.sample_files import parse_npy, read_npy, read_npz, read_png
+from fpp_ml_bench.evaluation.protocol import LARGEST_MM
+from fpp_ml_bench.evaluation.submission.sample_files import HEADER_BYTES, parse_npy, read_npy, read_npz, read_png
 from fpp_ml_bench.files import printable, read_bounded, strict_yaml
 
 SUBMISSION_FILE = "submission.yaml"
@@ -55,16 +56,20 @@ def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
 
 
 PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
+SIGMA = ".sigma.npy"
+"""Of a sample's optional standard uncertainty, a map (H, W) in mm, 0 where none is stated."""
 TABLES = ("predictions.parquet", "predictions.arrow")
 _MAT_SPARE_BYTES = 1 << 20
 
 
 class Listing(NamedTuple):
-    """``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems`` has a line for each missing or extra entry."""
+    """``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems`` has a line for each missing or extra entry; ``sigmas``:
+    whether there are `SIGMA` files."""
 
     form: str
     problems: list[str]
     present: list[str]
+    sigmas: bool
 
 
 def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> Listing:
@@ -91,10 +96,26 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
         return "remove it"
 
     problems = [f"{name}: is missing; write one for each sample" for name in files if name not in names]
-    extra = sorted(names - {*files, SUBMISSION_FILE, REPORTS_FILE})
+    uncertain = {f"{sample}{SIGMA}" for sample in samples}
+    if sigmas := bool(uncertain & names):
+        problems += [f"{name}: is missing; write one for each sample, or none" for name in sorted(uncertain - names)]
+    extra = sorted(names - {*files, *uncertain, SUBMISSION_FILE, REPORTS_FILE})
     problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
     present = list(samples) if form in TABLES else [sample for name, sample in files.items() if name in names]
-    return Listing(form, problems, present)
+    return Listing(form, problems, present, sigmas)
+
+
+def sigma_problems(folder: Path, sample: str, size: tuple[int, int]) -> list[str]:
+    """What is wrong with the `SIGMA` file of a sample; usually an empty list."""
+    name = f"{sample}{SIGMA}"
+    try:
+        sigma_mm = parse_npy(read_bounded(folder / name, size[0] * size[1] * 8 + HEADER_BYTES), size)
+    except PredictionError as error:
+        return [f"{name}: {error}"]
+    low, high = float(sigma_mm.min()), float(sigma_mm.max())
+    if low >= 0 and high <= LARGEST_MM:  # False for NaN
+        return []
+    return [f"{name}: expected finite mm of 0 and more, found {low:g} to {high:g}; write 0 where none is stated"]
 
 
 MapAndHash = tuple[NDArray[Any], str]

@@ -42,6 +42,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
     "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),
     "reliance": ("reliance", "measure phase reliance: does a prediction follow the fringes or the outline"),
+    "robustness": ("robustness", "disturb the scene, axis by axis: light, camera, surface, calibration, motion"),
     "diagnose": ("diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
     "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
     "stability": ("stability", "stiff and extreme cases against higher precision and theory"),

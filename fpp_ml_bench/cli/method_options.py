@@ -3,22 +3,23 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from fpp_ml_bench import baselines, decoding
+from fpp_ml_bench import baselines, decoding, optics
 from fpp_ml_bench.baselines import networks, training
 from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
 from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
-    "(single-shot phase; order, mask and correction learned), the name of weights that "
+    "(single-shot phase; order, mask and correction learned), constant (looks at nothing), the name of weights that "
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
     "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence", "white_grey", "ambient_grey"),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
+    "constant": ("at",),
     "trained networks": ("depth_range", "frame", "device"),
 }
 """Options that belong to one kind of method only, by their name in the parsed arguments."""
@@ -61,6 +62,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="weights of phase-net: a file, such as training writes (default: those that come with the package)",
     )
+    add = parser.add_argument_group("constant").add_argument
+    add("--at", metavar="DEPTH", help="standoff, middle (of the range), training-mean, or mm (default: standoff)")
     add = parser.add_argument_group("trained networks").add_argument
     add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
@@ -70,10 +73,25 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
-def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
-    """The method that ``args`` name, for the rig of ``opened``. Warns on standard error about weights that were trained
-    on another version of the dataset's benchmark. Raises FppBenchError for an unknown method, and for an option that
-    belongs to another one."""
+class Photographed(Protocol):
+    """What a method is chosen for: a dataset, or images of a rig that are not stored."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def rig(self) -> "optics.Rig": ...
+    @property
+    def size(self) -> tuple[int, int]: ...
+    @property
+    def sequence(self) -> "optics.Sequence": ...
+    @property
+    def manifest(self) -> "storage.Manifest": ...
+
+
+def chosen_method(args: argparse.Namespace, opened: Photographed, warn: bool = True) -> "baselines.Method":
+    """The method that ``args`` name, for the rig of ``opened``. Unless told not to, warns on standard error about
+    weights that were trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method,
+    and for an option that belongs to another one."""
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
     maker = _MAKERS.get(args.method)
@@ -90,7 +108,7 @@ def chosen_method(args: argparse.Namespace, opened: "storage.DatasetFolder") -> 
         method = baselines.load_method(args.method, opened.rig, **_MAKERS[args.method](args, opened))
     config = method.weights_config
     warning = None if config is None else training.training_data_warning(config, opened.manifest)
-    if config is not None and warning is not None:
+    if warn and config is not None and warning is not None:
         print(f"warning: {config.name} was {warning}", file=sys.stderr)
     return method
 
@@ -122,7 +140,7 @@ def _weights(name: str, size: int) -> Path:
     return baselines.known_weights(name)
 
 
-def _network(path: Path, args: argparse.Namespace, opened: "storage.DatasetFolder") -> "baselines.Method":
+def _network(path: Path, args: argparse.Namespace, opened: Photographed) -> "baselines.Method":
     model = networks.load(path, args.device)
     if model.config.image_size != opened.size:
         trained_at, here = (f"{height}x{width}" for height, width in (model.config.image_size, opened.size))
@@ -134,13 +152,13 @@ def _network(path: Path, args: argparse.Namespace, opened: "storage.DatasetFolde
     return networks.NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
 
 
-def _classical(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
+def _classical(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     usual = opened.sequence.steps if args.steps is None else args.steps
     steps = usual if args.depth_noise is None else _steps_for(args, opened)
     return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 
-def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int:
+def _steps_for(args: argparse.Namespace, opened: Photographed) -> int:
     """Steps for ``--depth-noise``, by the light and the camera that the dataset was built with."""
     from fpp_ml_bench.schema import validate
 
@@ -163,14 +181,14 @@ def _steps_for(args: argparse.Namespace, opened: "storage.DatasetFolder") -> int
     return steps
 
 
-def _phase(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
+def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
     options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
-def _phase_net(args: argparse.Namespace, opened: "storage.DatasetFolder") -> dict[str, Any]:
+def _phase_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     options = {name: getattr(args, name) for name in ("threads", "weights", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
@@ -179,4 +197,8 @@ def _given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net}
+def _constant(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    return _given(at=args.at)
+
+
+_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net, "constant": _constant}

@@ -1,5 +1,6 @@
 """One view of one object, from mesh to sample: frames, decoded ground truth, exact depth, and what separates them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,11 +116,17 @@ class Studio:
         frames = tuple(range(len(self._frames))) if not skipping_enabled() else self.stored + self.unstored
         if self.light.motion_mm == 0:
             return self.expose(scene, frames)
-        height, turn = 2 * uniform(*scene.stream, "height") - 1, uniform(*scene.stream, "turn")
+        return self.expose_moving(mesh, view, {frame: frame for frame in frames})
+
+    def expose_moving(self, mesh: SolidMesh, view: str, steps: Mapping[int, float]) -> int:
+        """Expose frames of an object that moves: each at so many steps of ``motion_mm`` from its place, all in one
+        direction drawn for the view. Returns how many shadow rays their light took."""
+        stream = (self.settings.seed, mesh.name, view)
+        height, turn = 2 * uniform(*stream, "height") - 1, uniform(*stream, "turn")
         level = np.sqrt(1 - height * height)
         direction = np.array([level * cosine_of_turns(turn), height, level * sine_of_turns(turn)])
         step_m = direction * (self.light.motion_mm / MM_PER_M)
-        return sum(self.expose(self.trace(mesh, view, step_m * frame), (frame,)) for frame in frames)
+        return sum(self.expose(self.trace(mesh, view, step_m * step), (frame,)) for frame, step in steps.items())
 
     def expose(self, scene: TracedView, frames: tuple[int, ...]) -> int:
         """Expose ``frames`` of a view into the studio's; those not stored at the object's pixels alone, unless it moves
@@ -154,6 +161,10 @@ class Studio:
             for index, values in zip(frames, exposed, strict=True):
                 images[index, pixels] = values
         return shadow_rays
+
+    def frame(self, index: int) -> NDArray[np.uint8]:
+        """The frame ``index`` as it was exposed last, uint8 (H, W); overwritten by the next view."""
+        return self._frames[index]
 
     @staticmethod
     def _of(

@@ -24,7 +24,7 @@ from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifest, ShardFile, describe_file
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.machine import THREAD_COUNTS
+from fpp_ml_bench.machine import single_threaded_algebra
 
 SETTINGS = "settings.json"
 RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
@@ -189,7 +189,7 @@ def _write_in_processes(
     waiting = deque(sorted(plans, key=lambda plan: -len(plan.samples)))
     pipes, processes = [], []
     try:
-        with _single_threaded_algebra():
+        with single_threaded_algebra():
             for _ in range(min(workers, len(plans))):
                 pipe, end = context.Pipe()
                 pipes.append(pipe)
@@ -253,19 +253,6 @@ def _end_with_parent() -> None:
     if parent is not None:
         connection.wait([parent.sentinel])
         os._exit(1)
-
-
-@contextmanager
-def _single_threaded_algebra() -> Iterator[None]:
-    """Worker processes started inside the block get a single-threaded BLAS, whose idle threads would spin otherwise."""
-    previous = {name: os.environ[name] for name in THREAD_COUNTS if name in os.environ}
-    os.environ.update(dict.fromkeys(THREAD_COUNTS, "1"))
-    try:
-        yield
-    finally:
-        for name in THREAD_COUNTS:
-            os.environ.pop(name, None)
-        os.environ.update(previous)
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:

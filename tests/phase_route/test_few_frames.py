@@ -11,7 +11,7 @@ import pytest
 from flat_planes import PAPER, USERS_WORD
 from synthetic import make
 
-from fpp_ml_bench.baselines.method import Method, load_method
+from fpp_ml_bench.baselines.method import Answer, Method, load_method
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, fringe_fit
 from fpp_ml_bench.baselines.phase_route.method import FewestFrames, PhaseMethod, levels_of
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
@@ -220,8 +220,8 @@ class Reporting(Method):
     def predict(self, frames):  # type: ignore[no-untyped-def]
         return np.where(frames[0] > 128, 1800, 0).astype(np.float32)
 
-    def predict_reported(self, frames):  # type: ignore[no-untyped-def]
-        return self.predict(frames), {"frames": int(frames[0][0, 0]) % 3 + 1}
+    def answer(self, frames):  # type: ignore[no-untyped-def]
+        return Answer(self.predict(frames), report={"frames": int(frames[0][0, 0]) % 3 + 1})
 
     def summary(self, reports):  # type: ignore[no-untyped-def]
         return {"frames_mean": sum(report["frames"] for report in reports) / len(reports)}

@@ -1,8 +1,10 @@
-"""Writing a measured phase reliance into the result file or row of the same method."""
+"""Writing what was measured of a method, phase reliance or robustness, into the result file or row of that method."""
+
+from typing import Any
 
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Reliance, Result, result_content, write_result
+from fpp_ml_bench.evaluation.result import Reliance, Result, Robustness, result_content, write_result
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
 from fpp_ml_bench.schema import validate
@@ -25,15 +27,25 @@ def check_same_method(entry: Entry, method: Method) -> None:
         if of_row != of_method:
             raise SubmissionError(
                 f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
-                f"{printable(str(of_method))} for the method to measure; phase reliance belongs to the very "
-                "method that was scored: give the same options"
+                f"{printable(str(of_method))} for the method to measure; what is measured belongs to the very method "
+                "that was scored: give the same options"
             )
 
 
 def write_reliance(entry: Entry, reliance: Reliance) -> None:
     """Put ``reliance`` into the file of ``entry``, replacing an earlier value; row files keep their provenance. Raises
     SubmissionError for a block that contradicts the result (other weights, other units)."""
-    content = {**result_content(entry.result), "reliance": reliance.model_dump(mode="json")}
+    _write(entry, "reliance", reliance.model_dump(mode="json"))
+
+
+def write_robustness(entry: Entry, robustness: Robustness) -> None:
+    """`write_reliance` of ``robustness``, beside that on another set."""
+    sets = {**(entry.result.robustness or {}), robustness.set: robustness}
+    _write(entry, "robustness", {name: block.model_dump(mode="json") for name, block in sets.items()})
+
+
+def _write(entry: Entry, key: str, block: dict[str, Any]) -> None:
+    content = {**result_content(entry.result), key: block}
     result: Result = validate(Result, content, entry.path, "result of fpp-eval")
     if entry.provenance == LOCAL:
         write_result(result, entry.path)

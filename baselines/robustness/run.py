@@ -1,0 +1,194 @@
+"""Measuring a method axis by axis: predictions of disturbed views in processes, a file for each finished axis."""
+
+import json
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
+from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, conditions_of
+from fpp_ml_bench.baselines.robustness.scores import score
+from fpp_ml_bench.constants import sample_name
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.files import exclusive, write_atomically
+from fpp_ml_bench.machine import single_threaded_algebra
+
+QUICK_SEVERITIES = (1, 3, 5)
+SEVERITIES = (1, 2, 3, 4, 5)
+View = dict[str, Any]
+"""A row of a view: sample, object, severity, seconds, and `SCORES`."""
+Progress = Callable[[str, int], None]
+Work = tuple[Method, Condition, FrameCache, tuple[str, ...]]
+"""A method, the clean scene, rendered frames, and the views of each object."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A method on a set. ``quick``: one view of each object and three severities, for a look."""
+
+    method: Method
+    set_name: SetName
+    size: int
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method.units != "mm":
+            raise PredictionError(
+                f"{self.method.title}: predicts normalised depth; robustness is measured in mm: give --range predicted"
+            )
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        views = tuple(corruptions().views[self.set_name])
+        return views[:1] if self.quick else views
+
+    @property
+    def severities(self) -> tuple[int, ...]:
+        return QUICK_SEVERITIES if self.quick else SEVERITIES
+
+    def axes(self, names: Sequence[str]) -> list[str]:
+        """`CLEAN`, and those of ``names`` (all with none) that apply to the method and the set."""
+        chosen, frames = corruptions().chosen(names), len(self.method.frames_used)
+        return [CLEAN, *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames))]
+
+    def conditions(self, axis: str) -> list[Condition]:
+        return conditions_of(axis, self.severities, self.set_name, self.size)
+
+    def key(self) -> dict[str, Any]:
+        """What must be equal for two measurements to be parts of one."""
+        threads = ("threads", "device")
+        return {
+            "fpp_ml_bench": __version__, "axes_version": corruptions().version, "set": self.set_name,
+            "size": self.size, "quick": self.quick, "method": self.method.name, "title": self.method.title,
+            "frames_used": list(self.method.frames_used),
+            "settings": {key: value for key, value in self.method.settings.items() if key not in threads},
+        }  # fmt: skip
+
+
+def measure(
+    setup: Setup, out: Path, axes: Sequence[str] = (), workers: int = 1, cache: Path | None = None,
+    progress: Progress = lambda axis, views: None,
+) -> dict[str, list[View]]:  # fmt: skip
+    """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
+    an earlier run of the same setup left are read instead. ``progress`` is called with an axis and a number of views.
+    Raises PredictionError for files of another setup, `BuildError` where another process is at it."""
+    with exclusive(out / ".lock", out, "measuring there"):
+        rows: dict[str, list[View]] = {}
+        missing = []
+        for axis in setup.axes(axes):
+            kept = _rows(out / f"{axis}.json", setup.key())
+            if kept is None:
+                missing.append(axis)
+            else:
+                rows[axis] = kept
+                progress(axis, len(kept))
+        if missing:
+            _measure_missing(setup, out, missing, workers, FrameCache(cache), rows, progress)
+        return {axis: rows[axis] for axis in setup.axes(axes)}
+
+
+def _measure_missing(
+    setup: Setup, out: Path, axes: Sequence[str], workers: int, cache: FrameCache, rows: dict[str, list[View]],
+    progress: Progress,
+) -> None:  # fmt: skip
+    work = setup.method, setup.conditions(CLEAN)[0], cache, setup.views
+    with _mapping(workers, work, out) as mapped:
+        for axis in axes:
+            conditions = setup.conditions(axis)
+            frame_bytes = len(setup.method.frames_used) * setup.size**2
+            cache.make_room(sum(len(c.objects) for c in conditions) * len(setup.views) * frame_bytes)
+            tasks = [(condition, name) for condition in conditions for name in condition.objects]
+            found: list[View] = []
+            for views in mapped(_measure_object, *zip(*tasks, strict=True)):
+                found += views
+                progress(axis, len(views))
+            content = {"setup": setup.key(), "axis": axis, "views": found}
+            write_atomically(out / f"{axis}.json", (json.dumps(content, indent=1) + "\n").encode())
+            rows[axis] = found
+
+
+_WORK: list[Work] = []
+"""What this process is at."""
+
+
+@contextmanager
+def _mapping(workers: int, work: Work, out: Path) -> Iterator[Callable[..., Iterable[list[View]]]]:
+    """``map`` over so many processes, or in this one."""
+    if workers == 1:
+        _WORK[:] = [work]
+        yield map
+        return
+    with single_threaded_algebra():
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (work,))
+        try:
+            yield pool.map
+        except BrokenProcessPool as error:
+            raise PredictionError(
+                f"{out}: a worker process died (out of memory?); run the same command again, it resumes; --workers 1 "
+                "needs the least memory"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _begin(work: Work) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _WORK[:] = [work]
+
+
+def _measure_object(condition: Condition, name: str) -> list[View]:
+    """The rows of an object's views in a condition, in a worker process."""
+    method, clean, cache, views = _WORK[0]
+    rules, rows = corruptions(), []
+    for view in views:
+        frames, truth = cache.frames(condition, name, view, method.frames_used), cache.truth(clean, name, view)
+        if method.uses_ground_truth_mask:
+            frames = [None if frame is None else frame * (truth.depth_mm > 0) for frame in frames]
+        started = perf_counter()
+        answer = method.answer(frames)
+        seconds = perf_counter() - started
+        scores = score(answer.depth, answer.sigma_mm, truth, rules)
+        place = {"sample": sample_name(name, view), "object": name, "severity": condition.severity}
+        rows.append({**place, "seconds": round(seconds, 4), **scores})
+    return rows
+
+
+def read_axis(file: Path) -> dict[str, Any] | None:
+    """What an axis's file holds: ``setup``, ``axis``, ``views``; None where there is none. PredictionError for a
+    damaged one."""
+    try:
+        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        views = content["views"]
+        complete = bool(views) and all({"sample", "object", "severity", "mae_mm"} <= row.keys() for row in views)
+        complete = complete and isinstance(content["setup"], dict) and isinstance(content["axis"], str)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        complete = False
+    if not complete:
+        raise PredictionError(f"{file}: damaged; delete it and run the same command again")
+    return content
+
+
+def _rows(file: Path, key: Mapping[str, Any]) -> list[View] | None:
+    """Rows of an axis that an earlier run of the same setup finished; None where there are none."""
+    content = read_axis(file)
+    if content is None:
+        return None
+    wanted = json.loads(json.dumps(key))
+    other = [name for name in wanted if content["setup"].get(name) != wanted[name]]
+    if other:
+        raise PredictionError(
+            f"{file}: holds another measurement (other {', '.join(other)}); give another folder, or delete it"
+        )
+    views: list[View] = content["views"]
+    return views

@@ -1,0 +1,130 @@
+"""``fpp-bench robustness``: how a method's error grows when the scene is disturbed, axis by axis."""
+
+import argparse
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Column, Table
+
+from fpp_ml_bench import optics
+from fpp_ml_bench.baselines import robustness
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+from fpp_ml_bench.constants import FULL_SIZE
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation import report
+from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.machine import limit_threads, usable_cores
+
+SUMMARY = (
+    "Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation."
+)
+EXAMPLES = (
+    "fpp-bench robustness phase --quick --out robustness                    a look, some minutes",
+    "fpp-bench robustness phase --out robustness                            the test set, resumable axis by axis",
+    "fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen",
+    "fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json",
+    "fpp-bench robustness unet-global-rmse --size 224 --out robustness-224",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("method", metavar="METHOD", help=METHOD_HELP)
+    add("--out", type=Path, required=True, metavar="DIR",
+        help="folder of measurements: each method has its own below it, and one page shows all")  # fmt: skip
+    add("--axes", default="", metavar="A,B", help="only these axes (default: all that apply to the method)")
+    add("--set", dest="objects", default="test", choices=("test", "unseen"), help="objects (default: test)")
+    add("--size", type=int, default=FULL_SIZE, metavar="PX", help=f"image size (default: {FULL_SIZE})")
+    add("--quick", action="store_true", help="one view of each object and three severities, for a look")
+    add("--into", type=Path, metavar="FILE",
+        help="write the block into this result or row of the same method (.json); needs all axes")  # fmt: skip
+    add("--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one for each core)")
+    add("--cache", type=Path, metavar="DIR", help="rendered frames, at most 10 GB (default: the user's cache folder)")
+    add("--no-cache", action="store_true", help="render every frame anew, keep none")
+    add_method_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, write the page, print. A file that can't take the block raises FppBenchError before measuring."""
+    limit_threads(args.threads)
+    from fpp_ml_bench.leaderboard.measured import check_same_method, write_robustness
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    if args.workers < 1:
+        raise PredictionError(f"--workers {args.workers}: expected 1 or more")
+    names = [name.strip() for name in args.axes.split(",") if name.strip()]
+    if args.into is not None and (names or args.quick):
+        raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
+    method = chosen_method(args, Scenes.of(args.objects, args.size), warn=False)
+    entry = None if args.into is None else read_entry(args.into)
+    if entry is not None:
+        check_same_method(entry, method)
+    setup = robustness.Setup(method, args.objects, args.size, args.quick)
+    folder, cache = args.out / slug(setup), None if args.no_cache else args.cache or robustness.CACHE
+    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(names) for c in setup.conditions(axis))
+    with progress_bar(f"{args.method}, {args.objects}", views, "views") as advance:
+        rows = robustness.measure(setup, folder, names, args.workers, cache, lambda axis, count: advance(count))
+    robustness.write_worst(setup, rows, folder, cache)
+    page = robustness.write_page(args.out)
+    if entry is not None:
+        write_robustness(entry, robustness.robustness(setup, rows))
+    show(_table(setup, rows))
+    print(f"{page}: curves of all methods measured there")
+    return 0
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """What a method is chosen for, in place of a dataset: the scenes are rendered when they are needed."""
+
+    settings: "render.BuildSettings"
+
+    @classmethod
+    def of(cls, objects: "robustness.SetName", size: int) -> "Scenes":
+        return cls(robustness.Condition(robustness.CLEAN, 0, tuple(robustness.SETS[objects]), size).settings)
+
+    path = Path("the robustness scenes")
+
+    @property
+    def rig(self) -> "optics.Rig":
+        return self.settings.rig
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.rig.camera.height, self.rig.camera.width
+
+    @property
+    def sequence(self) -> "optics.Sequence":
+        return self.rig.sequence
+
+    @property
+    def manifest(self) -> "storage.Manifest":
+        return render.assembly_of(self.settings).manifest
+
+
+def slug(setup: "robustness.Setup") -> str:
+    """Name of a measurement's folder."""
+    plain = re.sub(r"[^a-z0-9]+", "-", setup.method.title.casefold()).strip("-")[:80]
+    return f"{plain}-{setup.set_name}-{setup.size}{'-quick' if setup.quick else ''}"
+
+
+def _table(setup: "robustness.Setup", rows: "dict[str, list[robustness.View]]") -> Table:
+    """Errors by axis, clean and at each severity; shares at the last severity."""
+    severities = (0, *setup.severities)
+    columns = [Column("axis", no_wrap=True)]
+    columns += [Column(f"severity {severity}" if severity else "clean", justify="right") for severity in severities]
+    columns += [Column(title, justify="right") for title in ("wrong orders", "unanswered", "confident errors")]
+    table = Table(*columns, title=f"{setup.method.title}: object MAE in mm", title_justify="left")
+    for axis, found in rows.items():
+        means = robustness.by_severity(found)
+        last = means[max(means)]
+        cells = [report.millimetres(means[severity].mae_mm) if severity in means else "" for severity in severities]
+        shares = [
+            report.percent(last.wrong_share),
+            report.percent(last.unanswered_share),
+            report.percent(last.confident_share),
+        ]
+        table.add_row(axis, *cells, *shares)
+    return table

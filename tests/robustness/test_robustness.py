@@ -1,0 +1,288 @@
+"""FPP-C: conditions, charges, honesty, resuming; on one object at a small size."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines import ConstantMethod
+from fpp_ml_bench.baselines.method import Answer, Method
+from fpp_ml_bench.baselines.robustness import (
+    CLEAN,
+    SETS,
+    Condition,
+    FrameCache,
+    Setup,
+    Truth,
+    axes,
+    corruptions,
+    measure,
+    robustness,
+    run,
+    scenes,
+    score,
+    write_page,
+)
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.constants import VIEWS
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.result import Robustness
+from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.schema import validate
+
+SIZE, OBJECT = 176, "v_groove"
+ONE_FRAME = (0,)
+RULES = corruptions()
+
+
+@pytest.fixture(autouse=True)
+def one_object(monkeypatch):
+    """Both sets are a single object of two views."""
+    monkeypatch.setitem(SETS, "test", (OBJECT,))
+    monkeypatch.setitem(SETS, "unseen", (OBJECT,))
+    for name in SETS:
+        monkeypatch.setitem(RULES.views, name, ["A0", "A60"])
+
+
+def condition(axis: str, severity: int) -> Condition:
+    return Condition(axis, severity, (OBJECT,), SIZE)
+
+
+def frames(axis: str, severity: int, wanted=ONE_FRAME, cache=None):
+    return FrameCache(cache).frames(condition(axis, severity), OBJECT, "A0", wanted)
+
+
+class Noisy(Method):
+    """Answers with the middle of the range and noise; ``silent`` answers nothing; ``sigma_mm`` is what it claims."""
+
+    name, title, frames_used, settings = "noisy", "Noisy", ONE_FRAME, {}
+    silent, sigma_mm, noise_mm = False, None, 0.0
+
+    def predict(self, stack):
+        return self.answer(stack).depth
+
+    def answer(self, stack):
+        noise = np.random.default_rng(1).normal(0, self.noise_mm, (SIZE, SIZE))
+        depth = np.zeros((SIZE, SIZE)) if self.silent else 1800 + noise
+        sigma = None if self.sigma_mm is None else np.full((SIZE, SIZE), self.sigma_mm, dtype=np.float32)
+        return Answer(depth.astype(np.float32), sigma)
+
+
+def test_the_issues_severities_are_those_of_the_file():
+    severities = {name: list(axis.severities) for name, axis in RULES.axes.items()}
+    assert severities["under-exposure"] == [0.7, 0.5, 0.35, 0.25, 0.15]
+    assert severities["motion"] == [0.1, 0.25, 0.5, 1, 2]
+    assert len(severities) == 12 and RULES.unanswered_mm == 150
+    assert all(set(views) <= set(VIEWS) for views in corruptions.__wrapped__().views.values())
+
+
+@pytest.mark.parametrize("axis", RULES.axes)
+def test_severity_0_is_the_clean_frame_bit_for_bit_and_5_is_another(axis):
+    wanted = (0, 1, 2) if RULES.axes[axis].several_frames else ONE_FRAME
+    clean, same, severe = frames(CLEAN, 0, wanted), frames(axis, 0, wanted), frames(axis, 5, wanted)
+    for index in wanted:
+        assert np.array_equal(clean[index], same[index])
+    assert any(not np.array_equal(clean[index], severe[index]) for index in wanted)
+
+
+def test_a_frame_is_that_of_the_dataset_whatever_else_is_asked_for():
+    clean = frames(CLEAN, 0, (0, 18, 20))
+    assert np.array_equal(clean[0], frames(CLEAN, 0)[0]) and clean[1] is None and clean[18] is not None
+
+
+def test_read_noise_is_in_grey_levels():
+    camera = RULES.axes["read-noise"].light(RULES.clean, 3).camera
+    assert camera.read_noise_e / (camera.full_well_e / 255) == pytest.approx(4)
+
+
+def test_a_moving_object_rests_halfway_through_its_frames():
+    moved, clean = frames("motion", 5, (0, 1, 2)), frames(CLEAN, 0, (0, 1, 2))
+    assert np.array_equal(moved[1], clean[1])
+    assert not np.array_equal(moved[0], clean[0]) and not np.array_equal(moved[2], clean[2])
+
+
+def test_motion_is_nothing_to_one_frame_and_interreflection_to_convex_objects():
+    setup = Setup(Noisy(), "test", SIZE)
+    assert "motion" not in setup.axes(()) and "interreflection" in setup.axes(())
+    assert not RULES.axes["interreflection"].applies(("power_drill",), 1)
+
+
+def truth() -> Truth:
+    depth = np.zeros((SIZE, SIZE), dtype=np.float32)
+    depth[20:60, 20:60] = 1700
+    return Truth(depth, depth > 0)
+
+
+def test_silence_costs_half_an_order():
+    scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES)
+    assert scores["mae_mm"] == 150 and scores["protocol_mae_mm"] == 1700
+    assert scores["unanswered_share"] == 1 and scores["wrong_share"] == 0 and scores["coverage"] is None
+
+
+def test_a_right_answer_is_better_than_silence_and_silence_than_a_wrong_order():
+    right, wrong = truth().depth_mm + 3, truth().depth_mm + 300
+    assert score(right, None, truth(), RULES)["mae_mm"] == pytest.approx(3)
+    assert score(wrong, None, truth(), RULES)["mae_mm"] == pytest.approx(300)
+    assert score(wrong, None, truth(), RULES)["wrong_share"] == 1
+
+
+@pytest.mark.parametrize(("sigma_mm", "share"), [(5.0, 1.0), (74.0, 1.0), (76.0, 0.0), (300.0, 0.0)])
+def test_a_lie_about_sigma_is_a_confident_error(sigma_mm, share):
+    sigma = np.full((SIZE, SIZE), sigma_mm)
+    scores = score(truth().depth_mm + 300, sigma, truth(), RULES)
+    assert scores["confident_share"] == share and scores["coverage"] == 1
+    honest = score(truth().depth_mm + 20, sigma, truth(), RULES)
+    assert honest["confident_share"] == 0
+
+
+def test_stating_no_sigma_at_all_is_no_coverage():
+    scores = score(truth().depth_mm + 300, np.zeros((SIZE, SIZE)), truth(), RULES)
+    assert scores["confident_share"] == 0 and scores["coverage"] == 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+def test_no_number_is_refused(bad):
+    depth = truth().depth_mm.copy()
+    depth[0, 0] = bad
+    with pytest.raises(PredictionError, match="expected finite mm"):
+        score(depth, None, truth(), RULES)
+    with pytest.raises(PredictionError, match="sigma: expected finite mm"):
+        score(truth().depth_mm, depth, truth(), RULES)
+    with pytest.raises(PredictionError, match="expected a map of"):
+        score(depth[:-1], None, truth(), RULES)
+
+
+def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
+    chosen = ["ambient-light"]
+    random, silent, liar = Noisy(), Noisy(), Noisy()
+    random.noise_mm, silent.silent, liar.sigma_mm = 400.0, True, 1.0
+    liar.noise_mm = 400.0
+    means = {}
+    for number, method in enumerate((random, silent, liar, ConstantMethod(paper_rig(SIZE)))):
+        rows = measure(Setup(method, "test", SIZE, quick=True), tmp_path / str(number), chosen)
+        assert set(rows) == {CLEAN, *chosen} and len(rows[chosen[0]]) == 3
+        means[number] = rows[chosen[0]][0]
+    assert means[1]["mae_mm"] == 150 and means[1]["unanswered_share"] == 1
+    assert means[0]["mae_mm"] > 250 and means[0]["wrong_share"] > 0.5 and means[0]["coverage"] is None
+    assert means[2]["confident_share"] == means[2]["wrong_share"] > 0.5
+    assert means[3]["mae_mm"] < 150 and means[3]["wrong_share"] < 0.1
+
+
+def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_path, monkeypatch):
+    setup = Setup(Noisy(), "test", SIZE, quick=True)
+    first = measure(setup, tmp_path, ["ambient-light"])
+    monkeypatch.setattr(run, "_measure_object", None)  # nothing is left to do
+    assert measure(setup, tmp_path, ["ambient-light"]) == first
+    with pytest.raises(PredictionError, match="other quick"):
+        measure(Setup(Noisy(), "test", SIZE), tmp_path, ["ambient-light"])
+    (tmp_path / "clean.json").write_text('{"views": 3}')
+    with pytest.raises(PredictionError, match=r"clean\.json: damaged"):
+        measure(setup, tmp_path, ["ambient-light"])
+
+
+def test_processes_give_the_same_rows_as_one(tmp_path):
+    setup = Setup(ConstantMethod(paper_rig(SIZE)), "test", SIZE, quick=True)
+    one, two = (measure(setup, tmp_path / str(n), ["ambient-light"], workers=n) for n in (1, 2))
+    for rows in (*one.values(), *two.values()):
+        for row in rows:
+            del row["seconds"]
+    assert one == two
+
+
+def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):
+    first = frames("ambient-light", 2, cache=tmp_path)
+    (file,) = tmp_path.rglob("*.npy")
+    monkeypatch.setattr(scenes, "solid_mesh", None)  # no object, nothing is rendered
+    assert np.array_equal(frames("ambient-light", 2, cache=tmp_path)[0], first[0])
+    monkeypatch.undo()
+    file.write_bytes(file.read_bytes()[:500])
+    assert np.array_equal(frames("ambient-light", 2, cache=tmp_path)[0], first[0])
+    frames("ambient-light", 3, cache=tmp_path)
+    newer = file.parent.stat().st_mtime + 10
+    for folder in tmp_path.iterdir():
+        if folder != file.parent:
+            import os
+
+            os.utime(folder, (newer, newer))
+    cache, size = FrameCache(tmp_path), file.stat().st_size
+    cache.make_room(0, 2 * size)
+    assert len(list(tmp_path.iterdir())) == 2
+    cache.make_room(size, 2 * size)
+    assert file.parent not in list(tmp_path.iterdir()) and len(list(tmp_path.iterdir())) == 1
+
+
+def rows_of(axes_maes: dict[str, list[list[float]]]):
+    """Rows by axis from errors by severity and sample; samples s0, s1, ... of objects o0, o0, o1, o1, ..."""
+    found = {}
+    for axis, severities in axes_maes.items():
+        found[axis] = [
+            {"sample": f"s{k}", "object": f"o{k // 2}", "severity": severity, "mae_mm": mae, "protocol_mae_mm": mae,
+             "wrong_share": 0.0, "unanswered_share": 0.0, "confident_share": None, "coverage": None}
+            for severity, maes in enumerate(severities, 0 if axis == CLEAN else 1) for k, mae in enumerate(maes)
+        ]  # fmt: skip
+    return found
+
+
+def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_objects(monkeypatch):
+    setup = Setup(Noisy(), "test", SIZE)
+    monkeypatch.setattr(Setup, "axes", lambda self, names: [CLEAN, "gloss", "interreflection"])
+    rows = rows_of({CLEAN: [[1, 1, 2, 2]], "gloss": [[s, s, 2 * s, 2 * s] for s in range(1, 6)],
+                    "interreflection": [[10.0, 30.0]] * 5})  # fmt: skip
+    block = robustness(setup, rows)
+    assert block.mae_mm == pytest.approx(((1 + 2 + 3 + 4 + 5) * 1.5 + 5 * 20) / 10)
+    assert block.ratio == pytest.approx(block.mae_mm / 1.5)
+    assert block.interval[0] < block.mae_mm < block.interval[1]
+    assert block.mean("wrong_share") == 0 and block.mean("coverage") is None
+    content = block.model_dump(mode="json")
+    assert validate(Robustness, content, Path("x"), "block") == block
+    with pytest.raises(Exception, match="mae_mm does not follow"):
+        validate(Robustness, {**content, "mae_mm": 1.0}, Path("x"), "block")
+    with pytest.raises(PredictionError, match="without gloss"):
+        robustness(setup, {axis: found for axis, found in rows.items() if axis != "gloss"})
+    with pytest.raises(PredictionError, match="--quick look"):
+        robustness(replace(setup, quick=True), rows)
+
+
+def test_a_normalised_answer_and_an_unknown_axis_are_refused():
+    method = Noisy()
+    method.units = "normalised"
+    with pytest.raises(PredictionError, match="--range predicted"):
+        Setup(method, "test", SIZE)
+    with pytest.raises(PredictionError, match="unknown axis 'glos'; there are under-exposure"):
+        corruptions().chosen(["glos"])
+    assert axes.FILE.is_file()
+
+
+def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    words = ["robustness", "constant", "--at", "training-mean", "--quick", "--size", str(SIZE), "--axes", "read-noise",
+             "--workers", "1", "--out", str(out), "--cache", str(cache)]  # fmt: skip
+    assert main(words) == 0
+    assert "Constant depth: training-mean" in capsys.readouterr().out
+    assert main([*words[:2], "--at", "1700", *words[4:]]) == 0
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "Constant depth, 1700 mm" in page and "Constant depth: training-mean" in page and "<script" not in page
+    assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert len(list(out.glob("*/worst.png"))) == 2
+    (method,) = (json.loads(file.read_text()) for file in out.glob("*mean*/read-noise.json"))
+    assert [row["severity"] for row in method["views"]] == [1, 3, 5]
+    assert write_page(out) == out / "index.html"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
+        (["constant", "--steps", "3"], "--steps is an option of classical, not of constant"),
+        (["constant", "--axes", "glos"], "unknown axis 'glos'"),
+        (["constant", "--workers", "0"], "--workers 0: expected 1 or more"),
+        (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
+        (["unet-global-rmse"], "was trained at 224x224"),
+        (["no-such-method"], "unknown method"),
+    ],
+)
+def test_bad_input_is_a_sentence_and_nothing_is_written(tmp_path, capsys, words, said):
+    assert main(["robustness", *words, "--size", str(SIZE), "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
