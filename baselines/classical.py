@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.decoding import Decoded, Directions, choose_steps, decode_stack, fewest_gray_bits
+from fpp_ml_bench.coding import choose_steps
+from fpp_ml_bench.decoding import Decoded, Directions, decode_stack, fewest_gray_bits
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import DIRECTIONS, Rig
 

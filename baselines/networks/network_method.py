@@ -11,8 +11,7 @@ from fpp_ml_bench.baselines.networks.base import torch_threads
 from fpp_ml_bench.baselines.networks.model import Model
 from fpp_ml_bench.baselines.training import Loss
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import PAPER_SEQUENCE
-from fpp_ml_bench.optics import Sequence as FrameSequence
+from fpp_ml_bench.optics import PAPER_SEQUENCE, AnySequence
 
 DepthRange = Literal["oracle", "predicted", "mean"]
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
@@ -34,7 +33,7 @@ class NetworkMethod(Method):
 
     def __init__(
         self, model: Model, depth_range: DepthRange | None = None, frame: int | None = None, threads: int = 1,
-        sequence: FrameSequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
+        sequence: AnySequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
     ) -> None:  # fmt: skip
         config = self.weights_config = model.config
         self.model, self.threads = model, threads

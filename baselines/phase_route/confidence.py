@@ -13,8 +13,8 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mas
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import disk
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Observation, Reason, Settings
+from fpp_ml_bench.coding import MIN_MODULATION, phase_weights
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION, phase_weights
 
 LEAST_MARGIN = 0.1
 """Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""

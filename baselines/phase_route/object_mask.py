@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Image, Mask
+from fpp_ml_bench.coding import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION
 from fpp_ml_bench.optics import Rig
 
 Crop = tuple[slice, slice]
@@ -80,8 +80,8 @@ class EmptyScene:
         self.ambient_grey = ambient_grey
         self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
         self._rays = rig.camera.rays()
-        self._phase = layer.absolute_phase(rig.background_m * MM_PER_M)
-        self._fall_off = plane_irradiance(rig, rig.background_m)
+        self._phase = layer.absolute_phase(rig.background * MM_PER_M)
+        self._fall_off = plane_irradiance(rig, rig.background)
         self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
         self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
         self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)

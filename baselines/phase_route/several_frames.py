@@ -13,7 +13,7 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, EmptyScene, closed, without_small
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Capture
-from fpp_ml_bench.decoding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.coding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import PredictionError
 
 PAIR_DEGREES = 120.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench import optics
+from fpp_ml_bench import coding, optics
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.constants import PRESETS
@@ -60,10 +60,10 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     if args.rig is not None and args.size is not None:
         rig = rig.scaled(args.size)
     if args.pitch is not None:
-        sequence = rig.sequence
+        sequence = rig.paper_sequence
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
             lengths = (rig.pattern_length(direction) for direction in optics.DIRECTIONS)
-            horizontal, vertical = (optics.bits_needed(length, args.pitch) for length in lengths)
+            horizontal, vertical = (coding.bits_needed(length, args.pitch) for length in lengths)
             horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
             sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)

@@ -1,13 +1,3 @@
-from .gray_code import AMBIGUOUS_FRACTION as AMBIGUOUS_FRACTION
-from .gray_code import INCONSISTENT_RAD as INCONSISTENT_RAD
-from .gray_code import absolute_phase as absolute_phase
-from .gray_code import binary_to_gray as binary_to_gray
-from .gray_code import bits_needed as bits_needed
-from .gray_code import cell_centres_rad as cell_centres_rad
-from .gray_code import cell_count as cell_count
-from .gray_code import cell_of as cell_of
-from .gray_code import decode_cells as decode_cells
-from .gray_code import gray_to_binary as gray_to_binary
 from .patterns import export_patterns as export_patterns
 from .patterns import pattern_image as pattern_image
 from .patterns import pattern_profiles as pattern_profiles
@@ -29,6 +19,9 @@ from .sequence import AXES as AXES
 from .sequence import CONFIGS as CONFIGS
 from .sequence import DIRECTIONS as DIRECTIONS
 from .sequence import PAPER_SEQUENCE as PAPER_SEQUENCE
+from .sequence import AnySequence as AnySequence
+from .sequence import CodedSequence as CodedSequence
 from .sequence import Direction as Direction
 from .sequence import Frame as Frame
 from .sequence import Sequence as Sequence
+from .sequence import sequence_from_dict as sequence_from_dict

@@ -21,7 +21,7 @@ from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, 
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
 from fpp_ml_bench.loaders.storage import MANIFEST, WORK_FOLDER, Assembly, Manifest, Progress, ShardPlan
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
 IMPORTED = "imported"
 _CHECK_THREADS = 4
@@ -82,7 +82,7 @@ class SampleReader:
                 problems.append(f"{sample.frames[0]}: differs from the single-shot input {sample.fringes[0]}")
             if self.order is not None:
                 problems += self._misfits(sample, present, self.order)
-                ordered = self.order.frames(self.rig.sequence)
+                ordered = self.order.frames(self.rig.paper_sequence)
                 frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
         if problems or depth_mm is None:
             raise LayoutError("\n".join(problems))
@@ -259,7 +259,7 @@ def import_notes(manifest: Manifest) -> list[str]:
     if settings["frame_order"]:
         notes.append(f"frame order of the raw scans: {settings['frame_order']}")
         order = parse_order(settings["frame_order"])
-        first_file = (order or FrameOrder()).frames(manifest.sequence)[0]
+        first_file = (order or FrameOrder()).frames(rig_from_dict(manifest.rig).paper_sequence)[0]
         if first_file.index != SINGLE_SHOT_FRAME:
             notes.append(
                 f"the published single-shot input, A_0.png, is a {first_file.direction} fringe, stored in column "

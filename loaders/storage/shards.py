@@ -27,7 +27,7 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.optics import AnySequence
 
 BLOCK_BYTES = 1 << 22
 _BLOCKS = 4
@@ -189,7 +189,7 @@ class ShardWriter:
     lie in ``scratch``."""
 
     def __init__(
-        self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
+        self, folder: Path, scratch: Path, sequence: AnySequence, stored: str, exact: bool, size: tuple[int, int]
     ) -> None:
         self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
         self._groups = layout.stored_groups(sequence, stored)
