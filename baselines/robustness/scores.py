@@ -36,16 +36,16 @@ class Truth:
 def score(
     depth_mm: NDArray[np.floating], sigma_mm: NDArray[np.floating] | None, truth: Truth, rules: Corruptions
 ) -> Scores:
-    """`SCORES` of a prediction (H, W) in mm, 0 without an answer, whose standard uncertainty is ``sigma_mm`` (H, W),
-    above 0 where it is stated. Raises PredictionError for a depth or sigma that is not finite or below 0, and for
-    another size."""
+    """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below 0), whose standard
+    uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated. Raises PredictionError for a depth that is not
+    finite, a sigma that is not finite or below 0, and for another size."""
     for name, values in (("depth", depth_mm), ("sigma", sigma_mm)):
         if values is None:
             continue
         if values.shape != truth.depth_mm.shape:
             raise PredictionError(f"{name}: expected a map of {truth.depth_mm.shape}, got {values.shape}")
-        if not (np.isfinite(values).all() and (values >= 0).all()):
-            raise PredictionError(f"{name}: expected finite mm of 0 and more; the method is at fault")
+        if not np.isfinite(values).all() or (name == "sigma" and (values < 0).any()):
+            raise PredictionError(f"{name}: expected finite mm, a sigma of 0 and more; the method is at fault")
     target = truth.depth_mm[truth.scored].astype(np.float64)
     if target.size == 0:
         return dict.fromkeys(SCORES)
