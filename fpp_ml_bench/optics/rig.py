@@ -14,6 +14,8 @@ A rig file is YAML or JSON; reading is strict, and writing and reading again giv
     working_range_mm: [1500, 2100]
     standoff_m: 1.8
     background_m: 3.2
+
+A distortion has 5, 8, 12 or 14 coefficients (`fpp_ml_bench.optics.pinhole`).
 """
 
 import json
@@ -225,6 +227,8 @@ def rig_from_dict(data: object) -> Rig:
     pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
     for device in ("camera", "projector"):
         values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
+        if isinstance(lens := values["distortion"], list | tuple) and len(lens) == 4:
+            raise RigError(f"{device}.distortion: expected at least 5 numbers, got 4; write k3 too, as 0")
         try:
             entries[device] = Pinhole(**values)
         except RigError as error:
