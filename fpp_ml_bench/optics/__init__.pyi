@@ -8,6 +8,9 @@ from .gray_code import cell_count as cell_count
 from .gray_code import cell_of as cell_of
 from .gray_code import decode_cells as decode_cells
 from .gray_code import gray_to_binary as gray_to_binary
+from .opencv_files import Calibration as Calibration
+from .opencv_files import read_opencv_calibration as read_opencv_calibration
+from .opencv_files import write_opencv_calibration as write_opencv_calibration
 from .patterns import export_patterns as export_patterns
 from .patterns import pattern_image as pattern_image
 from .patterns import pattern_profiles as pattern_profiles

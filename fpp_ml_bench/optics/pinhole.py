@@ -85,7 +85,7 @@ def _tilt(coefficients: Coefficients) -> NDArray[np.float64]:
     return np.array([[turn[2, 2], 0.0, -turn[0, 2]], [0.0, turn[2, 2], -turn[1, 2]], [0.0, 0.0, 1.0]]) @ turn
 
 
-def _through(matrix: NDArray[np.float64], x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def _through(matrix: NDArray, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Normalised coordinates through a projective map, and their divisor: not positive behind the sensor."""
     u, v, ahead = (float(row[0]) * x + float(row[1]) * y + float(row[2]) for row in matrix)
     return u / ahead, v / ahead, ahead
