@@ -137,9 +137,9 @@ def _checked(values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf
             f"{array.shape}; give the map and the calibration of the same images"
         )
     array = array.astype(np.float64)
-    if not (np.isfinite(array) & (array >= 0) & (array <= most) & (array <= np.finfo(np.float32).max)).all():
+    bad = int((~((array >= 0) & (array <= min(most, np.finfo(np.float32).max)))).sum())  # NaN too
+    if bad:
         limits = f"from 0 to {most:g}" if np.isfinite(most) else "from 0, which means none, up"
-        bad = int((~(np.isfinite(array) & (array >= 0) & (array <= most))).sum())
         raise CaptureError(f"{name}: expected finite numbers {limits}, got {bad} others (of {array.size} pixels)")
     return array
 
@@ -156,6 +156,8 @@ def _joined(
     rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part, step_mm: float | None
 ) -> NDArray[np.bool_]:
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
+    if step_mm is not None and not 0 < step_mm < np.inf:
+        raise CaptureError(f"step_mm: expected a positive number of mm, got {step_mm!r}; leave it out for the default")
     near, far, difference = depth[one], depth[other], rays[one] - rays[other]
     apart = (near + far) / 2 * np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2)
     return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
