@@ -23,6 +23,8 @@ The sequence above is the paper's. Any other is a code for one direction or both
       vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
       # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
       # or      {scheme: gray, cell_px: 2, inverse: after each}
+
+A distortion has 5, 8, 12 or 14 coefficients (`fpp_ml_bench.optics.pinhole`).
 """
 
 import json
@@ -314,6 +316,8 @@ def rig_from_dict(data: object) -> Rig:
         entries |= {f"pitch_{direction}_px": pitch[direction] for direction in DIRECTIONS}
     for device in ("camera", "projector"):
         values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
+        if isinstance(lens := values["distortion"], list | tuple) and len(lens) == 4:
+            raise RigError(f"{device}.distortion: expected at least 5 numbers, got 4; write k3 too, as 0")
         try:
             entries[device] = Pinhole(**values)
         except RigError as error:

@@ -2,6 +2,7 @@ from .exporting import FORMS as FORMS
 from .exporting import SAMPLE_FORMS as SAMPLE_FORMS
 from .exporting import chosen_splits as chosen_splits
 from .exporting import export as export
+from .files import matrix_bytes as matrix_bytes
 from .files import parse_matrix as parse_matrix
 from .files import png_chunks as png_chunks
 from .importing import import_notes as import_notes
