@@ -16,6 +16,10 @@ class DecodeError(FppBenchError, ValueError):
     """Frames that can't be decoded at all."""
 
 
+class CalibrationError(FppBenchError, ValueError):
+    """Captures that don't determine a rig, or contradict each other."""
+
+
 class MeshError(FppBenchError, ValueError):
     """A mesh that can't be read, is empty, or does not fit the working range."""
 
