@@ -2,8 +2,8 @@
 
 Phase and depth alone determine the projector in periods (`projection`): all but the size of its pixels. The pitch in
 px then follows from one more fact: the pitch itself, the focal length in px, or (by default) the pattern's size, with
-square pixels and the principal point in the pattern's middle, (W - 1) / 2 px. A pitch that is, within its uncertainty, a
-whole number of px or fits the pattern a whole number of times is taken as that, unless the fit gets worse by it.
+square pixels and the principal point in the pattern's middle, (W - 1) / 2 px. A pitch that is within its uncertainty a
+whole number of px, or fits the pattern a whole number of times, is taken as that, unless the fit gets worse by it.
 
 The phase's origin is the centre of pixel 0, as in the patterns; another origin would shift the principal point.
 """
@@ -221,10 +221,11 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
 def _differences(view: DepthView, rig: Rig) -> NDArray[np.float64]:
     """Depth by the rig minus the depth given in mm, and projected minus measured u and v in px, (3, n)."""
     pitches = np.array([[rig.pitch(direction)] for direction in AXES])
-    coordinates_px, weights = view.periods * pitches, (view.modulation / pitches) ** 2
+    (u_px, v_px), weights = view.periods * pitches, (view.modulation / pitches) ** 2
     x, y = view.rays
-    depth_mm = depth_from_both((x, y), *coordinates_px, rig, weights[0], weights[1]).depth_mm
-    return np.stack([depth_mm - view.depth_mm, *(np.stack(rig.project(view.points_m)) - coordinates_px)])
+    depth_mm = depth_from_both((x, y), u_px, v_px, rig, weights[0], weights[1]).depth_mm
+    projected_u, projected_v = rig.project(view.points_m)
+    return np.stack([depth_mm - view.depth_mm, projected_u - u_px, projected_v - v_px])
 
 
 def _residual(name: str, differences: NDArray[np.float64]) -> Residual:

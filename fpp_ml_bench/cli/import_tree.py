@@ -17,7 +17,7 @@ EXAMPLES = (
     "fpp-bench import fpp-ml-bench data/published",
     "fpp-bench import fpp-ml-bench data/published --frame-order paper",
     "fpp-bench import my-scans data/mine --rig my-rig.yaml",
-    "fpp-bench import my-scans data/mine --fit-rig                find the rig from frames and depth, as calibrate does",
+    "fpp-bench import my-scans data/mine --fit-rig               find the rig from frames and depth, as calibrate does",
     "",
     "TREE holds training_datasets/ (training_data_depth_raw, or the global or individual variant) and, if there are",
     "raw scans, fpp_synthetic_dataset/. The tree's split is used. If files break the layout, they are all listed and",
