@@ -3,7 +3,8 @@
 Phase and depth alone determine the projector in periods (`projection`): all but the size of its pixels. The pitch in
 px then follows from one more fact: the pitch itself, the focal length in px, or (by default) the pattern's size, with
 square pixels and the principal point in the pattern's middle, (W - 1) / 2 px. A pitch that is within its uncertainty a
-whole number of px, or fits the pattern a whole number of times, is taken as that, unless the fit gets worse by it.
+whole number of px, or fits the pattern a whole number of times, is taken as that; also one that is a little farther off
+(`_PITCH_SHARE`), unless the fit gets worse by it.
 
 The phase's origin is the centre of pixel 0, as in the patterns; another origin would shift the principal point.
 """
@@ -90,7 +91,7 @@ def fit_projector(
     width, height = size or (rig.projector.width, rig.projector.height)
     measured = measured_in(views, most_px)
     start = projection_from(measured.points_m, measured.periods.T)
-    search = _Search(measured, (width, height), frozenset({"k1"} if lens else ()))
+    search = _Search(measured.only(start.kept), (width, height), frozenset({"k1"} if lens else ()))
     if pitch_px is not None:
         fitted = first = search.with_pitch(start, pitch_px)
         pitch_from = "given"
@@ -150,16 +151,17 @@ class _Search:
 
     def _rounded(self, found: Projector, centre: frozenset[str]) -> tuple[Projector, str]:
         """The fit with a whole pitch where the found one may be it, else the found one; and words that say so."""
-        pitches, words = {}, []
+        pitches, words, certain = {}, [], True
         for name, length in zip(("pitch_u", "pitch_v"), self.size, strict=True):
             if whole := _whole_pitch(found.values[name], found.errors[name], length):
                 pitches[name], title = whole
                 words.append(title)
+                certain &= abs(pitches[name] - found.values[name]) <= _SIGMAS * found.errors[name]
         if not pitches:
             return found, ""
         start = found.having(**pitches)
         fitted = self._fit(start, frozenset({"focal"}), centre, PITCH - pitches.keys())
-        if fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
+        if not certain and fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
             return found, ""
         return fitted, "; rounded to " + " and ".join(dict.fromkeys(words))
 

@@ -20,32 +20,36 @@ LEAST_GAP = 5.0
 LEAST_SINGULAR = 1e-5
 MOST_SKEW = 0.05
 """Of K, as a part of the focal length: a projector's axes are square to each other to far better than 3 degrees."""
-_TRIMMINGS = 5
-_KEPT_SIGMAS = 5.0
+_MOST_TRIMMINGS = 30
+_KEPT_MEDIANS = 5.0
 _SMALLEST_PERIODS = 1e-9
 ROBUST = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 class Projection(NamedTuple):
-    """R (3, 3), t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u and v."""
+    """R (3, 3), t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u and v; and which of the
+    points it was found from, bool (n,)."""
 
     R: NDArray[np.float64]
     t: NDArray[np.float64]
     focal: NDArray[np.float64]
     centre: NDArray[np.float64]
+    kept: NDArray[np.bool_]
 
 
 def projection_from(points_m: NDArray[np.float64], periods: NDArray[np.float64]) -> Projection:
-    """The projection of points (n, 3) in the camera's frame, m, to ``periods`` (n, 2), without outliers. Raises
-    `CalibrationError` where the points are flat, don't fit any projection, or fit only a mirrored or oblique one."""
+    """The projection of points (n, 3) in the camera's frame, m, to ``periods`` (n, 2), from those that agree with the
+    rest. Raises `CalibrationError` where the points are flat, don't fit any projection, or fit only a mirrored or oblique one."""
     kept = np.ones(len(points_m), dtype=bool)
-    for _ in range(_TRIMMINGS):
+    for _ in range(_MOST_TRIMMINGS):
         matrix, singular = _dlt(points_m[kept], periods[kept])
         projected = points_m @ matrix[:, :3].T + matrix[:, 3]
         with np.errstate(all="ignore"):
             distance = np.linalg.norm(projected[:, :2] / projected[:, 2:] - periods, axis=1)
-        kept = distance <= _KEPT_SIGMAS * ROBUST * np.median(distance) + _SMALLEST_PERIODS
+        before, kept = kept, distance <= _KEPT_MEDIANS * np.median(distance) + _SMALLEST_PERIODS
+        if np.array_equal(before, kept):
+            break
     extents = np.linalg.svd(points_m[kept] - points_m[kept].mean(axis=0), compute_uv=False)
     if extents[2] < LEAST_THICKNESS * extents[0]:
         raise CalibrationError(
@@ -54,12 +58,13 @@ def projection_from(points_m: NDArray[np.float64], periods: NDArray[np.float64])
         )
     if singular[-2] < LEAST_SINGULAR * singular[0] or singular[-2] < LEAST_GAP * singular[-1]:
         raise CalibrationError(
-            "no projector explains phase and depth together: expected phases of the frames that this depth was "
-            "measured from, and the camera that took them. Check the frame order, the depth's unit and the camera"
+            "no projector explains phase and depth together, or the surface has too little relief for their noise: "
+            "expected phases of the frames that this depth was measured from. Check the frame order, the depth's unit "
+            "and the camera, or give more views"
         )
     if np.median(projected[:, 2]) < 0:
         matrix = -matrix
-    return _decomposed(matrix)
+    return _decomposed(matrix, kept)
 
 
 def _dlt(points: NDArray[np.float64], periods: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -81,7 +86,7 @@ def _dlt(points: NDArray[np.float64], periods: NDArray[np.float64]) -> tuple[NDA
     return out @ right[-1].reshape(3, 4) @ into, singular
 
 
-def _decomposed(matrix: NDArray[np.float64]) -> Projection:
+def _decomposed(matrix: NDArray[np.float64], kept: NDArray[np.bool_]) -> Projection:
     from scipy.linalg import rq
 
     if np.linalg.det(matrix[:, :3]) < 0:
@@ -99,4 +104,4 @@ def _decomposed(matrix: NDArray[np.float64]) -> Projection:
             f"the best projector has oblique axes (skew {upper[0, 1] / upper[0, 0]:.3f} of its focal length, expected "
             f"under {MOST_SKEW}); check the camera, the frame order, and that the depth belongs to these frames"
         )
-    return Projection(rotation, translation, np.diag(upper)[:2].copy(), upper[:2, 2].copy())
+    return Projection(rotation, translation, np.diag(upper)[:2].copy(), upper[:2, 2].copy(), kept)

@@ -32,6 +32,9 @@ class Measured:
     weights: NDArray[np.float64]
     bands: NDArray[np.intp]
 
+    def only(self, kept: NDArray[np.bool_]) -> "Measured":
+        return Measured(self.points_m[kept], self.periods[:, kept], self.weights[:, kept], self.bands[kept])
+
 
 def measured_in(views: list[DepthView], most_px: int) -> Measured:
     """What ``views`` measure, thinned evenly to about ``most_px`` pixels."""
