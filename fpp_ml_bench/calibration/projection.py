@@ -28,8 +28,8 @@ ROBUST = 1.4826
 
 
 class Projection(NamedTuple):
-    """R (3, 3), t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u and v; and which of the
-    points it was found from, bool (n,)."""
+    """R (3, 3), t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u and v; ``kept`` bool
+    (n,): the points it was found from."""
 
     R: NDArray[np.float64]
     t: NDArray[np.float64]
@@ -40,7 +40,7 @@ class Projection(NamedTuple):
 
 def projection_from(points_m: NDArray[np.float64], periods: NDArray[np.float64]) -> Projection:
     """The projection of points (n, 3) in the camera's frame, m, to ``periods`` (n, 2), from those that agree with the
-    rest. Raises `CalibrationError` where the points are flat, don't fit any projection, or fit only a mirrored or oblique one."""
+    rest. Raises `CalibrationError` where the points are flat, fit no projection, or only a mirrored or oblique one."""
     kept = np.ones(len(points_m), dtype=bool)
     for _ in range(_MOST_TRIMMINGS):
         matrix, singular = _dlt(points_m[kept], periods[kept])

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
-from fpp_ml_bench import optics
-from fpp_ml_bench.calibration import DepthFit, Residual
+from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
@@ -86,16 +85,17 @@ def run(args: argparse.Namespace) -> int:
     known_rig = None if args.camera is None else optics.load_rig(args.camera)
     reader = published.plan_import(args.from_depth, known_rig, args.frame_order).reader
     with progress_bar("reading", len(reader.tree.by_name), "views") as advance:
-        rig, fit = published.fit_tree(
-            reader, workers, advance, size=args.projector, pitch_px=args.pitch, focal_px=args.focal, lens=args.lens
-        )
+        views = published.tree_views(reader, workers, advance)
+    rig, fit = calibration.fit_projector(
+        views, reader.rig, args.projector, pitch_px=args.pitch, focal_px=args.focal, lens=args.lens
+    )
     print_fit(rig, fit)
     optics.save_rig(rig, args.out)
     print(f"wrote {args.out}; next: fpp-bench import {args.from_depth} OUT --rig {args.out}")
     return 0
 
 
-def print_fit(rig: optics.Rig, fit: DepthFit) -> None:
+def print_fit(rig: "optics.Rig", fit: "calibration.DepthFit") -> None:
     """Print a fitted rig and its residuals: of all views together, and of the views with the largest RMS."""
     columns = [Column(name, justify="right") for name in ("pixels", "no depth", "median", "sigma", "RMS", "RMS, px")]
     shown = sorted(fit.views, key=lambda view: -view.rms_mm if view.pixels else float("-inf"))[:_MOST_SHOWN]
@@ -115,6 +115,6 @@ def print_fit(rig: optics.Rig, fit: DepthFit) -> None:
     print(f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm")
 
 
-def _cells(view: Residual) -> list[str]:
+def _cells(view: "calibration.Residual") -> list[str]:
     lengths = (f"{view.median_mm:.4f}", f"{view.sigma_mm:.4f}", f"{view.rms_mm:.4f}", f"{view.rms_px:.3f}")
     return [view.name, str(view.pixels), str(view.missing), *(lengths if view.pixels else "----")]

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench import optics
+from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli.calibrate import print_fit
 from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.errors import BuildError
@@ -48,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
     plan = published.plan_import(args.tree, rig, args.frame_order)
     if args.fit_rig:
         with progress_bar("reading", len(plan.reader.tree.by_name), "views") as advance:
-            rig, fit = published.fit_tree(plan.reader, workers, advance)
+            views = published.tree_views(plan.reader, workers, advance)
+        rig, fit = calibration.fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
         plan = published.plan_import(args.tree, rig, args.frame_order)
     sample_count = len(plan.reader.tree.by_name)

@@ -1,11 +1,11 @@
-"""The rig of a published tree from its raw scans and depths, for trees whose pitch and projector are not published."""
+"""What a published tree's raw scans and depths say about the rig, whose pitch and projector are not published."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fpp_ml_bench.calibration import MOST_PX, DepthFit, DepthView, fit_projector, view_from_frames
+from fpp_ml_bench.calibration import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DecodeError, LayoutError
@@ -16,8 +16,8 @@ from fpp_ml_bench.optics import Rig
 
 _LEAST_PX_A_VIEW = 2000
 AGREEING_MM = 1.0
-"""Median difference between a tree's depth and that of a rig, decoded from its frames, up to which the rig is its own:
-twice the error of the benchmark's own ground truth."""
+"""Largest median difference between a tree's depth and what its own rig decodes from its frames: twice the error of
+the benchmark's ground truth."""
 
 
 def tree_views(
@@ -41,14 +41,6 @@ def tree_views(
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(view, samples))
-
-
-def fit_tree(
-    reader: SampleReader, threads: int = 1, progress: Callable[[int], None] = lambda views: None, **known: object
-) -> tuple[Rig, DepthFit]:
-    """The rig that took a tree's frames, by `fit_projector` with what is ``known`` of it; errors as `tree_views` and
-    `fit_projector`."""
-    return fit_projector(tree_views(reader, threads, progress), reader.rig, **known)  # type: ignore[arg-type]
 
 
 def depth_difference_mm(reader: SampleReader) -> float | None:
