@@ -36,6 +36,7 @@ _PITCH_SHARE, _PITCH_PX = 0.005, 0.25
 """A pitch this near to a whole one may be it, whatever its standard error: the part that noise does not explain."""
 _MOST_APART_PX = 0.5
 _MOST_WORSE, _WORSE_PX = 1.05, 1e-3
+_SMALLEST_PX = 1e-4
 _LEVELS = 99.9, 0.1
 _STEP_MM, _BEHIND_M = 10, 0.1
 
@@ -168,15 +169,15 @@ class _Search:
 
 def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[float, str] | None:
     """The whole number of px, or the whole part of the pattern's length, that a measured pitch may be, and its name."""
-    allowed = max(_SIGMAS * error_px, min(_PITCH_SHARE * pitch_px, _PITCH_PX))
-    if allowed >= _MOST_APART_PX:
-        return None
-    if abs(round(pitch_px) - pitch_px) <= allowed:
-        return float(round(pitch_px)), "whole px"
-    periods = round(length_px / pitch_px)
-    return (
-        (length_px / periods, f"{length_px} px / {periods}") if abs(length_px / periods - pitch_px) <= allowed else None
-    )
+    noise_px = _SIGMAS * error_px + _SMALLEST_PX
+    whole, part = float(round(pitch_px)), length_px / round(length_px / pitch_px)
+    if noise_px < _MOST_APART_PX and abs(whole - pitch_px) <= max(noise_px, min(_PITCH_SHARE * pitch_px, _PITCH_PX)):
+        return whole, "whole px"
+    # Parts of the pattern lie closer together, so that one of them is near any pitch.
+    next_part = length_px / (length_px / part + 1)
+    if noise_px < (part - next_part) / 4 and abs(part - pitch_px) <= noise_px:
+        return part, f"{length_px} px / {length_px / part:.0f}"
+    return None
 
 
 def _projector(start: Projection, pitch_px: Pair) -> Projector:
