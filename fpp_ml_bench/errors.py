@@ -20,6 +20,10 @@ class CaptureError(FppBenchError, ValueError):
     """Captured images that can't be read as frames, or results of a capture that can't be written."""
 
 
+class CalibrationError(FppBenchError, ValueError):
+    """Captures that don't determine a rig, or contradict each other."""
+
+
 class MeshError(FppBenchError, ValueError):
     """A mesh that can't be read, is empty, or does not fit the working range."""
 

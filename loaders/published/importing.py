@@ -301,7 +301,11 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
         refusals.append(
             f"{sample.frames[0].parent}: fits no named frame order. Mismatch with the paper's order: {misfits[0]}"
         )
-    raise published_tree.layout_error(tree.root, refusals)
+    hint = (
+        "the order is checked with the rig's axes, given by --rig or else the paper's; for a projector that is turned, "
+        "give a rough rig, from which fpp-bench calibrate --from-depth TREE --camera ROUGH finds the exact one"
+    )
+    raise published_tree.layout_error(tree.root, [*refusals, hint])
 
 
 def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
