@@ -7,8 +7,13 @@ from .decode import Directions as Directions
 from .decode import decode_stack as decode_stack
 from .fewest import fewest_gray_bits as fewest_gray_bits
 from .fewest import fewest_steps as fewest_steps
+from .frame_order import exchanged_frames as exchanged_frames
 from .triangulation import FIXED_POINT_STEPS as FIXED_POINT_STEPS
+from .triangulation import coordinate_slope_px_per_mm as coordinate_slope_px_per_mm
 from .triangulation import depth_from_both as depth_from_both
 from .triangulation import depth_from_coordinate as depth_from_coordinate
 from .triangulation import depth_noise_mm as depth_noise_mm
 from .triangulation import rotated_ray as rotated_ray
+from .uncertainty import ASSUMED_NOISE_GREY as ASSUMED_NOISE_GREY
+from .uncertainty import depth_sigma_mm as depth_sigma_mm
+from .uncertainty import noise_of_frames as noise_of_frames

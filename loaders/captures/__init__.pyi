@@ -6,3 +6,4 @@ from .images import COLOURS as COLOURS
 from .images import CapturedFrames as CapturedFrames
 from .images import frame_files as frame_files
 from .images import read_frames as read_frames
+from .picture import capture_picture as capture_picture
