@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.coding.coordinates import Coordinates, Limits
 from fpp_ml_bench.errors import RigError
 
-Kind = Literal["sinusoid", "gray", "black", "white"]
+Kind = Literal["sinusoid", "gray", "crossed", "black", "white"]
 SMALLEST_PITCH_PX = 4.0
 """A Gray cell is half a period; below two pixels a cell its edges and centres can't be told apart."""
 

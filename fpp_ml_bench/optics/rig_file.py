@@ -18,6 +18,8 @@ The sequence above is the paper's. Any other is a code for one direction or both
       vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
       # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
       # or      {scheme: gray, cell_px: 2, inverse: after each}
+      # or      {scheme: composite, pitches_px: [18, 22]}: one frame, the sum; with both directions of steps: 1,
+      #         order: [crossed] is one frame, the mean of theirs
 
 Camera, projector and pose may be those of a calibration by OpenCV (`opencv_files`), in place of these four entries::
 
