@@ -108,7 +108,7 @@ class Board:
     def _circles(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
         settings = cv2.SimpleBlobDetector_Params()
         settings.minArea, settings.maxArea = 12.0, image.size / (self.columns * self.rows)
-        settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 20, 240, 10
+        settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 10
         settings.minDistBetweenBlobs, settings.filterByConvexity, settings.minInertiaRatio = 4, False, 0.05
         flags = cv2.CALIB_CB_SYMMETRIC_GRID if self.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
         for dark in (True, False):
