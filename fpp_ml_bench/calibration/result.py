@@ -10,8 +10,8 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Pinhole
 
 SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
-"""A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median, and
-its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
+"""A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median,
+and its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
 
 
 @dataclass(frozen=True)
