@@ -12,6 +12,10 @@ class RigError(FppBenchError, ValueError):
     """A rig that is not a usable camera-projector pair."""
 
 
+class CalibrationError(FppBenchError, ValueError):
+    """A board that is not found, or captures that don't determine a rig."""
+
+
 class DecodeError(FppBenchError, ValueError):
     """Frames that can't be decoded at all."""
 

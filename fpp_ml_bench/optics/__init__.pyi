@@ -1,4 +1,4 @@
-from .opencv_files import Calibration as Calibration
+from .opencv_files import OpenCvCalibration as OpenCvCalibration
 from .opencv_files import read_opencv_calibration as read_opencv_calibration
 from .opencv_files import write_opencv_calibration as write_opencv_calibration
 from .patterns import export_patterns as export_patterns

@@ -189,11 +189,11 @@ def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text,
 
 def test_a_rig_file_may_name_a_calibration_by_opencv(tmp_path):
     from fpp_ml_bench.optics import read_opencv_calibration, write_opencv_calibration
-    from fpp_ml_bench.optics.opencv_files import Calibration
+    from fpp_ml_bench.optics.opencv_files import OpenCvCalibration
 
     rig = vertical_rig({"scheme": "gray", "cell_px": 2})
     write_opencv_calibration(
-        Calibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), tmp_path / "c.yml"
+        OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), tmp_path / "c.yml"
     )
     assert read_opencv_calibration(tmp_path / "c.yml").camera == rig.camera
     (tmp_path / "rig.yaml").write_text(
