@@ -12,10 +12,6 @@ class RigError(FppBenchError, ValueError):
     """A rig that is not a usable camera-projector pair."""
 
 
-class CalibrationError(FppBenchError, ValueError):
-    """A board that is not found, or captures that don't determine a rig."""
-
-
 class DecodeError(FppBenchError, ValueError):
     """Frames that can't be decoded at all."""
 
@@ -25,7 +21,7 @@ class CaptureError(FppBenchError, ValueError):
 
 
 class CalibrationError(FppBenchError, ValueError):
-    """Captures that don't determine a rig, or contradict each other."""
+    """A board that is not found, or captures that don't determine a rig, or contradict each other."""
 
 
 class MeshError(FppBenchError, ValueError):
