@@ -161,7 +161,7 @@ class Bundle:
         count = sum(part.shape[1] for part in joined)
         inflation = count / max(count - unknowns, 1)
         camera, projector = (max(inflation * part[0].mean() - part[1].mean(), 0.0) ** 0.5 for part in joined)
-        self.extra_px = (max(camera, LEAST_SIGMA_PX), max(projector, LEAST_SIGMA_PX))
+        self.extra_px = (float(max(camera, LEAST_SIGMA_PX)), float(max(projector, LEAST_SIGMA_PX)))
         return self.extra_px
 
 
