@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Column, Table
 
 from fpp_ml_bench import coding, decoding, optics
-from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.console import progress_bar, show, working_range
 from fpp_ml_bench.errors import CaptureError, DecodeError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import captures
@@ -32,16 +32,6 @@ CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
 
 
-def _range(text: str) -> tuple[float, float]:
-    try:
-        near, far = (float(part) for part in text.split(","))
-    except ValueError:
-        near, far = 1.0, 0.0
-    if not 0 < near < far < 1e9:
-        raise argparse.ArgumentTypeError(f"expected NEAR,FAR in mm such as 350,450, got {text!r}")
-    return near, far
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("rig", type=Path, metavar="RIG", help="rig file (.yaml, .json)")
@@ -49,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     add("--direction", choices=("horizontal", "vertical", "both"), default="both",
         help="which of the coded directions to use (default: all there are)")  # fmt: skip
-    add("--range", type=_range, metavar="NEAR,FAR", help="working range in mm (default: the rig's)")
+    add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the rig's)")
     add("--mask", type=Path, metavar="FILE", help="image or .npy: decode where it is not 0")
     add("--min-modulation", type=float, default=coding.MIN_MODULATION, metavar="GREY",
         help=f"least modulation of a pixel in grey levels of 255 (default: {coding.MIN_MODULATION:g})")  # fmt: skip

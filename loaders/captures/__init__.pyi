@@ -1,3 +1,6 @@
+from .board_poses import board_poses as board_poses
+from .board_poses import calibrated_rig as calibrated_rig
+from .board_poses import pose_folders as pose_folders
 from .exports import FORMS as FORMS
 from .exports import export_capture as export_capture
 from .exports import pixel_normals as pixel_normals
