@@ -51,7 +51,7 @@ class PhaseMethod(Method):
         return self.route.measure(self._images(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.observe(self._images(frames)).crop
+        return self.route.resampling.captured_crop(self.route.observe(self._images(frames)).crop)
 
     def _images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = []
