@@ -7,6 +7,7 @@ the surface within it, nothing tells the two apart, and the order is ambiguous.
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask
@@ -33,7 +34,7 @@ SURE, LIKELY = 1.0, 0.03
 of an order: at the edge of a surface the phase may be that of two."""
 
 
-def margin_by_range(seen: Observation, order: Image) -> Image:
+def margin_by_range(seen: Observation, order: NDArray[np.int32]) -> Image:
     """Margin of ``order`` (h, w), float32: `SURE` where range and continuity rule every other order out, `LIKELY` where
     the range leaves a pixel alone one order, or beside a settled surface that it continues, else 0."""
     residual = seen.layer.residual_phase(seen.phase_rad, order)
@@ -65,7 +66,7 @@ def _misfit(seen: Observation) -> Image:
     return np.sqrt(cv2.GaussianBlur(relative * relative, (0, 0), MISFIT_PERIODS * seen.period_px))
 
 
-def _in_range(seen: Observation, order: Image) -> Mask:
+def _in_range(seen: Observation, order: NDArray[np.int32]) -> Mask:
     first, count = seen.candidates.first, seen.candidates.count
     return (order >= first) & (order < first + count)
 

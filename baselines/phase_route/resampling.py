@@ -1,18 +1,18 @@
 """Images whose fringe period is far from the one that a method was made for: resampled before, and the answer after.
 
-Windows, the steps of the order's grid and the filters of a network have a size in pixels of the fringe. So an image with a
+Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe. So an image with a
 period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image of 6 px enlarged. Nothing
 is lost of a longer period: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates, Mask
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates, Image, Mask
 from fpp_ml_bench.baselines.phase_route.object_mask import Crop
 from fpp_ml_bench.baselines.phase_route.observation import Measurement, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
@@ -99,9 +99,9 @@ class Resampling:
         captured image. The other maps are taken from the nearest pixel. ``range_mm``: the range of the candidates."""
         size = self.captured.camera.width, self.captured.camera.height
         inside = np.isfinite(measured.wrapped_phase_rad)
-        if not inside.any():
-            return self._empty(measured)
-        y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        y, x = np.indices(inside.shape)
+        if inside.any():
+            y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
 
         def nearest(image: NDArray) -> NDArray:
             """From the nearest object pixel."""
@@ -114,7 +114,8 @@ class Resampling:
             cv2.morphologyEx(np.where(inside, psi, beyond), operation, np.ones((3, 3), np.uint8))
             for operation, beyond in ((cv2.MORPH_ERODE, np.inf), (cv2.MORPH_DILATE, -np.inf))
         )
-        beside_jump = nearest((np.where(inside, highest - lowest, 0) > JUMP_RAD).astype(np.uint8)) > 0
+        step = np.subtract(highest, lowest, out=np.zeros_like(psi), where=inside)
+        beside_jump = nearest((step > JUMP_RAD).astype(np.uint8)) > 0
         on_object = weight > 0.5
         part = captured_layer.at(on_object)
         residual = np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6))[on_object]
@@ -131,7 +132,9 @@ class Resampling:
             image[on_object] = values
             return image
 
-        maps = "modulation_grey", "confidence", "expected_error_mm", "order_doubt_mm"
+        def pasted(image: Image) -> Image:
+            return paste(nearest(image)[on_object], np.float32)
+
         reason = paste(nearest(measured.reason)[on_object], np.uint8, Reason.BACKGROUND)
         counts = np.bincount(reason.ravel(), minlength=len(Reason))
         return replace(
@@ -139,18 +142,6 @@ class Resampling:
             candidates=Candidates(paste(allowed.first, np.int32), paste(allowed.count, np.int32)),
             depth_mm=paste(depth_mm, np.float32), reason=reason,
             counts={code.name.lower(): int(counts[code]) for code in Reason},
-            **{name: paste(nearest(getattr(measured, name))[on_object], np.float32) for name in maps},
+            modulation_grey=pasted(measured.modulation_grey), confidence=pasted(measured.confidence),
+            expected_error_mm=pasted(measured.expected_error_mm), order_doubt_mm=pasted(measured.order_doubt_mm),
         )  # fmt: skip
-
-    def _empty(self, measured: Measurement) -> Measurement:
-        """The measurement of an image without an object, in the size of the captured image."""
-        size = self.captured.camera.width, self.captured.camera.height
-
-        def resized(image: NDArray) -> NDArray:
-            return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-
-        candidates = Candidates(resized(measured.candidates.first), resized(measured.candidates.count))
-        names = [f.name for f in fields(measured) if isinstance(getattr(measured, f.name), np.ndarray)]
-        counts = dict.fromkeys(measured.counts, 0) | {"background": size[0] * size[1]}
-        maps = {name: resized(getattr(measured, name)) for name in names}
-        return replace(measured, candidates=candidates, counts=counts, **maps)

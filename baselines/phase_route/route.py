@@ -218,7 +218,7 @@ class PhaseRoute:
         for window in self._windows[1:]:
             fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, capture.shifts_rad)
             phase = fit.phase_rad
-        for _ in range(0 if background.shown else FREE_ROUNDS):
+        for _ in range(0 if background.calibrated else FREE_ROUNDS):
             if not given:
                 predicted = np.float32(background.ambient_grey) + fit.light
                 inside = inside & explained(greys[0], predicted, background.ambient_grey, self.period_px)
