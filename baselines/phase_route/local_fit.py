@@ -41,9 +41,10 @@ class Window:
         self._kernels = [(weight * t**power).astype(np.float64) for power in range(2 * max(map(max, CURVED)) + 1)]
 
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
-        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image."""
+        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image. In
+        the image's precision, single or double."""
         kernels = self._kernels
-        return cv2.sepFilter2D(image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
+        return cv2.sepFilter2D(image, -1, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -111,19 +112,23 @@ def fringe_fit(
 ) -> FringeFit:  # fmt: skip
     """Fit of g (1 + c cos(carrier + shift + d)), g of the ``terms`` and c the ``contrast``, around each pixel of
     ``greys``, float32 (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
-    weight = inside.astype(np.float32)
+    # The moments of more terms than a plane's are too much alike for the elimination in single precision.
+    real: type = np.float32 if len(terms) <= len(PLANE) else np.float64
+    weight: NDArray = inside.astype(real)
+    rr: NDArray
     rr = rs = ss = lr = ls = np.zeros_like(weight)
     for grey, shift in zip(greys, shifts_rad, strict=True):
-        angle = carrier_rad + np.float32(shift)
-        light = (grey - np.float32(ambient)) * weight
-        raised, sine = 1 + np.float32(contrast) * np.cos(angle), np.float32(contrast) * np.sin(angle)
+        angle = carrier_rad.astype(real) + real(shift)
+        light = (grey - real(ambient)) * weight
+        raised, sine = 1 + real(contrast) * np.cos(angle), real(contrast) * np.sin(angle)
         rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
         lr, ls = lr + light * raised, ls + light * sine
     m = window.moment
     rows = [[m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)] for i, (a, b) in enumerate(terms)] + [[m(ss)]]
     g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-    return FringeFit((carrier_rad + step).astype(np.float32), g, m(weight), contrast)
+    phase, share = (carrier_rad + step).astype(np.float32), m(weight).astype(np.float32)
+    return FringeFit(phase, g.astype(np.float32), share, contrast)
 
 
 def measured_contrast(light: Image, inside: Mask, fit: FringeFit) -> float:

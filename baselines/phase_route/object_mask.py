@@ -38,7 +38,7 @@ DIFFERENT_SIGMAS = 3.5
 CLOSING_PERIODS = 0.27
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
-LARGEST_MISFIT = 0.25  # of a fringe that is there, squared, as a share of its own square
+LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
 OBJECT_BONUS = 4.0  # added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object
 UNLIT_PERIODS = 0.8
 UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit

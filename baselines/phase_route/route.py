@@ -43,8 +43,7 @@ Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
-FREE_ROUNDS = 3
-"""Further fits where no known background shows, to fringes of any contrast on surfaces of any brightness."""
+CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
 PAIR_ROUNDS = 2  # fits to two frames over the small window
 MOST_SLACK_PERIODS = 0.07
 """Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, whose `Settings.slack_mm` is
@@ -218,13 +217,8 @@ class PhaseRoute:
         for window in self._windows[1:]:
             fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, capture.shifts_rad)
             phase = fit.phase_rad
-        for _ in range(0 if background.calibrated else FREE_ROUNDS):
-            if not given:
-                predicted = np.float32(background.ambient_grey) + fit.light
-                inside = inside & explained(greys[0], predicted, background.ambient_grey, self.period_px)
-            contrast = measured_contrast(greys[0] - np.float32(background.ambient_grey), inside, fit)
-            light = background.ambient_grey, self._windows[0], capture.shifts_rad, contrast, CURVED
-            fit = fringe_fit(greys, inside, fit.phase_rad, *light)
+        if not background.calibrated:
+            inside, fit = self._free_fits(capture, inside, fit, given)
         watch.done("phase")
         if given:
             return inside, fit
@@ -235,6 +229,23 @@ class PhaseRoute:
             inside = refined(inside, background, predicted, greys[0], FRINGE_NOISE * bright, reach_px)
         inside = inside & ~dark & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
         watch.done("mask")
+        return inside, fit
+
+    def _free_fits(self, capture: Capture, inside: Mask, fit: FringeFit, given: bool) -> tuple[Mask, FringeFit]:
+        """Object mask and fits to fringes of any contrast on surfaces of any brightness, after a ``fit`` that assumes
+        full contrast: its contrast is measured, then the fits start again, because a fit keeps the ripple of the phase
+        that it starts from."""
+        grey, ambient = capture.greys[0], capture.background.ambient_grey
+        for _ in range(CONTRAST_ROUNDS):
+            if not given:
+                inside = inside & explained(grey, np.float32(ambient) + fit.light, ambient, self.period_px)
+            contrast = measured_contrast(grey - np.float32(ambient), inside, fit)
+            light = ambient, self._windows[0], capture.shifts_rad, contrast, CURVED
+            fit = fringe_fit(capture.greys, inside, fit.phase_rad, *light)
+        phase, _ = carrier_fit(grey, inside, self._carrier[capture.crop], self._windows[0])
+        for _ in range(FREE_ROUNDS):
+            fit = fringe_fit(capture.greys, inside, phase, *light)
+            phase = fit.phase_rad
         return inside, fit
 
     def _modulated(self, grey: Image, background: Background) -> Mask:
