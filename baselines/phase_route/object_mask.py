@@ -1,4 +1,4 @@
-"""The object mask: pixels whose grey level the empty scene does not explain.
+"""The object mask: pixels whose grey level the empty scene does not explain; where none is known, modulated pixels.
 
 Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
 is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete,
@@ -81,8 +81,9 @@ class EmptyScene:
     calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
     pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
     calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
-    range, and of a surface in ambient light alone. Without them an image that does not show the plane is not
-    calibrated: everything brighter than its darkest pixels is object there, and brightness tells no distance."""
+    range, and of a surface in ambient light alone. Without them an image that does not show the plane, or
+    whose rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object there
+    (`modulated_region`)."""
 
     def __init__(
         self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float | None,
