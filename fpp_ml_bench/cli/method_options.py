@@ -17,7 +17,17 @@ METHOD_HELP = (
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
-    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence", "white_grey", "ambient_grey"),
+    "phase": (
+        "fringe",
+        "frames",
+        "error_mm",
+        "prior",
+        "no_shading",
+        "min_confidence",
+        "white_grey",
+        "ambient_grey",
+        "mask",
+    ),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
     "constant": ("at",),
     "trained networks": ("depth_range", "frame", "device"),
@@ -57,6 +67,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--ambient-grey", type=float, metavar="GREY",
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
              "image's darkest)")  # fmt: skip
+    add("--mask", metavar="FILE",
+        help="object mask of phase: an image of the frames' size, above 0 on the object in every sample (default: "
+             "found in each image)")  # fmt: skip
     add(
         "--weights",
         metavar="FILE",
@@ -184,7 +197,7 @@ def _steps_for(args: argparse.Namespace, opened: Photographed) -> int:
 def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", *_SHARED)}
+    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", "mask", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
