@@ -33,8 +33,8 @@ from fpp_ml_bench.baselines.phase_route.object_mask import (
 )
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Measurement, Observation, Reason, Settings, Watch
 from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
+from fpp_ml_bench.coding import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
@@ -73,8 +73,9 @@ class PhaseRoute:
         self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
         self._windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
-        self.steps = several_frames.steps_of(rig.sequence.steps, settings.frames)
-        self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
+        shifts_rad = rig.shifts_rad(settings.direction)
+        self.steps = several_frames.steps_of(len(shifts_rad), settings.frames)
+        self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
         if settings.frames == 2:
             self._windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, bits_needed, cell_count
+from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, PhaseShift, bits_needed, cell_count
 from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
@@ -162,6 +162,19 @@ class Rig:
         if isinstance(self.sequence, CodedSequence):
             return self.sequence.code(direction)
         return self.sequence.code(direction, self.pitch(direction))
+
+    def shifts_rad(self, direction: Direction) -> tuple[float, ...]:
+        """Phase shifts of the finest fringes of a direction, frame by frame, so that frame n shows ``cos(2 pi w / P +
+        shift_n)`` along the projector coordinate w. Raises `RigError` for a direction without fringes."""
+        pitch = self.pitch(direction)
+        if isinstance(self.sequence, Sequence):
+            steps = self.sequence.steps
+            return tuple(2 * np.pi * step / steps for step in range(steps))
+        code = self.sequence.code(direction)
+        if not isinstance(code, PhaseShift):
+            return (0.0,)
+        turns = code.fringes[code.finest].turns - code.origin_px / pitch
+        return tuple((2 * np.pi * turns).tolist())
 
     def pattern_length(self, direction: Direction) -> int:
         """Projector px along which the fringes vary: the rows for horizontal, the columns for vertical ones."""

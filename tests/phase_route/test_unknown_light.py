@@ -11,11 +11,11 @@ from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import load_method
-from fpp_ml_bench.baselines.phase_route import Periods, PhaseRoute, Reason, Settings
+from fpp_ml_bench.baselines.phase_route import Periods, PhaseMethod, PhaseRoute, Reason, Settings
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, build
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
 SMALL = paper_rig(240)
 NARROW = replace(SMALL, working_range_mm=(1600.0, 2000.0))
@@ -156,3 +156,22 @@ def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     capsys.readouterr()
     assert main(["predict", "classical", dataset, "--mask", str(file), "--out", str(tmp_path / "wrong")]) == 2
     assert "--mask is an option of phase" in capsys.readouterr().err
+
+
+def test_shifts_of_any_code_are_those_that_the_route_expects() -> None:
+    """A code with its own origin and sign gives the depth that the paper's kind gives, from the same light."""
+    data = paper_rig(200).to_dict()
+    del data["pitch_px"]
+    code = {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": -1, "origin_px": 4.5}
+    rig = rig_from_dict({**data, "sequence": {"vertical": code}})
+    assert np.allclose(rig.shifts_rad("vertical"), [-np.pi / 2, -np.pi / 2 - 2 * np.pi / 3, -np.pi / 2 - 4 * np.pi / 3])
+    x, y = rig.camera.rays()
+    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.7)
+    frames = [
+        np.rint(np.nan_to_num(100 + 80 * np.cos(2 * np.pi * u_px / 18 + shift), nan=100)).astype(np.uint8)
+        for shift in rig.shifts_rad("vertical")
+    ]
+    profile = rig.code("vertical").profiles(912)[1].astype(float)
+    assert np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1]).max() < 2
+    measurement = PhaseMethod(rig, direction="vertical", frames=3).measure(frames)
+    assert np.median(np.abs(measurement.depth_mm[measurement.depth_mm > 0] - 1700)) < 2
