@@ -70,10 +70,7 @@ def read_frames(
     16 bits that hold all levels; the result's ``note`` says which. ``colour``: which of `COLOURS` to take where
     channels differ. Raises `CaptureError` naming the file for anything but complete, lossless images of one size and
     bit depth, for levels that need more than ``bits``, and for colour without ``colour``."""
-    if colour is not None and colour not in COLOURS:
-        raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
-    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
-        raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
+    check_options(bits, colour)
     files = frame_files(source)
     if count is not None and len(files) != count:
         first, last = files[0].name, files[-1].name
@@ -100,6 +97,14 @@ def read_frames(
     for index, image in enumerate(images):
         frames[index] = image.levels * (np.float64(GREY_LEVELS) / full_scale)
     return CapturedFrames(frames, tuple(files), full_scale, note)
+
+
+def check_options(bits: int | None, colour: str | None) -> None:
+    """Raise `CaptureError` for options that `read_frames` does not take."""
+    if colour is not None and colour not in COLOURS:
+        raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
+    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
+        raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
 
 
 def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
