@@ -11,7 +11,7 @@ from pydantic import Field
 from fpp_ml_bench.constants import SPLITS, sample_name
 from fpp_ml_bench.errors import BuildError, CaptureError
 from fpp_ml_bench.files import strict_yaml
-from fpp_ml_bench.loaders.captures.images import SUFFIXES, frame_files
+from fpp_ml_bench.loaders.captures.images import SUFFIXES, frame_files, natural_key
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 SINGLE_VIEW = "single"
@@ -124,7 +124,8 @@ def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Captu
 
 
 def _folders(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    found = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 
 def _images(folder: Path) -> list[Path]:

@@ -131,9 +131,9 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
             raise CaptureError(f"{source}: no file matches this pattern; check it and the folder's name")
     else:
         raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
-    files.sort(key=lambda file: (_natural(str(file.with_suffix(""))), str(file)))
+    files.sort(key=lambda file: (natural_key(str(file.with_suffix(""))), str(file)))
     for file, following in pairwise(files):
-        if _natural(str(file.with_suffix(""))) == _natural(str(following.with_suffix(""))):
+        if natural_key(str(file.with_suffix(""))) == natural_key(str(following.with_suffix(""))):
             raise CaptureError(
                 f"{file}: {following.name} has the same name or number, so the frames have no order; remove one of "
                 "them, or give a pattern or a list of files"
@@ -141,7 +141,7 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
     return files
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key in which numbers count as numbers."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -23,6 +23,11 @@ from fpp_ml_bench.optics import Rig
 
 LEAST_DECODED_SHARE = 0.005
 """Of a capture's pixels. Below it nothing was measured but noise that passed by chance."""
+LEAST_AGREEING_SHARE = 0.5
+"""Of the pixels with a clear signal. With a wrong rig or order of the frames, some get a depth by chance."""
+_CONTRADICTIONS = (
+    Reason.NO_RAY, Reason.INCONSISTENT_ORDER, Reason.OUTSIDE_PATTERN, Reason.DIRECTIONS_DISAGREE,
+)  # fmt: skip
 _CHECK_THREADS = 2
 _CAUSES = {
     Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
@@ -177,4 +182,11 @@ def capture_notes(manifest: Manifest) -> list[str]:
     if len(scales) > 1:
         listed = ", ".join(map(str, scales))
         notes.append(f"white was taken as different levels ({listed}); give the camera's --bits to read all alike")
+    for row in rows:
+        wrong = sum(row["refused_share"].get(reason.name.lower(), 0.0) for reason in _CONTRADICTIONS)
+        if row["decoded_share"] < LEAST_AGREEING_SHARE * (row["decoded_share"] + wrong):
+            notes.append(
+                f"warning: {row['sample']}: more pixels contradict the rig ({100 * wrong:.1f}%) than have a depth "
+                f"({100 * row['decoded_share']:.1f}%), so the depth may be chance; check the rig and the frames' order"
+            )
     return notes
