@@ -145,6 +145,7 @@ def test_steps_out_of_bounds(opened, steps):
 
 
 UNIT_CUE = {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1}
+GRAY = {"scheme": "gray", "cell_px": 2}
 PLAIN = {"scheme": "phase-shift", "pitch_px": 18, "steps": 9, "gray": {}}
 
 
@@ -152,7 +153,7 @@ PLAIN = {"scheme": "phase-shift", "pitch_px": 18, "steps": 9, "gray": {}}
     ("sequence", "direction", "title", "frames"),
     [
         ({"vertical": UNIT_CUE}, "vertical", "Classical, vertical phase-shift 57 + 912 px", 6),
-        ({"vertical": {"scheme": "gray", "cell_px": 2}}, "vertical", "Classical, vertical Gray code, cells of 2 px", 11),
+        ({"vertical": GRAY}, "vertical", "Classical, vertical Gray code, cells of 2 px", 11),
         (
             {"horizontal": UNIT_CUE, "vertical": PLAIN}, "both",
             "Classical, horizontal phase-shift 57 + 912 px, vertical phase-shift 18 px + Gray code", 22,
