@@ -31,7 +31,7 @@ _CONTRADICTIONS = (
 _CHECK_THREADS = 2
 _CAUSES = {
     Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
-    Reason.LOW_MODULATION: "the frames are too dark, overexposed, out of focus, or in another order than the rig's sequence",
+    Reason.LOW_MODULATION: "the frames are too dark, overexposed, or not in the order of the rig's sequence",
     Reason.SATURATED: "the frames are overexposed",
     Reason.INCONSISTENT_ORDER: "the sequence (order, steps, sign, pitches, Gray code) is not what was projected",
     Reason.OUTSIDE_PATTERN: "the sequence (order, sign, pitches) or the projector's size is not what was projected",
