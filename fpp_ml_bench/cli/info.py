@@ -49,7 +49,6 @@ def run(args: argparse.Namespace) -> int:
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
     near, far = rig.working_range_mm
-    periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in optics.DIRECTIONS)
     settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
     if isinstance(settings.get("light"), dict):
         settings["light"] = settings["light"].get("name")
@@ -63,9 +62,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    pitches = f"{rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px"
-    print(f"fringes         pitch {pitches}; periods in range {periods}")
-    print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
+    for line in _fringe_lines(rig):
+        print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
     table = Table("", title=title, title_justify="left")
@@ -76,6 +74,20 @@ def run(args: argparse.Namespace) -> int:
         table.add_row(row_title, *map(cell, statistics))
     Console().print(table)
     return 0
+
+
+def _fringe_lines(rig: "optics.Rig") -> list[str]:
+    """How the rig codes, and how the camera samples the fringes: the vertical ones where there are both."""
+    ways = rig.fringe_directions
+    if isinstance(rig.sequence, optics.Sequence):
+        coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
+    else:
+        coded = "; ".join(f"{way} {rig.code(way).title}" for way in rig.directions)
+    if not ways:
+        return [f"code            {coded}"]
+    periods = " / ".join(f"{rig.periods_in_range(way):.2f} {way}" for way in ways)
+    sampled = f"{rig.image_px_per_period(ways[-1]):.1f} image px a period at the standoff"
+    return [f"fringes         {coded}; periods in range {periods}", f"sampling        {sampled}"]
 
 
 def _share(value: float | None) -> str:

@@ -41,9 +41,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
     add = parser.add_argument_group("classical").add_argument
-    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18, with Gray code (default: all)")
     add("--direction", choices=("horizontal", "vertical", "both"),
-        help="fringes to use: one direction is enough for a depth (default: both)")  # fmt: skip
+        help="fringes to use: one direction is enough for a depth (default: all that the rig codes)")  # fmt: skip
     add("--fewest", action="store_const", const=True,
         help="capture only the Gray frames that the rig's range needs: with both directions usually none")  # fmt: skip
     add("--depth-noise", type=float, metavar="MM",
@@ -166,8 +166,7 @@ def _network(path: Path, args: argparse.Namespace, opened: Photographed) -> "bas
 
 
 def _classical(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    usual = opened.sequence.steps if args.steps is None else args.steps
-    steps = usual if args.depth_noise is None else _steps_for(args, opened)
+    steps = args.steps if args.depth_noise is None else _steps_for(args, opened)
     return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 

@@ -39,6 +39,11 @@ class Code(ABC):
 
     @property
     @abstractmethod
+    def title(self) -> str:
+        """The code in a few words, with its periods or cells in projector px."""
+
+    @property
+    @abstractmethod
     def shown(self) -> tuple[Shown, ...]:
         """What each frame shows, in the order of `profiles` and of the levels that `decode` takes."""
 

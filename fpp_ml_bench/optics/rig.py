@@ -131,8 +131,9 @@ class Rig:
         """Period of the finest fringes in projector px. Raises `RigError` for a direction without fringes."""
         pitch = self._pitch(direction)
         if pitch is None:
-            listed = " and ".join(self.fringe_directions) or "no"
-            raise RigError(f"this rig projects {listed} fringes, and no {direction} ones")
+            listed = " and ".join(self.fringe_directions)
+            projected = f"{listed} fringes, and no {direction} ones" if listed else "Gray code alone, and no fringes"
+            raise RigError(f"this rig projects {projected}")
         return pitch
 
     @property

@@ -172,6 +172,7 @@ def test_shifts_of_any_code_are_those_that_the_route_expects() -> None:
         for shift in rig.shifts_rad("vertical")
     ]
     profile = rig.code("vertical").profiles(912)[1].astype(float)
-    assert np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1]).max() < 2
+    lit = (u_px > 0) & (u_px < 911)
+    assert np.abs(np.interp(u_px, np.arange(912), profile) * 80 / 127.5 + 20 - frames[1])[lit].max() < 2
     measurement = PhaseMethod(rig, direction="vertical", frames=3).measure(frames)
     assert np.median(np.abs(measurement.depth_mm[measurement.depth_mm > 0] - 1700)) < 2
