@@ -163,7 +163,7 @@ def test_shifts_of_any_code_are_those_that_the_route_expects() -> None:
     data = paper_rig(200).to_dict()
     del data["pitch_px"]
     code = {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": -1, "origin_px": 4.5}
-    rig = rig_from_dict({**data, "sequence": {"vertical": code}})
+    rig = rig_from_dict({**data, "sequence": {"vertical": code}, "working_range_mm": [1600, 1800], "standoff_m": 1.7})
     assert np.allclose(rig.shifts_rad("vertical"), [-np.pi / 2, -np.pi / 2 - 2 * np.pi / 3, -np.pi / 2 - 4 * np.pi / 3])
     x, y = rig.camera.rays()
     u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.7)
