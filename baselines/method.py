@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__, baselines
 from fpp_ml_bench.baselines import networks, phase_network, phase_route, training
-from fpp_ml_bench.coding import PhaseShift, equal_shifts
+from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics import Rig
@@ -116,12 +116,6 @@ def _fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, A
         raise PredictionError(
             f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
             f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); use classical"
-        )
-    several = options.get("frames", 1) != 1 or "error_mm" in options
-    if several and shifts != equal_shifts(rig.sequence.steps, 1):
-        raise PredictionError(
-            f"{name}: needs equal steps of +360 / N degrees (sign 1) for more than one frame, and those of this rig's "
-            f"{direction} fringes are others; use one frame, or classical"
         )
     if "error_mm" in options and not code.is_plain:
         raise PredictionError(

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.optics import CONFIGS, DIRECTIONS, AnySequence
+from fpp_ml_bench.constants import CONFIGS
+from fpp_ml_bench.optics import DIRECTIONS, AnySequence
 
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")

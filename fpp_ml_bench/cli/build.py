@@ -8,7 +8,7 @@ from time import perf_counter
 from fpp_ml_bench import coding, optics
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
-from fpp_ml_bench.constants import PRESETS
+from fpp_ml_bench.constants import CONFIGS, PRESETS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.machine import usable_cores
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
-    parser.add_argument("--frames", choices=optics.CONFIGS, default="all", help="frames to store (default: all)")
+    parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")

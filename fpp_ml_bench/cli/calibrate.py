@@ -74,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--board", metavar="KIND:CxR:MM", help="the board, such as checker:9x13:10")
     add("--sequence", type=Path, metavar="FILE", help="rig file with the projector's size and the sequence")
     add("--lens", default=AUTO, metavar="MODEL",
-        help=f"{', '.join(calibration.MODELS)}, or two of them, CAMERA,PROJECTOR; {AUTO} (default): of "
-             f"{', '.join(AUTO_MODELS)} the one that predicts poses left out best")  # fmt: skip
+        help="none, radial-1, radial-2, radial-3+tangential, rational, or two of them, CAMERA,PROJECTOR; auto "
+             f"(default): of {', '.join(AUTO_MODELS)} the one that predicts poses left out best")  # fmt: skip
     add("--square-pixels", action="store_true", help="fx = fy, of both devices")
     add("--centred", action="store_true", help="the camera's principal point is the image's centre")
     add(
@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--baseline", type=float, metavar="MM", help="distance of camera and projector, where the spacing is not known")
     add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the boards', and 10%%)")
     add("--bits", type=int, metavar="N", help="bits of the camera, where files of 16 bits hold fewer")
-    add("--colour", choices=tuple(captures.COLOURS), help="channel to take of colour images")
+    add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
     add("--opencv", type=Path, metavar="FILE", help="also write OpenCV's calibration file (.xml, .yml, .json)")
     depth = parser.add_argument_group("depth")
     add = depth.add_argument

@@ -20,7 +20,6 @@ from .rig_file import load_rig as load_rig
 from .rig_file import rig_from_dict as rig_from_dict
 from .rig_file import save_rig as save_rig
 from .sequence import AXES as AXES
-from .sequence import CONFIGS as CONFIGS
 from .sequence import DIRECTIONS as DIRECTIONS
 from .sequence import PAPER_SEQUENCE as PAPER_SEQUENCE
 from .sequence import AnySequence as AnySequence

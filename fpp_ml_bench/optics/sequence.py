@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import Code, Fringes, GrayCells, Kind, PhaseShift, equal_shifts
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import RigError
 
 Direction = Literal["horizontal", "vertical"]
@@ -23,7 +24,6 @@ Direction = Literal["horizontal", "vertical"]
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
 """The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
-CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,11 @@
 from .board_poses import board_poses as board_poses
 from .board_poses import calibrated_rig as calibrated_rig
 from .board_poses import pose_folders as pose_folders
+from .decoding import REPORT as REPORT
+from .decoding import DecodedCapture as DecodedCapture
+from .decoding import decode_capture as decode_capture
+from .decoding import read_mask as read_mask
+from .decoding import write_capture as write_capture
 from .exports import FORMS as FORMS
 from .exports import export_capture as export_capture
 from .exports import pixel_normals as pixel_normals

@@ -192,7 +192,6 @@ def one_direction(code):
             {},
             "vertical frame is shifted.*90 deg",
         ),
-        ({}, {"frames": 3}, r"needs equal steps of \+360 / N"),
         ({"sign": 1}, {"error_mm": 3.0}, "error_mm needs fringes of one period with Gray code"),
     ],
 )

@@ -363,7 +363,6 @@ def test_options_belong_to_one_kind_of_import(scanned, capsys):
         (["classical", "--direction", "horizontal"], "no horizontal fringes or codes, only vertical"),
         (["classical", "--fewest"], "leave fewest out"),
         (["phase", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
-        (["phase", "--frames", "3"], r"equal steps of \+360 / N degrees"),
         (["unet-individual-rmse"], "was trained at 224x224 px"),
         (["phase-net", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
     ],
