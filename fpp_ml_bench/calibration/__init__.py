@@ -1,4 +1,4 @@
-"""Calibration: the rig from captures of known shape."""
+"""Calibration: the rig from captures of known shape, a board or frames with their depth."""
 
 import lazy_loader
 

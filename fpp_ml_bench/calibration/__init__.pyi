@@ -1,3 +1,5 @@
+from .boards import Board as Board
+from .boards import parse_board as parse_board
 from .depth_views import MOST_PX as MOST_PX
 from .depth_views import DepthView as DepthView
 from .depth_views import view_from_frames as view_from_frames
@@ -5,3 +7,9 @@ from .depth_views import view_from_maps as view_from_maps
 from .from_depth import DepthFit as DepthFit
 from .from_depth import Residual as Residual
 from .from_depth import fit_projector as fit_projector
+from .projector_points import Pose as Pose
+from .projector_points import measure_pose as measure_pose
+from .result import Calibration as Calibration
+from .solve import calibrate as calibrate
+from .volume import VolumeError as VolumeError
+from .volume import volume_error_mm as volume_error_mm
