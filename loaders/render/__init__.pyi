@@ -23,6 +23,7 @@ from .projector import PatternLight as PatternLight
 from .raycast import Hits as Hits
 from .raycast import PixelRays as PixelRays
 from .raycast import TracedObject as TracedObject
+from .scene import PHOTOGRAPHED_BY as PHOTOGRAPHED_BY
 from .scene import BuildSettings as BuildSettings
 from .scene import SolidMesh as SolidMesh
 from .scene import UserMesh as UserMesh

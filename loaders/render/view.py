@@ -192,7 +192,7 @@ class Studio:
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
-        rig = self.settings.rig
+        rig = self.settings.stated_rig
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))

@@ -26,8 +26,8 @@ _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def board_studio(rig: Rig, board: Board, light: Light | None = None, seed: int = 42) -> Studio:
-    """A studio for `board_frames`. Its light has neither motion nor a calibration error: ``rig`` itself photographs, and
-    a flat board has no further bounces. Raises `CalibrationError` for a board that can't be printed, and what the
+    """A studio for `board_frames`, without calibration error (``rig`` itself photographs), motion, and further bounces,
+    which a flat board has not. Raises `CalibrationError` for a board that can't be printed, and what the
     builder raises for rig, light and seed."""
     check_print(board)
     light = (light or named_light("paper")).changed(motion_mm=0.0, calibration_px=0.0)
@@ -100,7 +100,7 @@ def _check_folder(place: Path, described: str, rig: Rig) -> None:
     board_file, rig_file = place / BOARD_FILE, place / RIG_FILE
     if not board_file.is_file():
         if others:
-            raise CaptureError(f"{place}: holds other files ({others[0]}) and no {BOARD_FILE}; give a new or empty folder")
+            raise CaptureError(f"{place}: holds other files ({others[0]}), no {BOARD_FILE}; give a new or empty folder")
     elif board_file.read_bytes() != described.encode() or (rig_file.is_file() and load_rig(rig_file) != rig):
         raise CaptureError(
             f"{place}: holds captures of another board, rig, light, seed or poses; give a new folder, or the same "

@@ -14,7 +14,7 @@ from fpp_ml_bench.calibration import Board
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, sheet_corners_mm
-from fpp_ml_bench.loaders.render.illumination import Material, light_surface
+from fpp_ml_bench.loaders.render.illumination import LitPixels, Material, light_surface
 from fpp_ml_bench.loaders.render.pixels import MixedPixels
 from fpp_ml_bench.loaders.render.raycast import Hits, TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
@@ -25,8 +25,8 @@ DARK = 0.25
 levels in the named light `paper`, so circles are decoded inside too."""
 EDGE_RAYS = 4
 Values = NDArray[np.float64]
-Footprint = tuple[Values, Values, Values, Values]
-"""How x and y on the board, mm, change over the width of a ray's part of the image, and then over its height."""
+Footprint = tuple[Values, ...]
+"""How x and y on the board, mm, change over the width of a ray's part of the image, and then over its height: four."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class OnBoard:
     def of(cls, x: Values, y: Values, pose: BoardPose) -> "OnBoard":
         """Of rays (x, y, 1), any equal shapes."""
         turn, (tx, ty, tz) = pose.rotation, pose.translation_m
-        (ax, ay, az), offset = (row[2] for row in turn), sum(row[2] * t for row, t in zip(turn, (tx, ty, tz), strict=True))
-        depth = offset / (ax * x + ay * y + az)
+        ax, ay, az = (row[2] for row in turn)  # the board's normal
+        depth = (ax * tx + ay * ty + az * tz) / (ax * x + ay * y + az)
         depth = np.where(depth > 0, depth, np.nan)
         dx, dy, dz = depth * x - tx, depth * y - ty, depth - tz
         across, down = ((turn[0][i] * dx + turn[1][i] * dy + turn[2][i] * dz) * MM_PER_M for i in (0, 1))
@@ -91,59 +91,65 @@ def check_print(board: Board) -> None:
         raise CalibrationError("board: charuco boards can't be photographed here; give checker or circles")
     if board.kind != "checker" and not 0 < board.radius_mm < board.spacing_mm / 2:
         raise CalibrationError(
-            f"board {board}: expected circles with a radius below half of the spacing, {board.spacing_mm / 2:g} mm, got "
-            f"{board.radius_mm:g} mm"
+            f"board {board}: expected circles with a radius below half of the spacing ({board.spacing_mm / 2:g} mm), "
+            f"got one of {board.radius_mm:g} mm"
         )
 
 
 def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[object, ...]) -> TracedView:
-    """The board before the studio's camera, lit; ``stream`` names its noise. A board is flat and matte, with its white
-    as white as the material: no light goes from one part of it to another, and nothing else is before it."""
+    """The board before the studio's camera, lit; ``stream`` names its noise. It is flat and matte, its white is the
+    light's material, and it stands alone: it gets the projector's light and the lamps', no further bounces."""
     rig, light, camera = studio.rig, studio.light, studio.rig.camera
-    shape, count = (camera.height, camera.width), EDGE_RAYS * EDGE_RAYS
     place = OnBoard.of(*camera.rays(), pose)
     (x_down, x_across), (y_down, y_across) = np.gradient(place.x_mm), np.gradient(place.y_mm)
     footprint = x_across, y_across, x_down, y_down
     # Over twice the pixel's part: strictly between 0 and 1 wherever an edge crosses the pixel.
-    dark = dark_share(board, place.x_mm, place.y_mm, tuple(2 * part for part in footprint))
+    dark = dark_share(board, place.x_mm, place.y_mm, tuple(np.multiply(2.0, part) for part in footprint))
     sheet = place.on_sheet(board)
-    edge = _border(sheet) | (sheet & (dark > 0) & (dark < 1))
-    (left, top), (right, bottom) = (np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board))
-    corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    mesh = SolidMesh("board", np.column_stack([corners, np.zeros(4)]), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    traced = TracedObject(mesh, pose.points_m(mesh.vertices_m))
+    edges = np.flatnonzero(_border(sheet) | (sheet & (dark > 0) & (dark < 1)))
+    traced, facing = _outline(board, pose), -np.array([row[2] for row in pose.rotation])
     white = (1.0 - light.surface.gloss) * light.surface.albedo
-    facing = -np.array([row[2] for row in pose.rotation])
-    shadowing = traced if light.bounces.shadows else None
 
-    def lit(points_m: Values, normals: Values, print_share: Values):  # type: ignore[no-untyped-def]
-        material = Material(white * (1.0 - (1.0 - DARK) * print_share), np.zeros(len(points_m)))
-        return light_surface(points_m, normals, rig, light, studio.exposure.pattern, material, shadowing)
+    def lit(points_m: Values, normals: Values, print_share: Values) -> LitPixels:
+        material = Material(white * (1.0 - (1.0 - DARK) * print_share), 0.0)
+        return light_surface(points_m, normals, rig, light, studio.exposure.pattern, material, traced)
 
     pixels = np.flatnonzero(sheet)
-    x, y = (axis.ravel()[pixels] for axis in camera.rays())
     depth_m = place.depth_m.ravel()[pixels]
+    x, y = (axis.ravel()[pixels] for axis in camera.rays())
+    points_m = _points(x, y, depth_m)
     normals = np.tile(facing, (len(pixels), 1))
-    points_m = np.column_stack([x, y, np.ones_like(x)]) * depth_m[:, None]
-    board_light = lit(points_m, normals, dark.ravel()[pixels])
     hits = Hits(pixels, depth_m, normals, np.zeros(len(pixels), dtype=np.int32))
+    board_light = lit(points_m, normals, dark.ravel()[pixels])
 
-    mixed = np.flatnonzero(edge)
-    rows, columns = (axis[:, None] for axis in np.divmod(mixed, shape[1]))
+    count = EDGE_RAYS * EDGE_RAYS
+    rows, columns = (axis[:, None] for axis in np.divmod(edges, camera.width))
     down, across = ((axis + 0.5) / EDGE_RAYS - 0.5 for axis in np.divmod(np.arange(count), EDGE_RAYS))
     x, y = camera.normalised((columns + across).ravel(), (rows + down).ravel())
     place = OnBoard.of(x, y, pose)
     upon = place.on_sheet(board)
-    parts = tuple(np.nan_to_num(np.repeat(part.ravel()[mixed], count)) / EDGE_RAYS for part in footprint)
-    share = np.where(upon, dark_share(board, place.x_mm, place.y_mm, parts), 0.0)
-    depth_m = np.where(upon, place.depth_m, rig.background)
+    parts = tuple(np.nan_to_num(np.repeat(part.ravel()[edges], count)) / EDGE_RAYS for part in footprint)
+    print_share = np.where(upon, dark_share(board, place.x_mm, place.y_mm, parts), 0.0)
+    points_m = _points(x, y, np.where(upon, place.depth_m, rig.background))
     normals = np.where(upon[:, None], facing, [0.0, 0.0, -1.0])
-    points_m = np.column_stack([x, y, np.ones_like(x)]) * depth_m[:, None]
     covered = upon.reshape(-1, count).mean(axis=1)
-    edges = MixedPixels(mixed, points_m, normals, np.where(upon, 0, -1).astype(np.int32), covered < 1, covered)
-    distance_m = pose.translation_m[2]
-    edge_light = lit(points_m, normals, share)
-    return TracedView(traced, distance_m, hits, board_light, edges, edge_light, studio.brightness(stream), stream)
+    mixed = MixedPixels(edges, points_m, normals, np.where(upon, 0, -1).astype(np.int32), covered < 1, covered)
+    return TracedView(
+        traced, pose.translation_m[2], hits, board_light, mixed, lit(points_m, normals, print_share),
+        studio.brightness(stream), stream,
+    )  # fmt: skip
+
+
+def _outline(board: Board, pose: BoardPose) -> TracedObject:
+    """The sheet as two triangles, which cast its shadow."""
+    (left, top), (right, bottom) = (np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board))
+    corners = np.array([[left, top, 0.0], [right, top, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
+    mesh = SolidMesh("board", corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    return TracedObject(mesh, pose.points_m(corners))
+
+
+def _points(x: Values, y: Values, depth_m: Values) -> Values:
+    return np.column_stack([x, y, np.ones_like(x)]) * depth_m[:, None]
 
 
 def _border(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
