@@ -22,7 +22,7 @@ EXAMPLES = (
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
-    "fpp-bench build data/lab --preset mini --decode-with found.yaml  ground truth by the rig that a calibration found",
+    "fpp-bench build data/lab --decode-with found.yaml            ground truth by the rig that a calibration found",
     "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
 
