@@ -21,7 +21,7 @@ class CaptureError(FppBenchError, ValueError):
 
 
 class CalibrationError(FppBenchError, ValueError):
-    """A board that is not found, or captures that don't determine a rig or contradict each other."""
+    """A board that is not found, or captures that don't determine a rig, or contradict each other."""
 
 
 class MeshError(FppBenchError, ValueError):

@@ -39,7 +39,13 @@ class NetworkMethod(Method):
         self.model, self.threads = model, threads
         self.name, self.device, self.parameters = config.name, str(model.device), model.parameters
         self.depth_range = _checked_range(model, depth_range)
-        usual_frame = sequence.config(config.data_config)[0]
+        trained_frames = sequence.config(config.data_config)
+        if not trained_frames:
+            raise PredictionError(
+                f"{config.name}: was trained on {config.data_config} fringes, and this rig projects "
+                f"{' and '.join(sequence.directions)} ones only; use weights that were trained on its fringes"
+            )
+        usual_frame = trained_frames[0]
         self.frame = usual_frame if frame is None else frame
         if not 0 <= self.frame < len(sequence):
             raise PredictionError(f"frame {frame}: expected 0 to {len(sequence) - 1}, the frames of the sequence")

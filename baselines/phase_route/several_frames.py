@@ -86,6 +86,8 @@ def lit_object(capture: Capture, scene: EmptyScene, modulation: Image) -> Mask:
     _, cosine, sine = phase_weights(capture.shifts_rad)
     sigma = capture.background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
     least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
+    if not capture.background.shown:  # nothing else tells the object
+        least_grey = MIN_MODULATION
     region = first_mask(different, capture.period_px)
     certain = region & different & (modulation > least_grey)
     side = 2 * round(CLOSING_PERIODS * capture.period_px) + 1

@@ -1,4 +1,4 @@
-"""Calibration: the rig from captures of known shape, a board or frames with their depth."""
+"""Calibration: the rig from captures of known shape, a board or a scene with known depth."""
 
 import lazy_loader
 

@@ -1,3 +1,4 @@
+from .boards import KINDS as KINDS
 from .boards import Board as Board
 from .boards import parse_board as parse_board
 from .depth_views import MOST_PX as MOST_PX
@@ -7,9 +8,17 @@ from .depth_views import view_from_maps as view_from_maps
 from .from_depth import DepthFit as DepthFit
 from .from_depth import Residual as Residual
 from .from_depth import fit_projector as fit_projector
+from .lens import MODELS as MODELS
+from .lens import Lens as Lens
 from .projector_points import Pose as Pose
+from .projector_points import ProjectorPoints as ProjectorPoints
 from .projector_points import measure_pose as measure_pose
+from .projector_points import projector_points as projector_points
+from .report import draw_residuals as draw_residuals
 from .result import Calibration as Calibration
+from .result import Device as Device
+from .result import FittedPose as FittedPose
 from .solve import calibrate as calibrate
+from .solve import compare_lenses as compare_lenses
 from .volume import VolumeError as VolumeError
 from .volume import volume_error_mm as volume_error_mm

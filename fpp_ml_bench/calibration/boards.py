@@ -8,6 +8,7 @@ projector get theirs from the same label. They are never mirrored.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,7 +48,8 @@ class Board:
         elif not 0 <= self.detail_mm < self.spacing_mm:
             wrong = f"radius or marker: expected mm below the spacing of {self.spacing_mm:g} mm, got {self.detail_mm!r}"
         elif self.kind == "charuco" and (not self.detail_mm or not hasattr(cv2.aruco, self.dictionary)):
-            wrong = f"charuco needs its markers' side in mm and an OpenCV dictionary, got {self.detail_mm:g} mm and {self.dictionary}"  # noqa: E501  # fmt: skip
+            got = f"{self.detail_mm:g} mm and {self.dictionary}"
+            wrong = f"charuco needs its markers' side in mm and the name of an OpenCV dictionary, got {got}"
         if wrong:
             raise CalibrationError(f"board: {wrong}")
 
@@ -106,7 +108,7 @@ class Board:
         return _refined(image, corners) if found else None
 
     def _circles(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
-        settings = cv2.SimpleBlobDetector_Params()
+        settings: Any = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
         settings.minArea, settings.maxArea = 12.0, image.size / (self.columns * self.rows)
         settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 10
         settings.minDistBetweenBlobs, settings.filterByConvexity, settings.minInertiaRatio = 4, False, 0.05
@@ -116,7 +118,7 @@ class Board:
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
                 found, centres = cv2.findCirclesGrid(
                     picture, (self.columns, self.rows), flags=flags + clustering,
-                    blobDetector=cv2.SimpleBlobDetector_create(settings),
+                    blobDetector=cv2.SimpleBlobDetector_create(settings),  # type: ignore[attr-defined]
                 )  # fmt: skip
                 if found:
                     return centres
@@ -156,11 +158,13 @@ def parse_board(text: str) -> Board:
     kind, *rest = text.strip().split(":")
     try:
         columns, rows = (int(count) for count in rest[0].lower().split("x"))
-        lengths, dictionary = [float(length) for length in rest[1:3]], rest[3:4]
-        if not lengths or len(rest) > 4:
+        spacing, detail, dictionary, *more = [*rest[1:], *("", "0", Board.dictionary)[len(rest) - 1 :]]
+        if more:
             raise ValueError
+        spacing_mm, detail_mm = float(spacing), float(detail)
     except (ValueError, IndexError):
         raise CalibrationError(
-            f"board: expected KIND:COLUMNSxROWS:SPACING_MM, such as checker:9x13:10 or circles:5x9:20:6 (radius), got {text!r}"  # noqa: E501
+            "board: expected KIND:COLUMNSxROWS:SPACING in mm, such as checker:9x13:10, or circles:5x9:20:6 for circles "
+            f"with a radius of 6 mm, got {text!r}"
         ) from None
-    return Board(kind, columns, rows, *lengths, *dictionary)
+    return Board(kind, columns, rows, spacing_mm, detail_mm, dictionary)

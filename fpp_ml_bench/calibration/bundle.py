@@ -17,12 +17,12 @@ from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.errors import CalibrationError
 
 BOARD_SHARE = 0.01
-"""Standard deviation of a printed board's points about their grid that is assumed where they are estimated, in spacings.
-It also fixes what the images can't: the estimated points fit the nominal ones best in position, turn and scale."""
+"""Standard deviation of a printed board's points about their grid, in spacings, assumed where they are estimated. It
+also fixes what the images can't: the estimated points fit the nominal ones best in position, turn and scale."""
 LEAST_SIGMA_PX = 1e-6
-TOLERANCE = 1e-13
+TOLERANCE = 1e-11
 
-Blocks = list[tuple[slice, NDArray[np.float64]]]
+Blocks = list[tuple[slice, NDArray]]
 """Non-zero columns of a Jacobian: which, and what is in them."""
 
 
@@ -36,7 +36,7 @@ class Bundle:
         self.extra_px = (1.0, 1.0)
         ends = np.cumsum([4 + lenses[0].coefficients, 4 + lenses[1].coefficients, 6, 6 * len(poses), points_mm.size])
         starts = [0, *ends[:-1]]
-        self.camera, self.projector, self.stereo, self.boards, self.board = map(slice, starts, ends)
+        self.camera, self.projector, self.stereo, self.boards, self.board = map(slice, starts, ends.tolist())
         self.size = int(ends[-1])
 
     def pose(self, index: int) -> slice:
@@ -137,7 +137,7 @@ class Bundle:
 
         unknowns = free.shape[1]
         if len(system(np.zeros(unknowns))[0]) < unknowns:
-            raise CalibrationError(f"{len(poses)} poses give too few points for {unknowns} unknowns: capture more poses")
+            raise CalibrationError(f"{len(poses)} poses give too few points for {unknowns} unknowns: capture more")
         try:
             found = least_squares(
                 lambda step: system(step)[0], np.zeros(unknowns), lambda step: system(step)[1], method="lm",
@@ -145,7 +145,7 @@ class Bundle:
                 ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=300,
             )  # fmt: skip
         except (ValueError, cv2.error) as error:  # coordinates that are not finite any more
-            raise CalibrationError(f"the fit of the rig failed ({error}): look at the poses and their labels") from error
+            raise CalibrationError(f"the fit of the rig failed ({error}): look at the poses") from error
         return start + free @ found.x, system(found.x)[1], free
 
     def weigh(self, x: NDArray[np.float64], unknowns: int) -> tuple[float, float]:
@@ -161,5 +161,16 @@ class Bundle:
         count = sum(part.shape[1] for part in joined)
         inflation = count / max(count - unknowns, 1)
         camera, projector = (max(inflation * part[0].mean() - part[1].mean(), 0.0) ** 0.5 for part in joined)
-        self.extra_px = (max(camera, LEAST_SIGMA_PX), max(projector, LEAST_SIGMA_PX))
+        self.extra_px = (float(max(camera, LEAST_SIGMA_PX)), float(max(projector, LEAST_SIGMA_PX)))
         return self.extra_px
+
+
+def spread(jacobian: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A root (p, f) of the covariance of all p parameters, which is its product with its transpose, from `Bundle.fit`'s
+    Jacobian (m, f) and matrix of free parameters (p, f); infinite where the data don't determine them."""
+    norm = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    try:
+        inverse = np.linalg.inv(np.linalg.qr(jacobian / norm, mode="r"))
+    except np.linalg.LinAlgError:
+        return np.full_like(free, np.inf)
+    return free @ (inverse / norm[:, None])

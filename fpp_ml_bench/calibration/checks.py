@@ -33,7 +33,8 @@ def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int
             raise CalibrationError(f"pose {pose.name}: the image is {got} px, the camera's are {width} x {height} px")
         corners, points = pose.corners_px, pose.projector.points_px
         if not len(corners) == len(points) == board.columns * board.rows:
-            raise CalibrationError(f"pose {pose.name}: expected {board.columns * board.rows} points, got {len(corners)}")
+            expected = board.columns * board.rows
+            raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
         both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
         if both.sum() < FEWEST_POINTS:
             reason = next(iter(pose.projector.reasons.items()), None)
@@ -46,15 +47,15 @@ def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int
             low, high = points[both, axis].min(), points[both, axis].max()
             if low < -MARGIN * size or high > (1 + MARGIN) * size:
                 raise CalibrationError(
-                    f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the projector has "
-                    f"{size}: look at the projector's size, the pitch, and which frames code which direction"
+                    f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
+                    f"projector has {size}: look at its size, the pitch, and which frames code which direction"
                 )
         plane = np.column_stack([corners[both], np.ones(both.sum())])
         affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
         if np.linalg.det(affine) < 0:
             raise CalibrationError(
-                f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the images, "
-                "or look at the direction in which the projector's columns and rows are counted"
+                f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
+                "images, or look at the direction in which the projector's columns and rows are counted"
             )
 
 
@@ -67,20 +68,17 @@ def check_start(poses: Sequence[Pose], turns: Sequence[NDArray]) -> None:
     if tilt < LEAST_TILT_RAD:
         names = ", ".join(pose.name for pose in poses)
         raise CalibrationError(
-            f"poses {names}: the board is parallel in all of them, within {np.rad2deg(tilt):.1f} degrees, so that focal "
-            f"length and distance can't be told apart; tilt it by 20 degrees or more, about both axes"
+            f"poses {names}: the board is parallel in all of them, within {np.rad2deg(tilt):.1f} degrees, so that "
+            "focal length and distance can't be told apart; tilt it by 20 degrees or more, about both axes"
         )
 
 
-def check_solution(bundle: Bundle, x: NDArray[np.float64], jacobian: NDArray, free: NDArray) -> None:
-    """Raise `CalibrationError` where a focal length is not determined."""
-    norm = np.linalg.norm(jacobian, axis=0)
-    spread = free @ (np.linalg.pinv(jacobian / np.maximum(norm, 1e-300)) / np.maximum(norm, 1e-300)[:, None])
-    sigma = np.sqrt((spread**2).sum(1))
+def check_solution(bundle: Bundle, x: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+    """Raise `CalibrationError` where a focal length is not determined, given all parameters' standard uncertainties."""
     for name, part in (("camera", bundle.camera), ("projector", bundle.projector)):
         focal = x[part][:2]
         if not (focal > 0).all() or (sigma[part][:2] > LARGEST_FOCAL_SIGMA * focal).any():
             raise CalibrationError(
-                f"the poses don't determine the {name}'s focal length: {focal[0]:.0f} ± {sigma[part][0]:.0f} px; tilt the "
-                "board more and in other directions, or choose a lens with fewer terms"
+                f"the poses don't determine the {name}'s focal length: {focal[0]:.0f} ± {sigma[part][0]:.0f} px; tilt "
+                "the board more and in other directions, or choose a lens with fewer terms"
             )

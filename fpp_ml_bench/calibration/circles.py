@@ -1,8 +1,8 @@
 """The bias of circle boards: the centroid of a circle's image is not the image of its centre.
 
-Perspective shifts an ellipse's centre, and lens distortion shifts it further (Heikkila, Geometric camera calibration using
-circular control points, IEEE TPAMI 2000). The shift is computed from a polygon of the outline, projected with the rig
-as known so far.
+Perspective shifts an ellipse's centre, and lens distortion shifts it further (Heikkila, Geometric camera calibration
+using circular control points, IEEE TPAMI 2000). The shift is computed from a polygon of the outline, projected with the
+rig as known so far.
 """
 
 import cv2
@@ -32,7 +32,7 @@ def without_bias(
     return pose.corners_px - offset, pose.projector.points_px - moved
 
 
-def polygon_centroids(polygons: NDArray[np.float64]) -> NDArray[np.float64]:
+def polygon_centroids(polygons: NDArray) -> NDArray[np.float64]:
     """Centroids of area (n, 2) of polygons (n, k, 2)."""
     following = np.roll(polygons, -1, axis=1)
     cross = polygons[..., 0] * following[..., 1] - polygons[..., 1] * following[..., 0]

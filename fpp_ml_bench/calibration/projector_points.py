@@ -63,8 +63,8 @@ def projector_points(
     corners_px: NDArray[np.float64], u_px: NDArray[np.float64], v_px: NDArray[np.float64]
 ) -> ProjectorPoints:
     """Projector coordinates at image points (n, 2) from the maps of projector columns and rows (H, W) px, float64, NaN
-    where not decoded. The uncertainty is that of the fit, from sums of residuals over blocks of pixels, so that errors
-    that neighbours share count (fringe harmonics, edges); errors of a whole window are not in it."""
+    where not decoded. The uncertainty is that of the fit, with the errors that neighbouring pixels share (fringe
+    harmonics, edges); errors of a whole window are not in it."""
     n = len(corners_px)
     points, sigma, jacobian = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
     reasons: dict[int, str] = {}
@@ -137,10 +137,14 @@ def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tup
         if done:
             break
         weight, scale = new_weight, np.where(denominator > 0.1, denominator, 0.1)
+    # The own noise of the pixels, and what blocks of them have in common: the larger one.
     block = np.clip((position * 2 + 2).astype(int), 0, 3) @ [4, 1]
     scores = np.zeros((16, 8))
     np.add.at(scores, np.tile(block, 2), design * (np.tile(weight / scale, 2) * residual.ravel())[:, None])
+    occupied = len(np.unique(block[weight > 0]))
     bread = np.linalg.pinv(normal, rcond=1e-14, hermitian=True)
-    variance = np.diag(bread @ (scores.T @ scores) @ bread) * 16 / 15
+    shared = np.diag(bread @ (scores.T @ scores) @ bread) * occupied / max(occupied - 4, 1)
+    own = np.diag(bread) * (weight * distance**2).sum() / max(2 * weight.sum() - 8, 1)
+    variance = np.maximum(shared, own)
     jacobian = solution[:6].reshape(2, 3)[:, :2] - np.outer(solution[[2, 5]], solution[6:])
     return solution[[2, 5]] + shift, np.sqrt(variance[[2, 5]]), jacobian

@@ -14,7 +14,7 @@ from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.bundle import Bundle
 from fpp_ml_bench.calibration.projector_points import Pose, ProjectorPoints
 
-SWEEPS = 3
+SWEEPS = 5
 
 
 def same_labels(poses: Sequence[Pose], board: Board, bundle: Bundle, x: NDArray[np.float64]) -> list[Pose]:
@@ -33,7 +33,7 @@ def same_labels(poses: Sequence[Pose], board: Board, bundle: Bundle, x: NDArray[
         choices.append([deviations[label] @ turn for label, turn in zip(labels, turns, strict=True)])
     chosen = [0] * len(poses)
     for _ in range(SWEEPS):
-        for index, alternatives in enumerate(choices[1:], start=1):
+        for index, alternatives in enumerate(choices):
             others = sum(choices[i][chosen[i]] for i in range(len(poses)) if i != index)
             chosen[index] = int(np.argmax([(alternative * others).sum() for alternative in alternatives]))
     return [_relabelled(pose, labels[choice]) for pose, choice in zip(poses, chosen, strict=True)]

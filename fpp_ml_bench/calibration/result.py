@@ -9,14 +9,15 @@ from fpp_ml_bench.calibration.lens import Lens
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics import Pinhole
 
-SPOILER_SIGMAS = 3.5
-"""A pose is named when its error lies above the median by this many robust sigmas and by half of the median."""
+SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
+"""A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median,
+and its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """Camera or projector: size in px, intrinsics in px with their standard uncertainties ``sigma`` (fx, fy, cx, cy; 0 =
-    not estimated), OpenCV's distortion coefficients (5, or 8 of the rational model) with theirs."""
+    """Camera or projector: size in px, intrinsics in px with their standard uncertainties ``sigma`` (fx, fy, cx, cy; 0
+    = not estimated), OpenCV's distortion coefficients (5, or 8 of the rational model) with theirs."""
 
     lens: Lens
     width: int
@@ -60,9 +61,9 @@ class Calibration:
     vector. RMS errors are OpenCV's, the root of the mean squared distance over all points: of the joint fit, and
     ``alone_rms_px`` of cv2.calibrateCamera for camera and projector each on its own with a perfect board.
     ``noise_px``: standard deviations of camera and projector coordinates that the residuals show, with whose inverse
-    squares they were weighted. ``board_mm``: the board's points (n, 3), estimated or given. Uncertainties take residuals
-    for independent: errors that all poses share, such as those of a board that is taken for perfect, make them too
-    small."""
+    squares they were weighted. ``board_mm``: the board's points (n, 3), estimated or given. Uncertainties take the
+    residuals for independent: errors that all poses share, such as those of a board that is taken for perfect, make
+    them too small."""
 
     camera: Device
     projector: Device
@@ -101,8 +102,10 @@ class Calibration:
     @property
     def spoilers(self) -> tuple[str, ...]:
         """Names of poses that fit the others badly (`SPOILER_SIGMAS`)."""
-        errors = np.array([[pose.held_out_rms_px, pose.stereo_rms_px] for pose in self.poses])
-        errors = errors[:, 1] if np.isnan(errors).any() else errors[:, 0]
+        fitted = np.array([pose.stereo_rms_px for pose in self.poses])
+        held_out = np.array([pose.held_out_rms_px for pose in self.poses])
+        errors = fitted if np.isnan(held_out).any() else held_out
         middle = np.median(errors)
         limit = middle + max(SPOILER_SIGMAS * 1.4826 * np.median(np.abs(errors - middle)), 0.5 * middle)
-        return tuple(pose.name for pose, error in zip(self.poses, errors, strict=True) if error > limit)
+        bad = (errors > limit) & (fitted > SPOILER_SHARE * np.median(fitted))
+        return tuple(pose.name for pose, named in zip(self.poses, bad, strict=True) if named)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.bundle import Bundle
+from fpp_ml_bench.calibration.bundle import Bundle, spread
 from fpp_ml_bench.calibration.checks import check_poses, check_solution, check_start
 from fpp_ml_bench.calibration.circles import without_bias
 from fpp_ml_bench.calibration.lens import MODELS, Lens
@@ -35,11 +35,11 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from at least three poses of a flat board; sizes are (width, height) in px.
 
-    ``lens``: a model of `MODELS` or a `Lens` for both devices, or a pair for camera and projector. No point is rejected.
-    Camera and projector residuals are weighted by the inverse of the variances that they show, the projector's with the
-    own uncertainty of each point. ``estimate_board``: the board's points are estimated too, about their nominal places
-    (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect planar target, ICCV Workshops 2011),
-    which needs four poses or more to be worth it. ``baseline_mm``: lengths are scaled so that the baseline has this
+    ``lens``: a model of `MODELS` or a `Lens` for both devices, or a pair for camera and projector. No point is
+    rejected. Camera and projector residuals are weighted by the inverse of the variances that they show, the
+    projector's with the own uncertainty of each point. ``estimate_board``: the board's points are estimated too, about
+    their nominal places (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect planar target,
+    ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the baseline has this
     length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out errors (a fit for
     each pose; needs four).
 
@@ -54,9 +54,10 @@ def calibrate(
     if estimate_board:
         poses = same_labels(poses, board, bundle, x)
         bundle, x, jacobian, free, alone = _without_circle_bias(poses, board, sizes, lenses, free_board=True)
-    check_solution(bundle, x, jacobian, free)
+    root = spread(jacobian, free)
+    check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
-    return _result(bundle, x, jacobian, free, alone, held_out, board, sizes, baseline_mm)
+    return _result(bundle, x, root, free.shape[1], alone, held_out, board, sizes, baseline_mm)
 
 
 def compare_lenses(
@@ -71,11 +72,9 @@ def compare_lenses(
 ) -> list[Calibration]:
     """`calibrate` with each of the ``lenses``; smallest held-out error first. Needs four poses."""
     if len(poses) < 4:
-        raise CalibrationError(f"comparing lens models needs at least 4 poses, got {len(poses)}; name the model instead")
-    found = [
-        calibrate(poses, board, camera_size, projector_size, lens, estimate_board=estimate_board, baseline_mm=baseline_mm)
-        for lens in lenses
-    ]
+        raise CalibrationError(f"comparing lens models needs at least 4 poses, got {len(poses)}; name the model")
+    sizes, options = (camera_size, projector_size), {"estimate_board": estimate_board, "baseline_mm": baseline_mm}
+    found = [calibrate(poses, board, *sizes, lens, **options) for lens in lenses]  # type: ignore[arg-type]
     return sorted(found, key=lambda calibration: calibration.held_out_rms_px)
 
 
@@ -121,16 +120,18 @@ def _start(
             # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the
             # image gets a margin of its own size all round.
             margin = np.array(size, dtype=np.float32)
-            matrix[:2, 2] += margin
+            matrix, distortion = np.array(matrix, dtype=np.float64), np.ravel(distortion).astype(np.float64)
+            matrix[:2, 2] += np.array(size)
             error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
                 objects, [image + margin for image in images], tuple(3 * length for length in size), matrix,
-                np.resize(distortion.ravel(), 5), flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
+                np.resize(distortion, 5), flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
             )  # fmt: skip
-            matrix[:2, 2] -= margin
+            matrix = np.array(matrix, dtype=np.float64)
+            matrix[:2, 2] -= np.array(size)
         except cv2.error as problem:
             raise CalibrationError(
-                f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): the "
-                "board has to be seen from different directions, and its points labelled alike in all poses"
+                f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): "
+                "the board has to be seen from different directions, and its points labelled alike in all poses"
             ) from problem
         distortion = np.resize(np.ravel(distortion), lens.coefficients)
         if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
@@ -184,37 +185,35 @@ def rms_px(*residuals: NDArray[np.float64]) -> float:
 
 
 def _result(
-    bundle: Bundle, x: NDArray, jacobian: NDArray, free: NDArray, alone: tuple[float, float], held_out: list[float],
+    bundle: Bundle, x: NDArray, root: NDArray, unknowns: int, alone: tuple[float, float], held_out: list[float],
     board: Board, sizes: tuple, baseline_mm: float | None,
 ) -> Calibration:  # fmt: skip
-    norm = np.linalg.norm(jacobian, axis=0)
-    spread = free @ (np.linalg.pinv(jacobian / norm) / norm[:, None])  # standard deviations by rows, covariance by product
-    sigma = np.sqrt((spread**2).sum(1))
+    sigma = np.linalg.norm(root, axis=1)
     devices = []
     for part, lens, (width, height) in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
-        values, sigmas = x[part].tolist(), sigma[part].tolist()
-        devices.append(
-            Device(lens, int(width), int(height), *values[:4], tuple(values[4:]), tuple(sigmas[:4]), tuple(sigmas[4:]))
-        )
+        (fx, fy, cx, cy, *terms), sigmas = x[part].tolist(), sigma[part].tolist()
+        device = Device(lens, width, height, fx, fy, cx, cy, tuple(terms), tuple(sigmas[:4]), tuple(sigmas[4:]))
+        devices.append(device)
     turn, shift = x[bundle.stereo][:3], x[bundle.stereo][3:]
     along = shift / np.linalg.norm(shift)
-    of_shift = spread[bundle.stereo][3:]
+    of_shift = root[bundle.stereo][3:]
     scale, factor = f"from the board's spacing of {board.spacing_mm:g} mm", 1.0
     baseline_sigma = float(np.linalg.norm(along @ of_shift))
     if baseline_mm is not None:
         factor = baseline_mm / float(np.linalg.norm(shift))
-        scale = f"from the baseline of {baseline_mm:g} mm; the board's spacing is then {board.spacing_mm * factor:.4f} mm"
+        spacing = f"{board.spacing_mm * factor:.4f}"
+        scale = f"from the baseline of {baseline_mm:g} mm; the board's spacing is then {spacing} mm"
         of_shift, baseline_sigma = of_shift - np.outer(along, along @ of_shift), 0.0
     fitted = []
     every: list[list[NDArray]] = [[], []]
     for index, pose in enumerate(bundle.poses):
         residuals = bundle.residuals(x, index)
-        for device, residual in enumerate(residuals):
-            every[device].append(residual)
-        part = x[bundle.pose(index)]
+        for all_residuals, residual in zip(every, residuals, strict=True):
+            all_residuals.append(residual)
+        place = x[bundle.pose(index)]
         fitted.append(
             FittedPose(
-                pose.name, tuple(part[:3].tolist()), tuple((factor * part[3:]).tolist()), rms_px(residuals[0]),
+                pose.name, tuple(place[:3].tolist()), tuple((factor * place[3:]).tolist()), rms_px(residuals[0]),
                 rms_px(residuals[1]), rms_px(*residuals), held_out[index], *bundle.targets[index], *residuals,
             )
         )  # fmt: skip
@@ -223,7 +222,7 @@ def _result(
         devices[0], devices[1], tuple(map(tuple, rotation)), tuple((factor * shift).tolist()),
         tuple(sigma[bundle.stereo][:3].tolist()), tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
         factor * baseline_sigma, board.spacing_mm * factor, scale, rms_px(*every[0]), rms_px(*every[1]),
-        rms_px(*every[0], *every[1]), alone, bundle.extra_px, _bic(bundle, x, free.shape[1]), bundle.free_board,
+        rms_px(*every[0], *every[1]), alone, bundle.extra_px, _bic(bundle, x, unknowns), bundle.free_board,
         factor * x[bundle.board].reshape(-1, 3), tuple(fitted),
     )  # fmt: skip
 

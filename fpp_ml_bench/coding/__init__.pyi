@@ -3,6 +3,7 @@ from .code import Code as Code
 from .code import Kind as Kind
 from .code import Shown as Shown
 from .code import code_from_dict as code_from_dict
+from .composite import Composite as Composite
 from .coordinates import CLIPPED_STEPS_DIVISOR as CLIPPED_STEPS_DIVISOR
 from .coordinates import MAX_DISAGREEMENT_PX as MAX_DISAGREEMENT_PX
 from .coordinates import MIN_MODULATION as MIN_MODULATION

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.coding.coordinates import Coordinates, Limits
 from fpp_ml_bench.errors import RigError
 
-Kind = Literal["sinusoid", "gray", "black", "white"]
+Kind = Literal["sinusoid", "gray", "crossed", "black", "white"]
 SMALLEST_PITCH_PX = 4.0
 """A Gray cell is half a period; below two pixels a cell its edges and centres can't be told apart."""
 
@@ -36,6 +36,11 @@ class Code(ABC):
     scheme: ClassVar[str]
     needs_flat: bool = False
     """Whether decoding also needs a black and a white frame."""
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """The code in a few words, with its periods or cells in projector px."""
 
     @property
     @abstractmethod

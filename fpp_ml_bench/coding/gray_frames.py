@@ -134,6 +134,10 @@ class GrayOnly(Code):
         return {"scheme": self.scheme, **self.cells.to_dict()}
 
     @property
+    def title(self) -> str:
+        return f"Gray code, cells of {self.cells.cell_px:g} px"
+
+    @property
     def shown(self) -> tuple[Shown, ...]:
         return self.cells.shown
 

@@ -105,6 +105,11 @@ class PhaseShift(Code):
         return content if self.gray is None else {**content, "gray": self.gray.to_dict()}
 
     @property
+    def title(self) -> str:
+        pitches = " + ".join(f"{fringe.pitch_px:g}" for fringe in self.fringes)
+        return f"{self.scheme} {pitches} px" + (" + Gray code" if self.gray else "")
+
+    @property
     def shown(self) -> tuple[Shown, ...]:
         frames = [
             Shown("sinusoid", step, number)

@@ -1,4 +1,4 @@
-from .opencv_files import Calibration as Calibration
+from .opencv_files import OpenCvCalibration as OpenCvCalibration
 from .opencv_files import read_opencv_calibration as read_opencv_calibration
 from .opencv_files import write_opencv_calibration as write_opencv_calibration
 from .patterns import export_patterns as export_patterns
@@ -13,11 +13,12 @@ from .pinhole import fold_radius_squared as fold_radius_squared
 from .pinhole import is_distorted as is_distorted
 from .pinhole import undistort as undistort
 from .rig import Rig as Rig
-from .rig import load_rig as load_rig
 from .rig import paper_rig as paper_rig
-from .rig import rig_from_dict as rig_from_dict
 from .rig import rotation_matrix as rotation_matrix
-from .rig import save_rig as save_rig
+from .rig_file import load_projection as load_projection
+from .rig_file import load_rig as load_rig
+from .rig_file import rig_from_dict as rig_from_dict
+from .rig_file import save_rig as save_rig
 from .sequence import AXES as AXES
 from .sequence import CONFIGS as CONFIGS
 from .sequence import DIRECTIONS as DIRECTIONS

@@ -48,7 +48,7 @@ _ERRORS = ("cam_error", "proj_error", "stereo_error")
 
 
 @dataclass(frozen=True)
-class Calibration:
+class OpenCvCalibration:
     """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``*_error_px``: the
     reprojection errors that the calibrating tool reported, None where the file has none."""
 
@@ -64,7 +64,7 @@ class Calibration:
 def read_opencv_calibration(
     *paths: str | Path, camera_size: tuple[int, int] | None = None, projector_size: tuple[int, int] | None = None,
     unit: str = "mm",
-) -> Calibration:  # fmt: skip
+) -> OpenCvCalibration:  # fmt: skip
     """The calibration in a file, or in several that hold parts of it (OpenCV's sample writes intrinsics and extrinsics
     apart). ``camera_size`` and ``projector_size``: (width, height) in px, needed where the files do not store them;
     ``unit``: mm or m, of the files' translation. A rotation rounded to float32 becomes the nearest exact one. Raises
@@ -81,7 +81,7 @@ def read_opencv_calibration(
     try:
         translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
         require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
-        return Calibration(
+        return OpenCvCalibration(
             _device(nodes, "camera", camera_size),
             _device(nodes, "projector", projector_size),
             _rotation(_matrix(nodes, "rotation", (3, 3))),
@@ -92,7 +92,7 @@ def read_opencv_calibration(
         raise RigError(f"{file}: {error}") from error
 
 
-def write_opencv_calibration(calibration: Calibration, path: str | Path, unit: str = "mm") -> None:
+def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, unit: str = "mm") -> None:
     """Write a calibration as XML, YAML or JSON (by the suffix) with the names of OpenCV's stereo samples (M1, D1, M2,
     D2, R, T), sizes as imageSize1 and imageSize2 and errors as cam_error, proj_error and stereo_error. Reading it gives
     equal numbers; only a translation that is no number of mm by 1000 changes, by its last bit, where ``unit`` is mm.

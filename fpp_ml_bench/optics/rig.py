@@ -2,46 +2,19 @@
 
 OpenCV's conventions: the camera frame has x right, y down, z forward; a point goes from the camera's frame to the
 projector's by ``X_p = R X_c + t`` in metres.
-
-A rig file is YAML or JSON; reading is strict, and writing and reading again gives an equal rig::
-
-    camera:    {width: 960, height: 960, fx: 2285.8, fy: 2285.8, cx: 479.5, cy: 479.5, distortion: [k1, k2, p1, p2, k3]}
-    projector: {width: 912, height: 1140, fx: 1824.0, fy: 1824.0, cx: 455.5, cy: 569.5, distortion: [0, 0, 0, 0, 0]}
-    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]     # 3 x 3, or a rotation vector of three numbers (rad)
-    translation_m: [0.125, -0.1, 0.0]               # X_projector = rotation X_camera + translation_m
-    pitch_px: {horizontal: 18, vertical: 18}        # projector px per period of each direction's fringes
-    sequence: {steps: 18, bits_horizontal: 7, bits_vertical: 7}
-    working_range_mm: [1500, 2100]
-    standoff_m: 1.8                                 # by default the middle of the range
-    background_m: 3.2                               # a plane behind the range; by default none is known
-
-The sequence above is the paper's. Any other is a code for one direction or both, which holds its own periods (no
-``pitch_px`` then)::
-
-    sequence:
-      order: [white, vertical]                      # as captured; by default horizontal, vertical
-      vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
-      # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
-      # or      {scheme: gray, cell_px: 2, inverse: after each}
-
-A distortion has 5, 8, 12 or 14 coefficients (`fpp_ml_bench.optics.pinhole`).
 """
 
-import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, bits_needed, cell_count
+from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, PhaseShift, bits_needed, cell_count
 from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
 from fpp_ml_bench.optics.sequence import (
     AXES,
@@ -50,7 +23,6 @@ from fpp_ml_bench.optics.sequence import (
     CodedSequence,
     Direction,
     Sequence,
-    sequence_from_dict,
 )
 
 ROTATION_TOLERANCE = 1e-6
@@ -159,8 +131,9 @@ class Rig:
         """Period of the finest fringes in projector px. Raises `RigError` for a direction without fringes."""
         pitch = self._pitch(direction)
         if pitch is None:
-            listed = " and ".join(self.fringe_directions) or "no"
-            raise RigError(f"this rig projects {listed} fringes, and no {direction} ones")
+            listed = " and ".join(self.fringe_directions)
+            projected = f"{listed} fringes, and no {direction} ones" if listed else "Gray code alone, and no fringes"
+            raise RigError(f"this rig projects {projected}")
         return pitch
 
     @property
@@ -190,6 +163,19 @@ class Rig:
         if isinstance(self.sequence, CodedSequence):
             return self.sequence.code(direction)
         return self.sequence.code(direction, self.pitch(direction))
+
+    def shifts_rad(self, direction: Direction) -> tuple[float, ...]:
+        """Phase shifts of the finest fringes of a direction, frame by frame, so that frame n shows ``cos(2 pi w / P +
+        shift_n)`` along the projector coordinate w. Raises `RigError` for a direction without fringes."""
+        pitch = self.pitch(direction)
+        if isinstance(self.sequence, Sequence):
+            steps = self.sequence.steps
+            return tuple(2 * np.pi * step / steps for step in range(steps))
+        code = self.sequence.code(direction)
+        if not isinstance(code, PhaseShift):
+            return (0.0,)
+        turns = code.fringes[code.finest].turns - code.origin_px / pitch
+        return tuple((2 * np.pi * turns).tolist())
 
     def pattern_length(self, direction: Direction) -> int:
         """Projector px along which the fringes vary: the rows for horizontal, the columns for vertical ones."""
@@ -287,92 +273,3 @@ def rotation_matrix(vector: tuple[float, ...]) -> NDArray[np.float64]:
     # np.sinc is sin(pi x) / (pi x): both factors stay exact as the angle goes to zero.
     half = np.sinc(angle / (2 * math.pi))
     return np.eye(3) + np.sinc(angle / math.pi) * cross + 0.5 * half * half * (cross @ cross)
-
-
-_RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
-_OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
-
-
-def _mapping(value: object, keys: Iterable[str], name: str, optional: Iterable[str] = ()) -> dict[str, Any]:
-    prefix, expected = f"{name}: " if name else "", ", ".join(keys)
-    if not isinstance(value, Mapping):
-        raise RigError(f"{prefix}expected a mapping with the keys {expected}, got {value!r}")
-    problems = [f"unknown key {key}" for key in value if key not in (*keys, *optional)]
-    problems += [f"missing key {key}" for key in keys if key not in value]
-    possible = f", and optionally {', '.join(optional)}" if optional else ""
-    require(not problems, f"{prefix}{', '.join(problems)}; expected exactly {expected}{possible}")
-    return dict(value)
-
-
-def rig_from_dict(data: object) -> Rig:
-    """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
-    anything unknown, missing, of the wrong type, or impossible as a rig."""
-    sequence = data.get("sequence") if isinstance(data, Mapping) else None
-    coded = isinstance(sequence, Mapping) and any(key in sequence for key in ("order", *DIRECTIONS))
-    keys = tuple(key for key in _RIG_KEYS if not (coded and key == "pitch_px"))
-    entries = _mapping(data, keys, "", _OPTIONAL_RIG_KEYS)
-    if not coded:
-        pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
-        entries |= {f"pitch_{direction}_px": pitch[direction] for direction in DIRECTIONS}
-    for device in ("camera", "projector"):
-        values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
-        if isinstance(lens := values["distortion"], list | tuple) and len(lens) == 4:
-            raise RigError(f"{device}.distortion: expected at least 5 numbers, got 4; write k3 too, as 0")
-        try:
-            entries[device] = Pinhole(**values)
-        except RigError as error:
-            raise RigError(f"{device}.{error}") from error
-    turn = entries["rotation"]
-    if isinstance(turn, list | tuple) and len(turn) == 3 and not any(isinstance(v, list | tuple) for v in turn):
-        entries["rotation"] = rotation_matrix(numbers(turn, 3, "rotation")).tolist()
-    lengths: dict[Direction, int] = {
-        "horizontal": entries["projector"].height, "vertical": entries["projector"].width,
-    }  # fmt: skip
-    entries["sequence"] = sequence_from_dict(entries["sequence"], lengths)
-    entries.setdefault("background_m", None)
-    if "standoff_m" not in entries:
-        near, far = numbers(entries["working_range_mm"], 2, "working_range_mm")
-        entries["standoff_m"] = (near + far) / 2 / MM_PER_M
-    return Rig(**entries)
-
-
-def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    mapping: dict[Any, Any] = {}
-    for key, value in pairs:
-        require(key not in mapping, f"key {key} is given twice in the same mapping; keep one entry")
-        mapping[key] = value
-    return mapping
-
-
-def _is_json(path: Path) -> bool:
-    suffix = path.suffix.lower()
-    require(suffix in (".yaml", ".yml", ".json"), f"{path}: expected a rig file ending in .yaml, .yml or .json")
-    return suffix == ".json"
-
-
-def load_rig(path: str | Path) -> Rig:
-    """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
-    file = Path(path)
-    as_json = _is_json(file)
-    try:
-        text = file.read_text(encoding="utf-8")
-        require(text.strip(), f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
-        return rig_from_dict(json.loads(text, object_pairs_hook=_unique_keys) if as_json else strict_yaml(text))
-    except RigError as error:
-        raise RigError(f"{file}: {error}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RigError(f"{file}: can't be read as text: {error}") from error
-    except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
-        problem = str(error) or "nested too deeply"
-        raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error
-
-
-def save_rig(rig: Rig, path: str | Path) -> None:
-    """Write a rig as YAML or JSON (by the suffix); `load_rig` gives an equal rig back, to the last bit."""
-    file = Path(path)
-    data = rig.to_dict()
-    text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RigError(f"{file}: can't be written: {error.strerror or error}") from error

@@ -197,7 +197,7 @@ def _paper_code(steps: int, bits: int, pitch_px: float) -> PhaseShift:
 @dataclass(frozen=True)
 class CodedSequence(AnySequence):
     """A ``horizontal`` or ``vertical`` code, or both, and the ``order`` of what is projected: directions, black and
-    white."""
+    white; or ``crossed`` in place of both directions, a single frame that is the mean of their single frames."""
 
     horizontal: Code | None
     vertical: Code | None
@@ -206,13 +206,16 @@ class CodedSequence(AnySequence):
     def __post_init__(self) -> None:
         if not self.directions:
             raise RigError("sequence: no direction is coded; describe horizontal, vertical or both")
-        known = (*self.directions, "black", "white")
+        crossed = "crossed" in self.order
+        if crossed and (len(self.directions) < 2 or any(len(self.code(d).shown) != 1 for d in self.directions)):
+            raise RigError("sequence.order: crossed needs a code of a single frame for both directions (steps: 1)")
+        known = ("crossed", "black", "white") if crossed else (*self.directions, "black", "white")
         for name in self.order:
             if name not in known or self.order.count(name) > 1:
                 raise RigError(f"sequence.order: expected each of {', '.join(known)} at most once, got {self.order}")
         for direction in self.directions:
             code = self.code(direction)
-            needed = (direction, *(("black", "white") if code.needs_flat else ()))
+            needed = ("crossed" if crossed else direction, *(("black", "white") if code.needs_flat else ()))
             missing = [name for name in needed if name not in self.order]
             if missing:
                 raise RigError(f"sequence.order: {', '.join(missing)} missing, which the {direction} code needs")
@@ -253,10 +256,22 @@ class CodedSequence(AnySequence):
             if name in ("black", "white"):
                 frames.append(Frame(len(frames), "black" if name == "black" else "white"))
                 continue
+            if name == "crossed":
+                frames.append(Frame(len(frames), "crossed"))
+                continue
             direction: Direction = "horizontal" if name == "horizontal" else "vertical"
             frames += [Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
                        for i, shown in enumerate(self.code(direction).shown)]  # fmt: skip
         return tuple(frames)
+
+    def coded(self, direction: Direction) -> tuple[int, ...]:
+        return self._crossed() or super().coded(direction)
+
+    def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
+        return self._crossed() if direction in self.directions and self._crossed() else super().sinusoids(direction)
+
+    def _crossed(self) -> tuple[int, ...]:
+        return tuple(frame.index for frame in self.frames if frame.kind == "crossed")
 
     def _finest(self, direction: Direction) -> int:
         code = getattr(self, direction)

@@ -1,8 +1,17 @@
+from .board_poses import board_poses as board_poses
+from .board_poses import calibrated_rig as calibrated_rig
+from .board_poses import pose_folders as pose_folders
 from .exports import FORMS as FORMS
 from .exports import export_capture as export_capture
 from .exports import pixel_normals as pixel_normals
 from .exports import triangles as triangles
+from .folders import Splits as Splits
+from .folders import read_splits as read_splits
 from .images import COLOURS as COLOURS
 from .images import CapturedFrames as CapturedFrames
 from .images import frame_files as frame_files
 from .images import read_frames as read_frames
+from .importing import capture_notes as capture_notes
+from .importing import import_captures as import_captures
+from .importing import plan_captures as plan_captures
+from .picture import capture_picture as capture_picture

@@ -70,10 +70,7 @@ def read_frames(
     16 bits that hold all levels; the result's ``note`` says which. ``colour``: which of `COLOURS` to take where
     channels differ. Raises `CaptureError` naming the file for anything but complete, lossless images of one size and
     bit depth, for levels that need more than ``bits``, and for colour without ``colour``."""
-    if colour is not None and colour not in COLOURS:
-        raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
-    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
-        raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
+    check_options(bits, colour)
     files = frame_files(source)
     if count is not None and len(files) != count:
         first, last = files[0].name, files[-1].name
@@ -102,6 +99,14 @@ def read_frames(
     return CapturedFrames(frames, tuple(files), full_scale, note)
 
 
+def check_options(bits: int | None, colour: str | None) -> None:
+    """Raise `CaptureError` for options that `read_frames` does not take."""
+    if colour is not None and colour not in COLOURS:
+        raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
+    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
+        raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
+
+
 def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """The image files of ``source``: a folder, a pattern for names in a folder such as ``scan/frame_*.png``, a file, or
     a list of files, which keeps its order. The others are in natural order: frame_2 before frame_10. Hidden files, and
@@ -126,9 +131,9 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
             raise CaptureError(f"{source}: no file matches this pattern; check it and the folder's name")
     else:
         raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
-    files.sort(key=lambda file: (_natural(str(file.with_suffix(""))), str(file)))
+    files.sort(key=lambda file: (natural_key(str(file.with_suffix(""))), str(file)))
     for file, following in pairwise(files):
-        if _natural(str(file.with_suffix(""))) == _natural(str(following.with_suffix(""))):
+        if natural_key(str(file.with_suffix(""))) == natural_key(str(following.with_suffix(""))):
             raise CaptureError(
                 f"{file}: {following.name} has the same name or number, so the frames have no order; remove one of "
                 "them, or give a pattern or a list of files"
@@ -136,7 +141,7 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
     return files
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key in which numbers count as numbers."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

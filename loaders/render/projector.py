@@ -60,6 +60,8 @@ class PatternLight:
         levels, per_px = np.array([0.0]), 1
         if light.defocus_px > 0:
             levels, per_px = _levels(defocus_variance_px2(rig, light, _distances(rig)).max()), FINE
+        if any(frame.kind == "crossed" for frame in rig.sequence):
+            raise BuildError("crossed fringes can't be rendered yet: project the two directions as frames of their own")
         response = response_table(light.response)
         vertical = np.array([frame.direction == "vertical" for frame in rig.sequence])
         length = max(rig.projector.width, rig.projector.height)

@@ -19,6 +19,8 @@ WORK_FOLDER = ".build"
 MESH_FOLDER = "meshes"
 GENERATED = "generated"
 """`Manifest.origin` of a dataset that the builder made."""
+CAPTURED = "captured"
+"""That of a dataset decoded from a scanner's captures; objects have any views."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import Calibration, Pinhole, opencv_files, read_opencv_calibration, write_opencv_calibration
+from fpp_ml_bench.optics import (
+    OpenCvCalibration,
+    Pinhole,
+    opencv_files,
+    read_opencv_calibration,
+    write_opencv_calibration,
+)
 
 CAMERA = Pinhole(640, 480, 800.1, 801.7, 319.3, 241.9, (-0.1, 0.02, 0.001, -0.002, 0.01))
 PROJECTOR = Pinhole(912, 1140, 1500.5, 1501.25, 455.5, 1100.0, (0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.01, -0.01))
@@ -97,7 +103,7 @@ def test_writing_and_reading_gives_equal_numbers(sound, tmp_path, suffix):
     rng = np.random.default_rng(3)
     for unit, translation in (("mm", tuple((rng.normal(size=3) * 100 / 1000).tolist())), ("m", (1 / 3, 1e-17, -0.1))):
         turn = tuple(tuple(row) for row in TURN.tolist())
-        calibration = Calibration(CAMERA, PROJECTOR, turn, translation, 0.1 + 0.2, None, 5e-324)
+        calibration = OpenCvCalibration(CAMERA, PROJECTOR, turn, translation, 0.1 + 0.2, None, 5e-324)
         path = tmp_path / f"calibration.{suffix}"
         write_opencv_calibration(calibration, path, unit)
         read = read_opencv_calibration(path, unit=unit)
