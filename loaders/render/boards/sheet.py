@@ -2,7 +2,7 @@
 
 The print is a function of the place on the sheet, neither mesh nor picture. A pixel on one of its edges is the mean of
 `EDGE_RAYS` x `EDGE_RAYS` rays, each as dark as the share of its own area that is: a circle's grey levels then have
-their centroid where it should be, to a thousandth of a pixel (`tests/render/test_boards.py`).
+their centroid where it should be, to a thousandth of a pixel (`tests/render/test_photographed_boards.py`).
 """
 
 from dataclasses import dataclass
