@@ -22,6 +22,7 @@ EXAMPLES = (
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
+    "fpp-bench build data/lab --decode-with found.yaml            ground truth by the rig that a calibration found",
     "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
 
@@ -37,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
+    parser.add_argument("--decode-with", type=Path, metavar="FILE",
+                        help="rig that a calibration found: it decodes the ground truth and is the dataset's; "
+                             "--rig photographs")  # fmt: skip
     parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
     parser.add_argument("--light", default="paper", metavar="NAME|FILE",
                         help="paper, workshop, hard, or a YAML file with other numbers (default: paper)")  # fmt: skip
@@ -80,7 +84,8 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
         light = light.changed("camera", **render.camera_noise(args.noise_sigma))
     if args.shadows:
         light = light.changed("bounces", shadows=True)
-    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own)
+    found = None if args.decode_with is None else optics.load_rig(args.decode_with)
+    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own, found)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -102,9 +102,9 @@ class Studio:
             shaded = lit.gain > 0 if light.bounces.shadows else None
             mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across, shaded)
             mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
-        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self._brightness(stream), stream)
+        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream)
 
-    def _brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
+    def brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
         """The view's exposure times the lens's vignetting, for every pixel or one for all."""
         exposure = self.light.camera.exposure
         if isinstance(exposure, tuple):
@@ -202,7 +202,7 @@ class Studio:
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
-        rig = self.settings.rig
+        rig = self.settings.stated_rig
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
