@@ -1,16 +1,18 @@
 """``fpp-bench calibrate``: the rig from captures of a board, or from frames with depth."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from rich.table import Column, Table
 
 from fpp_ml_bench import calibration, optics
+from fpp_ml_bench.cli import count
 from fpp_ml_bench.cli.console import progress_bar, show, working_range
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders import captures, published
+from fpp_ml_bench.loaders import captures, published, render
 from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = (
@@ -19,6 +21,7 @@ SUMMARY = (
 EXAMPLES = (
     "fpp-bench calibrate poses --board checker:9x13:10 --sequence projector.yaml --out rig.yaml",
     "fpp-bench calibrate poses --board circles:5x9:60:18 --sequence projector.yaml --out rig.yaml --estimate-board",
+    "fpp-bench calibrate --virtual boards --out found.yaml                   the paper's calibration, by our own light",
     "fpp-bench calibrate --from-depth fpp-ml-bench --out rig.yaml",
     "fpp-bench calibrate --from-depth my-scans --out rig.yaml --camera my-rig.yaml --projector 1280x800",
     "",
@@ -68,6 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("captures", nargs="?", type=Path, metavar="CAPTURES", help="folder with a folder of frames for each board pose")
     add("--from-depth", type=Path, metavar="TREE", help="instead: a published tree with raw scans and depth in mm")
+    add("--virtual", type=Path, metavar="DIR",
+        help="instead: photograph a board with a virtual rig into DIR, and calibrate from the images")  # fmt: skip
     add("--out", type=Path, metavar="RIG", required=True, help="rig file to write, .yaml or .json")
     board = parser.add_argument_group("board")
     add = board.add_argument
@@ -78,16 +83,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
              f"(default): of {', '.join(AUTO_MODELS)} the one that predicts poses left out best")  # fmt: skip
     add("--square-pixels", action="store_true", help="fx = fy, of both devices")
     add("--centred", action="store_true", help="the camera's principal point is the image's centre")
-    add(
-        "--estimate-board",
-        action="store_true",
-        help="the board's points are estimated too: printed boards are not perfect",
-    )
+    add("--estimate-board", action="store_true", help="estimate the board's points too: no print is perfect")
     add("--baseline", type=float, metavar="MM", help="distance of camera and projector, where the spacing is not known")
     add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the boards', and 10%%)")
     add("--bits", type=int, metavar="N", help="bits of the camera, where files of 16 bits hold fewer")
     add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
     add("--opencv", type=Path, metavar="FILE", help="also write OpenCV's calibration file (.xml, .yml, .json)")
+    virtual = parser.add_argument_group("virtual")
+    add = virtual.add_argument
+    add("--true-rig", type=Path, metavar="FILE", help="the rig that photographs (default: the paper's)")
+    add("--size", type=int, metavar="PX", help="width of its images (default: the rig's)")
+    add("--poses", type=count(100), metavar="N", help="poses of the board (default: 18)")
     depth = parser.add_argument_group("depth")
     add = depth.add_argument
     add("--camera", type=Path, metavar="FILE",
@@ -112,9 +118,34 @@ def run(args: argparse.Namespace) -> int:
         raise RigError(f"{args.out}: expected a rig file ending in .yaml, .yml or .json")
     if not args.out.absolute().parent.is_dir():
         raise RigError(f"{args.out}: the folder {args.out.parent} does not exist; make it first")
-    if (args.captures is None) == (args.from_depth is None):
-        raise CalibrationError("expected either CAPTURES of a board, or --from-depth TREE")
-    return _from_depth(args, workers) if args.captures is None else _from_board(args)
+    if sum(given is not None for given in (args.captures, args.from_depth, args.virtual)) != 1:
+        raise CalibrationError("expected one of CAPTURES of a board, --from-depth TREE, or --virtual DIR")
+    if args.from_depth is not None:
+        return _from_depth(args, workers)
+    if args.virtual is not None:
+        return _virtual(args)
+    if args.board is None or args.sequence is None:
+        raise CalibrationError("captures of a board need --board KIND:COLUMNSxROWS:SPACING and --sequence FILE")
+    _from_board(args, args.captures, calibration.parse_board(args.board), args.sequence)
+    return 0
+
+
+def _virtual(args: argparse.Namespace) -> int:
+    """Photograph a board, calibrate from the images alone, and compare with the rig that took them."""
+    if args.size is not None and not 64 <= args.size <= 8192:
+        raise CalibrationError(f"--size {args.size}: expected 64 to 8192 px")
+    true_rig = optics.paper_rig() if args.true_rig is None else optics.load_rig(args.true_rig)
+    true_rig = true_rig if args.size is None else true_rig.scaled(args.size)
+    board = render.fitting_board(true_rig) if args.board is None else calibration.parse_board(args.board)
+    poses = render.board_poses(true_rig, board, args.poses or render.BOARD_POSES)
+    with progress_bar("photographing", len(poses) * len(true_rig.sequence), "images") as advance:
+        render.photograph_board(args.virtual, true_rig, board, poses, progress=advance)
+    range_mm = args.range or true_rig.working_range_mm
+    found = _from_board(args, args.virtual, board, args.virtual / "rig.yaml", range_mm, true_rig)
+    error = calibration.volume_error_mm(found, true_rig)
+    print(f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
+          f"scale {error.scale:.5f}; baseline {MM_PER_M * true_rig.baseline_m:.2f} mm")  # fmt: skip
+    return 0
 
 
 def _from_depth(args: argparse.Namespace, workers: int) -> int:
@@ -131,12 +162,15 @@ def _from_depth(args: argparse.Namespace, workers: int) -> int:
     return 0
 
 
-def _from_board(args: argparse.Namespace) -> int:
-    if args.board is None or args.sequence is None:
-        raise CalibrationError("captures of a board need --board KIND:COLUMNSxROWS:SPACING and --sequence FILE")
-    board, lenses = calibration.parse_board(args.board), _lenses(args)
-    with progress_bar("finding the board", len(captures.pose_folders(args.captures)), "poses") as advance:
-        poses, rig = captures.board_poses(args.captures, board, args.sequence, args.bits, args.colour, advance)
+def _from_board(
+    args: argparse.Namespace, folder: Path, board: "calibration.Board", sequence: Path,
+    range_mm: tuple[float, float] | None = None, like: "optics.Rig | None" = None,
+) -> "optics.Rig":  # fmt: skip
+    """Calibrate, print and write; the rig, with standoff and background of ``like``."""
+    lenses = _lenses(args)
+    with progress_bar("finding the board", len(captures.pose_folders(folder)), "poses") as advance:
+        poses, rig = captures.board_poses(folder, board, sequence, args.bits, args.colour, advance)
+    lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
     options = {"estimate_board": args.estimate_board, "baseline_mm": args.baseline}
     with progress_bar("fitting", len(lenses), "lens models") as advance:
@@ -152,7 +186,9 @@ def _from_board(args: argparse.Namespace) -> int:
             )
         show(compared)
     best = min(found, key=lambda one: one.held_out_rms_px) if len(found) > 1 else found[0]
-    rig = captures.calibrated_rig(best, rig, args.range)
+    rig = captures.calibrated_rig(best, rig, range_mm or args.range)
+    if like is not None:
+        rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     print_calibration(best)
     optics.save_rig(rig, args.out)
     picture = args.out.with_suffix(".png")
@@ -164,7 +200,7 @@ def _from_board(args: argparse.Namespace) -> int:
         optics.write_opencv_calibration(content, args.opencv)
         written.append(args.opencv)
     print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {args.out} FRAMES --out OUT")
-    return 0
+    return rig
 
 
 def _lenses(args: argparse.Namespace) -> list[tuple["calibration.Lens", "calibration.Lens"]]:

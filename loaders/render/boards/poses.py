@@ -15,7 +15,7 @@ from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.optics import Rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
-POSES = 18
+BOARD_POSES = 18
 """As many as the paper takes (Section 2.2)."""
 MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco": 1.5}
 """From the outer points to the end of the sheet, in spacings."""
@@ -65,7 +65,7 @@ def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int =
     return Board(kind, columns, rows, float(f"{spacing:g}"), float(f"{unit.detail_mm * spacing:g}"))
 
 
-def board_poses(rig: Rig, board: Board, count: int = POSES, tilt_deg: float = 30.0) -> tuple[BoardPose, ...]:
+def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES, tilt_deg: float = 30.0) -> tuple[BoardPose, ...]:
     """``count`` poses at which the sheet is within the working range, the image and the pattern: towards the middle,
     the corners and the sides of the image in turn, tilted by up to ``tilt_deg`` in directions all round, upright and
     turned by a quarter, at distances over the whole range. Raises `CalibrationError` for a board that does not fit."""
