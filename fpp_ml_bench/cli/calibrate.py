@@ -136,7 +136,12 @@ def _virtual(args: argparse.Namespace) -> int:
         raise CalibrationError(f"--size {args.size}: expected 64 to 8192 px")
     true_rig = optics.paper_rig() if args.true_rig is None else optics.load_rig(args.true_rig)
     true_rig = true_rig if args.size is None else true_rig.scaled(args.size)
-    board = render.fitting_board(true_rig) if args.board is None else calibration.parse_board(args.board)
+    if args.board is not None:
+        board = calibration.parse_board(args.board)
+    elif true_rig == optics.paper_rig():
+        board = render.PAPER_BOARD
+    else:
+        board = render.fitting_board(true_rig)
     poses = render.board_poses(true_rig, board, args.poses or render.BOARD_POSES)
     with progress_bar("photographing", len(poses) * len(true_rig.sequence), "images") as advance:
         render.photograph_board(args.virtual, true_rig, board, poses, progress=advance)

@@ -37,6 +37,10 @@ class Composite(Code):
         return {"scheme": self.scheme, "pitches_px": list(self.pitches_px)}
 
     @property
+    def title(self) -> str:
+        return f"one frame of {' + '.join(f'{pitch:g}' for pitch in self.pitches_px)} px"
+
+    @property
     def shown(self) -> tuple[Shown, ...]:
         return (Shown("sinusoid"),)
 

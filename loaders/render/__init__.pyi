@@ -1,5 +1,6 @@
 from .boards import BOARD_FILE as BOARD_FILE
 from .boards import BOARD_POSES as BOARD_POSES
+from .boards import PAPER_BOARD as PAPER_BOARD
 from .boards import BoardPose as BoardPose
 from .boards import board_poses as board_poses
 from .boards import fitting_board as fitting_board

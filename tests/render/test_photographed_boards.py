@@ -13,7 +13,7 @@ from fpp_ml_bench.calibration import Board, parse_board
 from fpp_ml_bench.errors import BuildError, CalibrationError, CaptureError
 from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.loaders.captures import read_frames
-from fpp_ml_bench.loaders.render.boards import BoardPose, board_poses, fitting_board, photograph_board
+from fpp_ml_bench.loaders.render.boards import PAPER_BOARD, BoardPose, board_poses, fitting_board, photograph_board
 from fpp_ml_bench.loaders.render.boards.captures import board_frames, board_studio
 from fpp_ml_bench.loaders.render.boards.poses import sheet_corners_mm
 from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, dark_share
@@ -96,6 +96,7 @@ def test_the_dark_area_is_that_of_the_print(footprint_mm):
 
 
 def test_the_boards_of_the_papers_rig():
+    assert len(board_poses(paper_rig(), PAPER_BOARD)) == 18
     assert (BOARD.kind, BOARD.columns, BOARD.rows, BOARD.spacing_mm, BOARD.radius_mm) == ("circles", 5, 9, 50.0, 15.0)
     assert fitting_board(paper_rig(), "checker", 7, 9).radius_mm == 0
 

@@ -16,7 +16,10 @@ from fpp_ml_bench.optics import Rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 BOARD_POSES = 18
-"""As many as the paper takes (Section 2.2)."""
+"""As many as the paper takes (Section 2.3)."""
+PAPER_BOARD = Board("circles-asymmetric", 5, 9, 20.0, 5.0)
+"""The paper's (Section 2.3): 5 x 9 asymmetric circles of 10 mm, 20 mm apart. Its sheet takes 7% of the image at the
+standoff."""
 MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco": 1.5}
 """From the outer points to the end of the sheet, in spacings."""
 COVERED = 0.65
@@ -54,7 +57,7 @@ def sheet_corners_mm(board: Board) -> tuple[tuple[float, float], tuple[float, fl
 
 def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int = 9) -> Board:
     """A board for a rig: its longer side takes `COVERED` of the image's shorter side at the standoff, the spacing a
-    round number of mm. Circles have a radius of 0.3 spacings. The paper's board has 5 x 9 circles."""
+    round number of mm. Circles have a radius of 0.3 spacings."""
     unit = Board(kind, columns, rows, 1.0, 0.3 if kind.startswith("circles") else 0.0)
     (left, top), (right, bottom) = sheet_corners_mm(unit)
     camera = rig.camera
