@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from rich.table import Column, Table
@@ -196,9 +197,10 @@ def _from_board(
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     print_calibration(best)
     optics.save_rig(rig, args.out)
-    picture = args.out.with_suffix(".png")
-    write_atomically(picture, calibration.draw_residuals(best))
-    written = [args.out, picture]
+    written = [args.out]
+    if find_spec("matplotlib"):  # of the extra page
+        written.append(args.out.with_suffix(".png"))
+        write_atomically(written[-1], calibration.draw_residuals(best))
     if args.opencv is not None:
         errors = (best.camera_rms_px, best.projector_rms_px, best.stereo_rms_px)
         content = optics.OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *errors)

@@ -4,6 +4,7 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -118,16 +119,18 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
 def write_capture(
     folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
 ) -> None:
-    """Write a decoded capture: the ``forms`` of `export_capture`, maps as .npy, a picture, and `REPORT`."""
+    """Write a decoded capture: the ``forms`` of `export_capture`, maps as .npy, `REPORT`, and with matplotlib a
+    picture."""
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
     for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
         buffer = io.BytesIO()
         np.save(buffer, values)
         write_atomically(folder / f"{name}.npy", buffer.getvalue())
-    title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
-    write_atomically(folder / "picture.png", capture_picture(title, *maps))
+    if find_spec("matplotlib"):  # of the extra page
+        title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
+        maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
+        write_atomically(folder / "picture.png", capture_picture(title, *maps))
     content = {
         "rig": rig.to_dict(), "frames": [file.name for file in capture.files], "full_scale": capture.full_scale,
         "pixels": decoded.counts, "noise_grey": result.noise_grey, "noise_measured": result.noise_measured,
