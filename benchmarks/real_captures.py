@@ -22,7 +22,7 @@ from PIL import Image
 from fpp_ml_bench import calibration, decoding, optics
 from fpp_ml_bench.baselines import robustness
 from fpp_ml_bench.baselines.phase_route import PhaseMethod
-from fpp_ml_bench.loaders import captures
+from fpp_ml_bench.loaders import captures, render
 
 SPACING_MM = 10.0
 """Not recorded with the captures; with it our point clouds have the size of the authors' to 0.06%."""
@@ -56,6 +56,7 @@ def main() -> int:
             for who, found in (("authors", theirs), ("ours", ours)):
                 rig = rig_of(found, name, Path(scratch))
                 decode(args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}")
+        twin(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
         one_frame(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
     return 0
 
@@ -151,6 +152,31 @@ def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tu
         kept = apart < 3 * ROBUST * np.median(apart)
     scale = np.sqrt(((target[kept] - b) ** 2).sum() / ((points[kept] - a) ** 2).sum())
     return float(np.median(apart)), float(scale)
+
+
+def twin(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
+    """Render a ball before the same rig by the light `paper`, and compare modulation and noise with the real frames:
+    noise of depth from second differences along the rows, which a smooth surface has not."""
+    import trimesh
+
+    trimesh.creation.icosphere(subdivisions=5, radius=0.04).export(scratch / "ball.stl")
+    virtual = replace(rig, working_range_mm=(350.0, 450.0), standoff_m=0.4, background_m=0.6)
+    mesh = render.single_mesh(scratch / "ball.stl")
+    studio = render.Studio(render.BuildSettings(virtual, ("ball",), user_meshes=(mesh,)))
+    row = studio.photograph(render.load_user_mesh(mesh), "A0")
+    rendered = [row.frames[index] for index in range(len(rig.sequence))]
+    real = list(captures.read_frames(folder, count=len(rig.sequence)).frames)
+    for title, frames in (("twin, light paper", rendered), ("real frames", real)):
+        decoded = decoding.decode_stack(frames, virtual if title != "real frames" else rig, details=True, threads=2)
+        found = decoded.depth_mm > 0
+        depth_mm = np.where(found, decoded.depth_mm.astype(np.float64), np.nan)
+        bends = depth_mm[:, 2:] - 2 * depth_mm[:, 1:-1] + depth_mm[:, :-2]
+        bends = bends[np.isfinite(bends) & (np.abs(bends) < 3)]
+        noise_mm = ROBUST * float(np.median(np.abs(bends - np.median(bends)))) / np.sqrt(6)
+        modulation = float(np.median(decoded.details["vertical"].modulation[found]))
+        print(
+            f"{title:<20} {found.sum():,} px: modulation {modulation:.1f} grey levels, noise of depth {noise_mm:.3f} mm"
+        )
 
 
 def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
