@@ -1,4 +1,5 @@
-"""Classical multi-frame FPP: N-step phase, Gray-code order, triangulation (paper Section 2.1).
+"""Classical multi-frame FPP: phase and order by whatever a rig codes, in the paper N steps and Gray code, then
+triangulation (paper Section 2.1).
 
 With all steps and both directions it is the process that made the ``depth`` column, so only ``--target depth_exact``
 shows its error.
@@ -8,39 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.decoding import Decoded, Directions, choose_steps, decode_stack, fewest_gray_bits
+from fpp_ml_bench.coding import Limits
+from fpp_ml_bench.decoding import Decoded, DirectionPlan, Directions, decode_stack, fewest_plans, plan_direction
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import DIRECTIONS, Rig
+from fpp_ml_bench.optics import Rig
 
 
 class ClassicalMethod(Method):
-    """``steps`` of the N sinusoids of one direction or both, and their Gray code. Metric, nothing learned. ``fewest``:
-    of the Gray code only the frames that the rig's working range needs (`fpp_ml_bench.decoding.fewest`)."""
+    """All that a rig codes in one direction or "both", decoded. With the paper's kind of code, ``steps`` of the N
+    sinusoids (default: all) and the Gray code, or with ``fewest`` only those of its frames that the rig's working range
+    needs (`fpp_ml_bench.decoding.fewest`). Metric, nothing learned. Raises `RigError` for a direction that the rig does
+    not code, `DecodeError` for steps that were not captured, and for ``steps`` or ``fewest`` with another kind."""
 
     name = "classical"
 
     def __init__(
-        self, rig: Rig, direction: Directions = "both", steps: int = 18, threads: int = 1, fewest: bool = False
+        self, rig: Rig, direction: Directions = "both", steps: int | None = None, threads: int = 1, fewest: bool = False
     ) -> None:
-        sequence = rig.sequence
-        if not 3 <= steps <= sequence.steps:
-            raise DecodeError(f"steps {steps}: expected 3 to the {sequence.steps} that were captured")
-        self.rig, self.direction, self.steps, self.threads, self.fewest = rig, direction, steps, threads, fewest
-        directions = DIRECTIONS if direction == "both" else (direction,)
-        every_bit = {way: tuple(range(sequence.bits(way))) for way in directions}
-        gray_bits = fewest_gray_bits(rig, direction) if fewest else every_bit
-        used: list[int] = []
-        for way in directions:
-            sinusoids = sequence.sinusoids(way)
-            used += [sinusoids[step] for step in choose_steps(sequence.steps, steps)]
-            used += [sequence.gray(way)[bit] for bit in gray_bits[way]]
-        self.frames_used = tuple(sorted(used))
-        fringes = "both directions" if direction == "both" else f"{direction} fringes"
-        count = sum(map(len, gray_bits.values()))
-        self.title = f"Classical {steps}-step + Gray code, {fringes}"
-        self.settings = {"direction": direction, "steps": steps, "threads": threads}
+        directions = rig.directions if direction == "both" else (direction,)
+        plans = [plan_direction(rig, way, steps, Limits()) for way in directions]
         if fewest:
-            self.title = f"Classical {steps}-step, {fringes}, " + (f"{count} Gray frames" if count else "no Gray code")
+            plans = fewest_plans(rig, plans)[0]
+        self.rig, self.threads, self.fewest = rig, threads, fewest
+        self.direction: Directions = "both" if len(directions) > 1 else directions[0]
+        self.frames_used = tuple(sorted({index for plan in plans for index in plan.frames}))
+        counts = {len(plan.sinusoids) if isinstance(plan, DirectionPlan) else 0 for plan in plans}
+        if len(counts) > 1 or 0 in counts:
+            if fewest:
+                raise DecodeError(
+                    "fewest: frames can be left out only with sinusoids of one period in equal steps from pixel 0 and "
+                    "Gray code in half periods; the code of this rig is another: leave fewest out"
+                )
+            self.steps = None
+            code = ", ".join(f"{way} {rig.code(way).title}" for way in directions)
+            self.title = f"Classical, {code}"
+            self.settings = {"direction": self.direction, "code": code, "threads": threads}
+            return
+        self.steps = counts.pop()
+        fringes = "both directions" if self.direction == "both" else f"{self.direction} fringes"
+        self.title = f"Classical {self.steps}-step + Gray code, {fringes}"
+        self.settings = {"direction": self.direction, "steps": self.steps, "threads": threads}
+        if fewest:
+            count = len(self.frames_used) - self.steps * len(plans)
+            gray = f"{count} Gray frames" if count else "no Gray code"
+            self.title = f"Classical {self.steps}-step, {fringes}, {gray}"
             self.settings = {**self.settings, "fewest": True}
 
     def decode(self, frames: Frames, reasons: bool = True) -> Decoded:

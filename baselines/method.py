@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__, baselines
 from fpp_ml_bench.baselines import networks, phase_network, phase_route, training
+from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics import Rig
@@ -92,13 +93,36 @@ class Method(ABC):
 METHODS: Mapping[str, Callable[..., Method]] = {
     "classical": lambda rig, **options: baselines.ClassicalMethod(rig, **options),
     "phase": lambda rig, **options: (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(
-        rig, **options
+        rig, **_fringe_options("phase", rig, options)
     ),
-    "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **options),
+    "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **_fringe_options("phase-net", rig, options)),
     "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
 `NetworkMethod`."""
+
+
+def _fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
+    """``options`` of a method that computes with the fringes of one direction, which is the rig's only one by default.
+    Raises `PredictionError` for fringes that it would take for others."""
+    ways = rig.fringe_directions
+    if len(ways) == 1:
+        options = {"direction": ways[0], **options}
+    direction = options.get("direction", "horizontal")
+    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
+        return options  # refused by the method
+    shifts = code.fringes[code.finest].shifts_deg
+    if code.origin_px != 0 or shifts[0] != 0:
+        raise PredictionError(
+            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
+            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); use classical"
+        )
+    if "error_mm" in options and not code.is_plain:
+        raise PredictionError(
+            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
+            f"{code.title}; say how many frames instead"
+        )
+    return options
 
 
 def load_method(name_or_path: str | Path, rig: Rig, **options: Any) -> Method:

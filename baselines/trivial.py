@@ -31,7 +31,7 @@ class ConstantMethod(Method):
         if not 0 < self.depth_mm < 1e6:
             raise PredictionError(f"at {at!r}: expected {', '.join(known)}, or a depth in mm above 0")
         self.shape = rig.camera.height, rig.camera.width
-        self.frames_used = (rig.sequence.sinusoids("horizontal")[0],)
+        self.frames_used = rig.sequence.config("single_shot")
         self.title = f"Constant depth, {at} mm" if at not in known else f"Constant depth: {at}"
         self.settings = {"at": at, "depth_mm": self.depth_mm}
 

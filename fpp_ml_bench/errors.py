@@ -16,6 +16,14 @@ class DecodeError(FppBenchError, ValueError):
     """Frames that can't be decoded at all."""
 
 
+class CaptureError(FppBenchError, ValueError):
+    """Captured images that can't be read as frames, or results of a capture that can't be written."""
+
+
+class CalibrationError(FppBenchError, ValueError):
+    """A board that is not found, or captures that don't determine a rig, or contradict each other."""
+
+
 class MeshError(FppBenchError, ValueError):
     """A mesh that can't be read, is empty, or does not fit the working range."""
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
 
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import EARLIER, benchmark_of
-from fpp_ml_bench.optics import CONFIGS
 
 LEGACY_FINGERPRINTS = (
     "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",

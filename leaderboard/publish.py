@@ -16,6 +16,7 @@ from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.tradeoff import shipped_tradeoff
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report import millimetres, percent
@@ -29,7 +30,6 @@ from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage import PREVIEW, DatasetFolder
-from fpp_ml_bench.optics import CONFIGS
 
 FRAMEWORK = "fpp-ml-bench"
 SPLIT, TARGET, MODE = "test", "depth", "standard"

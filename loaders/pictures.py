@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import VIEWS, sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import render
@@ -49,8 +48,9 @@ Panel = tuple[str, NDArray, str, float, float]
 def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
     sequence, stored = dataset.sequence, dataset.manifest.stored_frames
     # The third finest Gray bit: its stripes are still visible in a small picture.
-    codes = [sequence.gray(direction)[-3:][0] for direction in DIRECTIONS]
-    frames = [i for i in (0, sequence.sinusoids("vertical")[0], *codes, sequence.white) if i in stored]
+    codes = [index for direction in DIRECTIONS for index in tuple(sequence.gray(direction))[-3:][:1]]
+    firsts = (*sequence.config("single_shot"), *sequence.sinusoids("vertical")[:1])
+    frames = [i for i in dict.fromkeys((*firsts, *codes, sequence.white)) if i in stored]
     panels: list[Panel] = [(sequence.frames[i].title, dataset.frame(sample, i), _GREY, 0, 255) for i in frames]
     depth_mm = dataset.depth_mm(sample)
     inside = object_mask(depth_mm)
@@ -101,25 +101,26 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
 
 
 def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
-    """Write all objects (two per line) in their six views as a PNG, in white light if that frame is stored."""
-    samples = dataset.samples(split)
-    objects = list(dict.fromkeys(dataset.measured(sample)["object"] for sample in samples))
-    index = dataset.sequence.white if dataset.sequence.white in dataset.manifest.stored_frames else 0
+    """Write all objects (two per line) in all their views as a PNG, in white light if that frame is stored."""
+    views: dict[str, list[str]] = {}
+    for sample in dataset.samples(split):
+        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    white, (single,) = dataset.sequence.white, dataset.sequence.config("single_shot")
+    index = white if white in dataset.manifest.stored_frames and white is not None else single
+    height, width = dataset.size
+    tile_px = tuple(max(1, _TILE_PX * side // max(width, height)) for side in (width, height))
     label_px, columns = 18, 2
-    line_px = _TILE_PX + label_px
-    lines = -(-len(objects) // columns)
-    width = len(VIEWS) * _TILE_PX
-    sheet = np.full((lines * line_px, columns * width + 8), 255, dtype=np.uint8)
-    for number, name in enumerate(objects):
-        top, left = (number // columns) * line_px, (number % columns) * (width + 8)
-        for view_number, view in enumerate(VIEWS):
-            sample = sample_name(name, view)
-            if sample not in samples:
-                continue
-            tile = cv2.resize(dataset.frame(sample, index), (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
-            column = left + view_number * _TILE_PX
-            sheet[top + label_px : top + line_px, column : column + _TILE_PX] = cv2.convertScaleAbs(tile, alpha=1.4)
-        title = f"{name} ({dataset.split_of_sample(sample_name(name, VIEWS[0]))})"
+    line_px = tile_px[1] + label_px
+    lines = -(-len(views) // columns)
+    column_px = max(map(len, views.values())) * tile_px[0]
+    sheet = np.full((lines * line_px, columns * column_px + 8), 255, dtype=np.uint8)
+    for number, (name, samples) in enumerate(views.items()):
+        top, left = (number // columns) * line_px, (number % columns) * (column_px + 8)
+        for view_number, sample in enumerate(samples):
+            tile = cv2.resize(dataset.frame(sample, index), tile_px, interpolation=cv2.INTER_AREA)
+            column = left + view_number * tile_px[0]
+            sheet[top + label_px : top + line_px, column : column + tile_px[0]] = cv2.convertScaleAbs(tile, alpha=1.4)
+        title = f"{name} ({dataset.split_of_sample(samples[0])})"
         cv2.putText(sheet, title, (left + 4, top + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
     encoded, png = cv2.imencode(".png", sheet)
     if not encoded:

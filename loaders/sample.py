@@ -10,7 +10,8 @@ configuration opens only the files it needs:
     vertical    the vertical sinusoids                                             frames/<split>/vertical-*.arrow
     codes       Gray code, black, white                                            frames/<split>/codes-*.arrow
 
-The ``data`` group alone is the `single_shot` configuration, which plain ``datasets`` can open without this package.
+With a sequence of another kind than the paper's, the first of its finest fringes takes the place of frame_00. The
+``data`` group alone is the `single_shot` configuration, which plain ``datasets`` can open without this package.
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.optics import CONFIGS, Sequence
+from fpp_ml_bench.constants import CONFIGS
+from fpp_ml_bench.optics import DIRECTIONS, AnySequence
 
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")
@@ -28,6 +30,7 @@ DEPTH, DEPTH_EXACT, FLAGS, COVER = "depth", "depth_exact", "flags", "cover"
 DEPTHS, PIXEL_MAPS = (DEPTH, DEPTH_EXACT), (FLAGS, COVER)
 RANGE = ("depth_min", "depth_max")
 SINGLE_SHOT_FRAME = 0
+"""The single-shot input of the paper's sequence."""
 
 
 class Flag(IntFlag):
@@ -65,41 +68,41 @@ class Row:
     cover: NDArray[np.uint8] | None = None
 
 
-def stored_groups(sequence: Sequence, stored: str) -> dict[str, tuple[int, ...]]:
+def stored_groups(sequence: AnySequence, stored: str) -> dict[str, tuple[int, ...]]:
     """Column groups of a dataset that stores configuration ``stored``: group name -> frame indices, in file order."""
-    indices = set(sequence.config(stored))
-    groups = {
-        DATA_GROUP: (SINGLE_SHOT_FRAME,),
-        "horizontal": tuple(i for i in sequence.sinusoids("horizontal") if i != SINGLE_SHOT_FRAME),
-        "vertical": tuple(sequence.sinusoids("vertical")),
-        "codes": tuple(range(2 * sequence.steps, len(sequence))),
-    }
-    return {name: frames for name, frames in groups.items() if name == DATA_GROUP or indices.issuperset(frames)}
+    indices, first = set(sequence.config(stored)), sequence.config("single_shot")
+    groups = {DATA_GROUP: first}
+    for direction in DIRECTIONS:
+        groups[direction] = tuple(i for i in sequence.sinusoids(direction) if i not in first)
+    placed = {i for frames in groups.values() for i in frames}
+    groups["codes"] = tuple(i for i in range(len(sequence)) if i not in placed)
+    return {name: f for name, f in groups.items() if name == DATA_GROUP or (f and indices.issuperset(f))}
 
 
-def stored_frames(sequence: Sequence, stored: str) -> tuple[int, ...]:
-    """Frame indices on disk, ascending: the frames of the configuration, and always frame 0."""
+def stored_frames(sequence: AnySequence, stored: str) -> tuple[int, ...]:
+    """Frame indices on disk, ascending: those of the configuration, and always the one of `single_shot`."""
     return tuple(sorted(i for frames in stored_groups(sequence, stored).values() for i in frames))
 
 
-def available_configs(sequence: Sequence, stored: str) -> tuple[str, ...]:
+def available_configs(sequence: AnySequence, stored: str) -> tuple[str, ...]:
     """Configurations that can be read from a dataset storing ``stored``."""
     available = set(stored_frames(sequence, stored))
-    return tuple(config for config in CONFIGS if available.issuperset(sequence.config(config)))
+    frames = {config: sequence.config(config) for config in CONFIGS}
+    return tuple(config for config in CONFIGS if frames[config] and available.issuperset(frames[config]))
 
 
-def row_columns(sequence: Sequence, frames: tuple[int, ...], exact: bool) -> list[str]:
+def row_columns(sequence: AnySequence, frames: tuple[int, ...], exact: bool) -> list[str]:
     """Columns of a table with ``frames``, in order: labels, frames, depths, range."""
     names = [sequence.frames[i].column for i in frames]
     return [*LABELS, *names, DEPTH, *([DEPTH_EXACT, *PIXEL_MAPS] if exact else []), *RANGE]
 
 
-def config_columns(sequence: Sequence, config: str, exact: bool) -> list[str]:
+def config_columns(sequence: AnySequence, config: str, exact: bool) -> list[str]:
     """Column names of a configuration, in order."""
     return row_columns(sequence, sequence.config(config), exact)
 
 
-def group_columns(sequence: Sequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
+def group_columns(sequence: AnySequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
     """Column names of a group's files, in order."""
     if group == DATA_GROUP:
         return row_columns(sequence, frames, exact)

@@ -9,12 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.constants import CONFIGS, GREY_LEVELS
 from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import njit, numba_enabled
-from fpp_ml_bench.optics import CONFIGS
 
 
 class FringeDepth(NamedTuple):

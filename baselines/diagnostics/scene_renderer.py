@@ -219,7 +219,7 @@ class SceneRenderer:
     @cached_property
     def _empty(self) -> render.LitPixels:
         x, y = (rays.ravel() for rays in self.rig.camera.rays())
-        points_m = np.column_stack([x, y, np.ones_like(x)]) * self.rig.background_m
+        points_m = np.column_stack([x, y, np.ones_like(x)]) * self.rig.background
         return self._lit(points_m, np.broadcast_to([0.0, 0.0, -1.0], points_m.shape))
 
     def light(self, surface: Surface) -> render.LitPixels:

@@ -11,8 +11,7 @@ from fpp_ml_bench.baselines.networks.base import torch_threads
 from fpp_ml_bench.baselines.networks.model import Model
 from fpp_ml_bench.baselines.training import Loss
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import PAPER_SEQUENCE
-from fpp_ml_bench.optics import Sequence as FrameSequence
+from fpp_ml_bench.optics import PAPER_SEQUENCE, AnySequence
 
 DepthRange = Literal["oracle", "predicted", "mean"]
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
@@ -34,13 +33,19 @@ class NetworkMethod(Method):
 
     def __init__(
         self, model: Model, depth_range: DepthRange | None = None, frame: int | None = None, threads: int = 1,
-        sequence: FrameSequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
+        sequence: AnySequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
     ) -> None:  # fmt: skip
         config = self.weights_config = model.config
         self.model, self.threads = model, threads
         self.name, self.device, self.parameters = config.name, str(model.device), model.parameters
         self.depth_range = _checked_range(model, depth_range)
-        usual_frame = sequence.config(config.data_config)[0]
+        trained_frames = sequence.config(config.data_config)
+        if not trained_frames:
+            raise PredictionError(
+                f"{config.name}: was trained on {config.data_config} fringes, and this rig projects "
+                f"{' and '.join(sequence.directions)} ones only; use weights that were trained on its fringes"
+            )
+        usual_frame = trained_frames[0]
         self.frame = usual_frame if frame is None else frame
         if not 0 <= self.frame < len(sequence):
             raise PredictionError(f"frame {frame}: expected 0 to {len(sequence) - 1}, the frames of the sequence")

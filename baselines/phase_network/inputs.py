@@ -83,9 +83,12 @@ class Geometry:
     rotation: Rotation
 
     @classmethod
-    def of(cls, rig: Rig, settings: phase_route.Settings) -> "Geometry":
-        route = phase_route.PhaseRoute(rig, settings)
-        return cls(rig, route, Rotation.of(route.layer, settings.direction))
+    def of(
+        cls, rig: Rig, settings: phase_route.Settings, periods: phase_route.Periods | None = None
+    ) -> "Geometry":  # fmt: skip
+        """As `phase_route.PhaseRoute`: ``rig`` of the geometry is that of the images resampled to ``periods``."""
+        route = phase_route.PhaseRoute(rig, settings, periods=periods)
+        return cls(route.rig, route, Rotation.of(route.layer, settings.direction))
 
     @property
     def layer(self) -> CalibrationLayer:

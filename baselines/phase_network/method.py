@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks import torch_threads
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_route import Measurement, Settings
+from fpp_ml_bench.baselines.phase_route import Measurement, Periods, Settings
 from fpp_ml_bench.baselines.training import PHASE_NETWORKS, NetConfig, read_file, weights_path, write_file
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError, WeightsError
 from fpp_ml_bench.files import printable
@@ -19,7 +19,9 @@ from fpp_ml_bench.optics import Direction, Rig
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "phase-net"
-PERIOD_TOLERANCE = 2.2  # factor by which an image's fringe period in px may differ from that of the training images
+PERIOD_TOLERANCE = 2.2
+"""Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
+resampled to theirs."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,7 @@ class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
     ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects;
     ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
-    for weights that can't be used, and `PredictionError` for an invalid option and for a rig whose fringe period in the
-    image is far from that of the training data."""
+    for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
     target = "depth"
@@ -83,21 +84,18 @@ class PhaseNetMethod(Method):
         self.file = weights if isinstance(weights, NetFile) else load_net(weights)
         self.rig, self.threads = rig, threads
         trained_period_px = self.file.config.period_px.get(direction)
-        image_period_px = rig.image_px_per_period(direction)
         if trained_period_px is None:
             raise PredictionError(
                 f"{self.file.path}: learned from {', '.join(self.file.config.period_px)} fringes only, not from "
                 f"{direction} ones; use other weights, or the measured route (phase)"
             )
-        if not trained_period_px / PERIOD_TOLERANCE < image_period_px < trained_period_px * PERIOD_TOLERANCE:
-            raise PredictionError(
-                f"{self.file.path}: learned from {direction} fringes of {trained_period_px:.1f} px a period in the "
-                f"image, this rig's have {image_period_px:.1f} px, beyond a factor of {PERIOD_TOLERANCE}; train "
-                "weights for it (fpp-bench train phase-net), or use the measured route (phase)"
-            )
+        bounds = trained_period_px / PERIOD_TOLERANCE, trained_period_px * PERIOD_TOLERANCE
+        periods = Periods(bounds[0], trained_period_px, bounds[1])
         config = self.file.config
         route_levers = levers or Levers(shading=shading)
-        self.route = NetworkRoute(rig, self.options, self.file.network, config.threshold, route_levers, config.lead)
+        self.route = NetworkRoute(
+            rig, self.options, self.file.network, config.threshold, route_levers, config.lead, periods
+        )
         self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.frames_used = (rig.sequence.sinusoids(direction)[0],)
@@ -116,7 +114,8 @@ class PhaseNetMethod(Method):
             return self.route.measure(self._image(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.geometry.route.observe(self._image(frames)).crop
+        route = self.route.geometry.route
+        return route.resampling.captured_crop(route.observe(self._image(frames)).crop)
 
     def _image(self, frames: Frames) -> NDArray[np.uint8]:
         (index,) = self.frames_used

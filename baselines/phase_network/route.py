@@ -92,14 +92,16 @@ class AnsweredObservation:
 
 
 class NetworkRoute:
-    """One rig, one fringe direction, one network."""
+    """One rig, one fringe direction, one network; images whose fringe period is beyond ``periods`` are resampled. An
+    image whose brightness nothing calibrates (`phase_route.EmptyScene`) is measured without the network: what it learnt
+    of order and mask rests on the brightness of a lit background."""
 
     def __init__(
         self, rig: Rig, settings: Settings, network: PhaseNet, threshold: float = 0.0, levers: Levers | None = None,
-        lead: float = 0.0,
+        lead: float = 0.0, periods: phase_route.Periods | None = None,
     ) -> None:  # fmt: skip
         self.levers = levers or Levers()
-        self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading))
+        self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading), periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 
     def measure(self, image: NDArray[np.uint8]) -> Measurement:
@@ -113,7 +115,7 @@ class NetworkRoute:
         base, margin = geometry.route.choose(observation)
         observation.watch.done("order")
         scene = answers = None
-        if observation.inside.any():
+        if observation.background.calibrated and observation.inside.any():
             scene = Scene.of(observation, base)
             answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
             observation.watch.done("network")

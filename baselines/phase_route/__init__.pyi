@@ -22,4 +22,5 @@ from .orders import of_choice as of_choice
 from .orders import repeated as repeated
 from .orders import spread_over_pixels as spread_over_pixels
 from .orders import stride_of as stride_of
+from .resampling import Periods as Periods
 from .route import PhaseRoute as PhaseRoute

@@ -13,12 +13,15 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mas
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import disk
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Observation, Reason, Settings
+from fpp_ml_bench.coding import MIN_MODULATION, phase_weights
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION, phase_weights
 
 LEAST_MARGIN = 0.1
 """Least margin of an order that is not ambiguous; 1 is the margin of brightness that rules the rival order out."""
 MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
+MISFIT_SHARE, UNKNOWN_MISFIT_SHARE = 0.3, 0.75
+"""Phase error of a local fit as a share of its relative misfit: on the benchmark's objects, and where no known
+background shows, so that light and surface may be any (a real skull, `docs/phase_route.md`)."""
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
 """Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""
@@ -31,7 +34,8 @@ def fit_uncertainty_rad(
     """Expected error of the phase of a local fit to the first frame, in rad, float32 (h, w); order aside."""
     background = capture.background
     bright = np.maximum(fit.brightness, 0.5)
-    misfit = (capture.greys[0] - background.ambient_grey - bright * (1 + np.cos(fit.phase_rad))) * inside
+    fringe = np.cos(fit.phase_rad) if fit.contrast == 1 else np.float32(fit.contrast) * np.cos(fit.phase_rad)
+    misfit = (capture.greys[0] - background.ambient_grey - bright * (1 + fringe)) * inside
     power = window.moment((misfit * misfit).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
     # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not average.
     averaged = background.noise_grey**2 / (2 * np.pi * window.sigma_px**2 * np.maximum(fit.weight, 0.05))
@@ -39,7 +43,8 @@ def fit_uncertainty_rad(
     sigma_phase = np.sqrt(averaged + systematic) / bright
     steep = np.hypot(*slopes)
     rim = np.clip(1 - fit.weight, 0, 1)
-    return sigma_phase * (0.3 + rim) + steep * rim  # type: ignore[return-value]  # float32 all through
+    share = MISFIT_SHARE if background.shown else UNKNOWN_MISFIT_SHARE
+    return sigma_phase * (share + rim) + steep * rim  # type: ignore[return-value]  # float32 all through
 
 
 def pixel_uncertainty_rad(capture: Capture, fit: FringeFit, mean_grey: Image) -> Image:

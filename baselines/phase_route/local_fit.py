@@ -18,12 +18,19 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wr
 WINDOW_SIGMAS = 3.0
 RIDGE = 1e-6  # of the window's weight, added to the diagonal: fits of a few pixels stay finite
 LARGEST_STEP_RAD = 0.7  # largest correction of the second fit: beyond it the linear model does not hold
+WHOLE_WINDOW = 0.9  # share of a window that lies on the object, of the pixels on which contrast is measured
+LEAST_CONTRAST = 0.3
 STEEPEST_RAD_PER_PX = 0.5
 """Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
 
 
+PLANE = ((0, 0), (1, 0), (0, 1))
+"""Powers of x and y of the terms of a brightness that changes evenly across a window."""
+CURVED = (*PLANE, (2, 0), (1, 1), (0, 2))
+
+
 class Window:
-    """A Gaussian of ``sigma_px`` and its first and second moments, for `cv2.sepFilter2D`."""
+    """A Gaussian of ``sigma_px`` and its moments up to the fourth, for `cv2.sepFilter2D`."""
 
     def __init__(self, sigma_px: float) -> None:
         half = int(np.ceil(WINDOW_SIGMAS * sigma_px))
@@ -31,22 +38,31 @@ class Window:
         weight = np.exp(-0.5 * t * t)
         weight /= weight.sum()
         self.sigma_px = sigma_px
-        self._kernels = [(weight * t**power).astype(np.float64) for power in range(3)]
+        self._kernels = [(weight * t**power).astype(np.float64) for power in range(2 * max(map(max, CURVED)) + 1)]
 
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
-        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image."""
+        """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image. In
+        the image's precision, single or double."""
         kernels = self._kernels
-        return cv2.sepFilter2D(image, cv2.CV_32F, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
+        return cv2.sepFilter2D(image, -1, kernels[along_x], kernels[along_y], borderType=cv2.BORDER_CONSTANT)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class FringeFit:
     """``phase_rad`` float32 (H, W), not wrapped: carrier plus correction; ``brightness`` g, grey levels (a white
-    pattern's is twice as much); ``weight``: share of the window that lies on the object."""
+    pattern's is twice as much); ``weight``: share of the window that lies on the object; ``contrast`` of the fringes,
+    modulation over mean."""
 
     phase_rad: Image
     brightness: Image
     weight: Image
+    contrast: float = 1.0
+
+    @property
+    def light(self) -> Image:
+        """Grey levels (H, W) of the fitted fringe, without the ambient light, in the first frame."""
+        fringe = np.cos(self.phase_rad) if self.contrast == 1 else np.float32(self.contrast) * np.cos(self.phase_rad)
+        return np.maximum(self.brightness, 0) * (1 + fringe)
 
 
 def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
@@ -69,8 +85,9 @@ def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
     return right
 
 
-def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window) -> Image:
-    """Phase in rad, float32 (H, W), from the five-term fit of ``grey`` around each pixel; use it inside only."""
+def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window) -> tuple[Image, Image]:
+    """Phase in rad and modulation in grey levels, float32 (H, W), from the five-term fit of ``grey`` around each pixel;
+    use them inside only."""
     weight = inside.astype(np.float32)
     light = grey * weight
     cosine, sine = np.cos(carrier_rad).astype(np.float32), np.sin(carrier_rad).astype(np.float32)
@@ -85,33 +102,44 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
         [w00 - cc],
     ]
     answer = solve_symmetric(rows, [m(light), m(light, 1, 0), m(light, 0, 1), m(light * cosine), m(light * sine)])
-    return (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
+    phase: Image = (carrier_rad + np.arctan2(-answer[4], answer[3])).astype(np.float32)
+    return phase, np.hypot(answer[3], answer[4])
 
 
 def fringe_fit(
     greys: Sequence[Image], inside: Mask, carrier_rad: Image, ambient: float, window: Window,
-    shifts_rad: Sequence[float],
+    shifts_rad: Sequence[float], contrast: float = 1.0, terms: Sequence[tuple[int, int]] = PLANE,
 ) -> FringeFit:  # fmt: skip
-    """Fit of g (1 + cos(carrier + shift + d)), g a plane, around each pixel of ``greys``, float32 (H, W) each: one
-    image, or several whose fringes are shifted by ``shifts_rad``."""
-    weight = inside.astype(np.float32)
+    """Fit of g (1 + c cos(carrier + shift + d)), g of the ``terms`` and c the ``contrast``, around each pixel of
+    ``greys``, float32 (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
+    # The moments of more terms than a plane's are too much alike for the elimination in single precision.
+    real: type = np.float32 if len(terms) <= len(PLANE) else np.float64
+    weight: NDArray = inside.astype(real)
+    rr: NDArray
     rr = rs = ss = lr = ls = np.zeros_like(weight)
     for grey, shift in zip(greys, shifts_rad, strict=True):
-        angle = carrier_rad + np.float32(shift)
-        light = (grey - np.float32(ambient)) * weight
-        raised, sine = 1 + np.cos(angle), np.sin(angle)
+        angle = carrier_rad.astype(real) + real(shift)
+        light = (grey - real(ambient)) * weight
+        raised, sine = 1 + real(contrast) * np.cos(angle), real(contrast) * np.sin(angle)
         rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
         lr, ls = lr + light * raised, ls + light * sine
     m = window.moment
-    rows = [
-        [m(rr), m(rr, 1, 0), m(rr, 0, 1), m(rs)],
-        [m(rr, 2, 0), m(rr, 1, 1), m(rs, 1, 0)],
-        [m(rr, 0, 2), m(rs, 0, 1)],
-        [m(ss)],
-    ]
-    g, _, _, s = solve_symmetric(rows, [m(lr), m(lr, 1, 0), m(lr, 0, 1), m(ls)])
+    rows = [[m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)] for i, (a, b) in enumerate(terms)] + [[m(ss)]]
+    g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
     step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-    return FringeFit((carrier_rad + step).astype(np.float32), g, m(weight))
+    phase, share = (carrier_rad + step).astype(np.float32), m(weight).astype(np.float32)
+    return FringeFit(phase, g.astype(np.float32), share, contrast)
+
+
+def measured_contrast(light: Image, inside: Mask, fit: FringeFit) -> float:
+    """Modulation over mean of the fringes of ``light`` (grey levels less the ambient light), over the pixels whose
+    window lies on the object: the contrast with which the phase and brightness of ``fit`` explain them best."""
+    fringe, whole = np.cos(fit.phase_rad), inside & (fit.weight > WHOLE_WINDOW)
+    varies = np.clip(light / np.maximum(fit.brightness, 1.0) - 1, -1, 1)
+    power = float((fringe**2).sum(where=whole, dtype=np.float64))
+    if power == 0:
+        return fit.contrast
+    return float(np.clip((fringe * varies).sum(where=whole, dtype=np.float64) / power, LEAST_CONTRAST, 1.0))
 
 
 def phase_slopes(residual_rad: Image, inside: Mask, smooth_px: float) -> tuple[Image, Image]:

@@ -7,13 +7,15 @@ expected error, from its phase and from its order. While that error is too large
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Settings
+from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.decoding import decode_stack
@@ -26,13 +28,30 @@ ORDER_SHARE = (0.16, 0.10, 0.05)
 that it is wrong; these factors correct that."""
 
 
+def read_mask(file: str | Path, rig: Rig) -> NDArray[np.bool_]:
+    """Object mask bool (H, W) of ``rig``'s camera from an image file, its pixels above 0. Raises `PredictionError` for
+    a file that is no image, has another size, or shows no object."""
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if Path(file).is_file() else None
+    shape = rig.camera.height, rig.camera.width
+    if image is None:
+        raise PredictionError(f"mask {file}: expected an image file (PNG) whose pixels above 0 are object")
+    if image.shape != shape:
+        raise PredictionError(
+            f"mask {file}: expected the size of the captured images, {shape} (H, W), got {image.shape}"
+        )
+    if not image.any():
+        raise PredictionError(f"mask {file}: shows no object: all pixels are 0")
+    return image > 0  # type: ignore[no-any-return]
+
+
 class PhaseMethod(Method):
-    """Depth from one or more sinusoids of one direction; options are those of `Settings`. Raises `PredictionError` for
-    an unknown option or an invalid value."""
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: an image file of
+    the camera's size whose pixels above 0 are object in every sample, instead of the route's own mask. Raises
+    `PredictionError` for an unknown option, an invalid value, and a mask that can't be used."""
 
     name = "phase"
 
-    def __init__(self, rig: Rig, **options: Any) -> None:
+    def __init__(self, rig: Rig, mask: str | Path | None = None, **options: Any) -> None:
         try:
             settings = Settings(**options)
         except TypeError as error:
@@ -44,14 +63,15 @@ class PhaseMethod(Method):
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
         cues = ["range"] + ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
         self.title = f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
-        self.settings = asdict(settings)
+        self.mask = None if mask is None else read_mask(mask, rig)
+        self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        return self.route.measure(self._images(frames))
+        return self.route.measure(self._images(frames), self.mask)
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.observe(self._images(frames)).crop
+        return self.route.resampling.captured_crop(self.route.observe(self._images(frames), self.mask).crop)
 
     def _images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = []
@@ -84,7 +104,8 @@ class Look:
 
     @classmethod
     def of(cls, measurement: Measurement, count: int) -> "Look":
-        on_object = measurement.depth_mm > 0
+        # A pixel without a depth because its order is ambiguous is what more frames are for.
+        on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
         if not on_object.any():
             return cls(count, False, 0.0, 0.0)
         order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))

@@ -1,4 +1,4 @@
-"""The object mask: pixels whose grey level the empty scene does not explain.
+"""The object mask: pixels whose grey level the empty scene does not explain; where none is known, modulated pixels.
 
 Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
 is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete,
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Image, Mask
+from fpp_ml_bench.coding import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import MIN_MODULATION
 from fpp_ml_bench.optics import Rig
 
 Crop = tuple[slice, slice]
@@ -25,6 +25,9 @@ LEAST_SHARE = 0.02  # of the image's tiles that must show background for the ima
 STRENGTH_TOLERANCE = 0.4
 """Relative deviation of the lamp's strength in an image from a strength that the user gives. A surface in the working
 range whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+LEAST_EXPLAINED = 0.5
+"""Least share of the variance of the tiles' grey levels that one plane must explain. A dark tile in which nothing is to
+be seen misfits no prediction; a plane that is there explains 0.8 and more even where it is as dim as noise."""
 SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
 DARK_PERCENTILE = 1.0  # of the grey levels of an image without background that is taken for its ambient light
 SAMPLE_STEP_PX = 5
@@ -33,6 +36,9 @@ DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measur
 DIFFERENT_SIGMAS = 3.5
 """A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
+RING_PERIODS = 0.14
+"""Distance from the first mask's silhouette within which a pixel may change between object and background."""
+LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
 OBJECT_BONUS = 4.0  # added to the plane's squared misfit, in sigmas: a pixel that both predictions explain is object
 UNLIT_PERIODS = 0.8
 UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts as unlit
@@ -60,6 +66,11 @@ class Background:
         return bool(np.isfinite(self.strength))
 
     @property
+    def shown(self) -> bool:
+        """Whether the image shows the background plane, so that what differs from it is object."""
+        return self.share > 0
+
+    @property
     def different(self) -> Mask:
         """Pixels (H, W) whose own grey level the empty scene does not explain."""
         return np.abs(self.residual) > DIFFERENT_SIGMAS * self.noise_grey
@@ -70,8 +81,9 @@ class EmptyScene:
     calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
     pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
     calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
-    range, and of a surface in ambient light alone. Without them an image that does not show the plane is not
-    calibrated: everything brighter than its darkest pixels is object there, and brightness tells no distance."""
+    range, and of a surface in ambient light alone. Without them an image that does not show the plane, or
+    whose rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object there
+    (`modulated_region`)."""
 
     def __init__(
         self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float | None,
@@ -80,8 +92,10 @@ class EmptyScene:
         self.ambient_grey = ambient_grey
         self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
         self._rays = rig.camera.rays()
-        self._phase = layer.absolute_phase(rig.background_m * MM_PER_M)
-        self._fall_off = plane_irradiance(rig, rig.background_m)
+        # Without a known background nothing is predicted, and no image shows it.
+        depth_m = np.nan if rig.background_m is None else rig.background_m
+        self._phase = layer.absolute_phase(depth_m * MM_PER_M)
+        self._fall_off = plane_irradiance(rig, depth_m)
         self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
         self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
         self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
@@ -147,7 +161,10 @@ class EmptyScene:
         count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(ascending.size)
         first = int(count.argmax())
         typical = float(np.median(ascending[first : first + count[first]]))
-        return plane_tiles & (np.abs(slope / typical - 1) < 0.15)
+        plane_tiles &= np.abs(slope / typical - 1) < 0.15
+        shown = (square - mean**2)[plane_tiles].sum()
+        unexplained = (misfit[plane_tiles] ** 2).sum()
+        return plane_tiles if unexplained < (1 - LEAST_EXPLAINED) * shown else np.zeros_like(plane_tiles)
 
 
 def image_noise_grey(image: NDArray) -> float:
@@ -199,11 +216,34 @@ def object_region(background: Background, period_px: float) -> Mask:
     return closed(background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2)
 
 
+def modulated_region(grey: Image, modulation: Image, background: Background, period_px: float) -> Mask:
+    """First mask (H, W) of an image that shows no known background: pixels with a fringe, by ``modulation`` in grey
+    levels (`local_fit.carrier_fit`), whose stripes are also as bright as such a fringe: the window of ``modulation``
+    reaches a third of a period beyond the silhouette, closing the stripes does not."""
+    bright = stripes_filled(grey, period_px) > background.ambient_grey + 2 * MIN_MODULATION
+    region = (modulation > MIN_MODULATION) & bright
+    return closed(region, 1, LEAST_AREA_PERIODS * period_px**2)
+
+
+def stripes_filled(grey: Image, period_px: float) -> Image:
+    """The envelope of bright stripes: ``grey`` (H, W) closed over most of a period."""
+    size = 2 * round(UNLIT_PERIODS * period_px / 2) + 1
+    square = np.ones((size, size), np.uint8)
+    return cv2.morphologyEx(grey, cv2.MORPH_CLOSE, square, borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+
+
 def unlit(grey: Image, background: Background, period_px: float) -> Mask:
     """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first."""
-    size = 2 * round(UNLIT_PERIODS * period_px / 2) + 1
-    filled = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return filled < background.ambient_grey + UNLIT_SIGMAS * background.noise_grey
+    return stripes_filled(grey, period_px) < background.ambient_grey + UNLIT_SIGMAS * background.noise_grey
+
+
+def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: float) -> Mask:
+    """Pixels (H, W) around which the ``predicted`` grey levels of the object's fringe are seen: not a dark hollow in it
+    into which only the fit's window reaches."""
+    sigma_px = RING_PERIODS * period_px
+    light = predicted - np.float32(ambient_grey)
+    misfit, power = (cv2.GaussianBlur(v * v, (0, 0), sigma_px) for v in (grey - predicted, light))
+    return misfit < LARGEST_MISFIT * power  # type: ignore[no-any-return]
 
 
 def refined(

@@ -32,7 +32,7 @@ class Settings:
     ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
     more. ``slack_mm`` widens the working range for noise at its ends. ``white_grey`` and ``ambient_grey``, if given,
     calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
-    shows none, every pixel with several possible orders is ambiguous.
+    shows none, range and continuity settle the order, or it is ambiguous and has no depth (see `continuity`).
     """
 
     direction: Direction = "horizontal"

@@ -9,9 +9,31 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import confidence, orders, several_frames
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Candidates, Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, carrier_fit, fringe_fit, phase_slopes
-from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, Crop, EmptyScene, object_region, refined, unlit
+from fpp_ml_bench.baselines.phase_route.continuity import margin_by_range
+from fpp_ml_bench.baselines.phase_route.local_fit import (
+    CURVED,
+    FringeFit,
+    Window,
+    carrier_fit,
+    fringe_fit,
+    measured_contrast,
+    phase_slopes,
+)
+from fpp_ml_bench.baselines.phase_route.object_mask import (
+    DARKEST_GREY,
+    RING_PERIODS,
+    Background,
+    Crop,
+    EmptyScene,
+    explained,
+    modulated_region,
+    object_region,
+    refined,
+    unlit,
+)
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Measurement, Observation, Reason, Settings, Watch
+from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
+from fpp_ml_bench.coding import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
@@ -19,28 +41,41 @@ from fpp_ml_bench.optics import Rig
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
-RING_PERIODS = 0.14
-"""Distance from the first mask's silhouette within which a pixel may change between object and background."""
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
+CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
 PAIR_ROUNDS = 2  # fits to two frames over the small window
+MOST_SLACK_PERIODS = 0.07
+"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, whose `Settings.slack_mm` is
+15, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
 
 
 class PhaseRoute:
-    """The route for one rig and one fringe direction; ``chooser`` decides the orders (default: without learning)."""
+    """The route for one rig and one fringe direction; ``chooser`` decides the orders (default: without learning).
+    Images whose fringe period is beyond ``periods`` are resampled: then `rig`, `layer` and `period_px` are those of the
+    resampled images, which an `Observation` is of; images, masks and the `Measurement` have the captured size."""
 
     def __init__(
-        self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness
-    ) -> None:
-        self.rig, self.settings, self.chooser = rig, (settings := settings or Settings()), chooser
-        self.layer = CalibrationLayer.of(rig, settings.direction)
-        self.period_px = rig.image_px_per_period(settings.direction)
+        self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness,
+        periods: Periods | None = None,
+    ) -> None:  # fmt: skip
+        settings, self.chooser = settings or Settings(), chooser
         rig.check_sampling()
+        self.resampling = Resampling.of(rig, settings.direction, periods or Periods())
+        self.captured_layer = self.layer = CalibrationLayer.of(rig, settings.direction)
+        self.rig = rig = self.resampling.rig
+        if self.resampling.needed:
+            self.layer = CalibrationLayer.of(rig, settings.direction)
+        (near, far), periods_in_range = rig.working_range_mm, rig.periods_in_range(settings.direction)
+        most_slack_mm = MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
+        self.settings = settings = replace(settings, slack_mm=min(settings.slack_mm, most_slack_mm))
+        self.period_px = rig.image_px_per_period(settings.direction)
         self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
         self._windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
-        self.steps = several_frames.steps_of(rig.sequence.steps, settings.frames)
-        self.shifts_rad = tuple(2 * np.pi * n / rig.sequence.steps for n in self.steps)
+        shifts_rad = rig.shifts_rad(settings.direction)
+        self.steps = several_frames.steps_of(len(shifts_rad), settings.frames)
+        self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
         if settings.frames == 2:
             self._windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
@@ -52,18 +87,23 @@ class PhaseRoute:
 
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask, phase and candidate orders of captured fringes; arguments as of `measure`."""
-        images = self._checked(image)
+        images = [self.resampling.image(frame) for frame in self._checked(image)]
         watch = Watch()
         background = self._scene.fit(images[0])
         watch.done("background")
-        region = object_region(background, self.period_px) if mask is None else mask
+        if mask is not None:
+            region = self.resampling.mask(mask)
+        elif background.shown:
+            region = object_region(background, self.period_px)
+        else:
+            region = self._modulated(images[0].astype(np.float32), background)
         crop = self._crop(region)
         watch.done("mask")
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         plane, layer = replace(background, residual=background.residual[crop]), self.layer.at(crop)
         capture = Capture(self.rig, self.period_px, images[0].shape, crop, greys, self.shifts_rad, plane, layer, watch)
         if capture.pixelwise:
-            given = None if mask is None else mask[crop]
+            given = None if mask is None else region[crop]
             inside, fit, mean_grey = several_frames.pixel_fits(capture, self._scene, given, self._windows[1])
         else:
             inside, fit = self._local_fits(capture, region[crop], given=mask is not None)
@@ -103,7 +143,7 @@ class PhaseRoute:
                 f"{np.shape(order)} and {np.shape(margin)}"
             )
         if not observation.background.calibrated:  # no evidence about the order, whatever the chooser preferred
-            margin = np.where(observation.candidates.count > 1, 0.0, margin).astype(np.float32)
+            margin = margin_by_range(observation, order)
         watch.done("order")
         depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
         depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
@@ -111,6 +151,8 @@ class PhaseRoute:
         error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
         sureness = (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)
         reason = confidence.reasons(observation, margin, sureness, depth_mm, self.settings)
+        if not observation.background.calibrated:
+            depth_mm[margin == 0] = 0.0  # a guess
         watch.done("confidence")
 
         def paste(part: NDArray, dtype: type, outside: float) -> NDArray:
@@ -131,13 +173,18 @@ class PhaseRoute:
             reason=reasons, counts={code.name.lower(): int(counts[code]) for code in Reason},
             background_share=observation.background.share, seconds=watch.seconds,
         )  # fmt: skip
+        if self.resampling.needed:
+            (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
+            layers = self.layer, self.captured_layer
+            measurement = self.resampling.restored(measurement, *layers, (near - slack, far + slack))
         watch.done("depth")
         return measurement
 
     def _checked(self, image: Frames) -> list[NDArray[np.uint8]]:
         """The frames, as many as the settings say."""
         images = [image] if isinstance(image, np.ndarray) and image.ndim == 2 else list(image)
-        shape = (self.rig.camera.height, self.rig.camera.width)
+        captured = self.resampling.captured.camera
+        shape = (captured.height, captured.width)
         if len(images) != len(self.steps):
             raise DecodeError(f"expected {len(self.steps)} fringes, those of steps {self.steps}, got {len(images)}")
         for frame in images:
@@ -163,21 +210,47 @@ class PhaseRoute:
         if not given:
             dark = unlit(np.maximum.reduce(greys), background, self.period_px)
             if len(greys) > 1:
-                region = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+                differs = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+                region = differs if background.shown else region & differs
             inside = region & ~dark
             watch.done("mask")
-        phase = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
+        phase, _ = carrier_fit(greys[0], inside, self._carrier[capture.crop], self._windows[0])
         for window in self._windows[1:]:
             fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, capture.shifts_rad)
             phase = fit.phase_rad
+        if not background.calibrated:
+            inside, fit = self._free_fits(capture, inside, fit, given)
         watch.done("phase")
         if given:
             return inside, fit
         if len(greys) == 1:
             bright = np.maximum(fit.brightness, 0)
-            predicted = (background.ambient_grey + bright * (1 + np.cos(fit.phase_rad))).astype(np.float32)
+            predicted = (background.ambient_grey + fit.light).astype(np.float32)
             reach_px = RING_PERIODS * self.period_px
             inside = refined(inside, background, predicted, greys[0], FRINGE_NOISE * bright, reach_px)
-        inside = inside & ~dark & (fit.brightness > DARKEST_GREY)
+        inside = inside & ~dark & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
         watch.done("mask")
         return inside, fit
+
+    def _free_fits(self, capture: Capture, inside: Mask, fit: FringeFit, given: bool) -> tuple[Mask, FringeFit]:
+        """Object mask and fits to fringes of any contrast on surfaces of any brightness, after a ``fit`` that assumes
+        full contrast: its contrast is measured, then the fits start again, because a fit keeps the ripple of the phase
+        that it starts from."""
+        grey, ambient = capture.greys[0], capture.background.ambient_grey
+        for _ in range(CONTRAST_ROUNDS):
+            if not given:
+                inside = inside & explained(grey, np.float32(ambient) + fit.light, ambient, self.period_px)
+            contrast = measured_contrast(grey - np.float32(ambient), inside, fit)
+            light = ambient, self._windows[0], capture.shifts_rad, contrast, CURVED
+            fit = fringe_fit(capture.greys, inside, fit.phase_rad, *light)
+        phase, _ = carrier_fit(grey, inside, self._carrier[capture.crop], self._windows[0])
+        for _ in range(FREE_ROUNDS):
+            fit = fringe_fit(capture.greys, inside, phase, *light)
+            phase = fit.phase_rad
+        return inside, fit
+
+    def _modulated(self, grey: Image, background: Background) -> Mask:
+        """First mask (H, W) of an image that shows no known background."""
+        everywhere = np.ones(grey.shape, bool)
+        _, modulation = carrier_fit(grey, everywhere, self._carrier, self._windows[0])
+        return modulated_region(grey, modulation, background, self.period_px)

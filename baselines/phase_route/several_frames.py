@@ -13,7 +13,7 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, EmptyScene, closed, without_small
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Capture
-from fpp_ml_bench.decoding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.coding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import PredictionError
 
 PAIR_DEGREES = 120.0
@@ -86,6 +86,8 @@ def lit_object(capture: Capture, scene: EmptyScene, modulation: Image) -> Mask:
     _, cosine, sine = phase_weights(capture.shifts_rad)
     sigma = capture.background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
     least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
+    if not capture.background.shown:  # nothing else tells the object
+        least_grey = MIN_MODULATION
     region = first_mask(different, capture.period_px)
     certain = region & different & (modulation > least_grey)
     side = 2 * round(CLOSING_PERIODS * capture.period_px) + 1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import decoding, optics
+from fpp_ml_bench import coding, decoding, optics
 from fpp_ml_bench.baselines.stability import cases
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, difference, wide, worst
 from fpp_ml_bench.constants import MM_PER_M
@@ -42,7 +42,7 @@ def grey(values: NDArray) -> NDArray[np.uint8]:
 
 def phase_error(frames: NDArray, deltas: NDArray | None = None) -> Floats:
     """Error in rad, on the circle, of the wrapped phase of frames of `phases`."""
-    return np.angle(np.exp(1j * (decoding.wrapped_phase(frames, deltas).phase[0] - phases())))
+    return np.angle(np.exp(1j * (coding.wrapped_phase(frames, deltas).phase[0] - phases())))
 
 
 def frame_gain(steps: int) -> float:
@@ -67,7 +67,7 @@ def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: i
     if length is not None:
         focal = device.fx * length / device.width
         device = optics.Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
-    sequence = optics.Sequence(steps, *(optics.bits_needed(side, pitch_px) for side in (device.height, device.width)))
+    sequence = optics.Sequence(steps, *(coding.bits_needed(side, pitch_px) for side in (device.height, device.width)))
     return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
@@ -77,7 +77,7 @@ def direction_levels(rig: optics.Rig, coordinate_px: NDArray, direction: optics.
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to."""
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
     waves = sinusoids(2 * np.pi * coordinate_px / pitch, rig.sequence.steps, mean, modulation)[:, 0]
-    code = optics.binary_to_gray(optics.cell_of(np.rint(coordinate_px), pitch))
+    code = coding.binary_to_gray(coding.cell_of(np.rint(coordinate_px), pitch))
     bright = (code >> np.arange(bits - 1, -1, -1)[:, None]) & 1
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
@@ -99,9 +99,9 @@ def plane_stack(rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN,
 
 def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
-    plan = decoding.plan_direction(rig, "vertical", rig.sequence.steps, decoding.Limits())
-    decoded = decoding.decode_direction(grey(levels), plan, decoding.Limits())
-    return decoded.coordinate_px - exact_px, decoded.reason != decoding.Reason.DECODED
+    plan = decoding.plain_plan(rig, "vertical", rig.sequence.steps, coding.Limits())
+    decoded = decoding.decode_direction(grey(levels), plan, coding.Limits())
+    return decoded.coordinate_px - exact_px, decoded.reason != coding.Reason.DECODED
 
 
 def _decoded(rig: optics.Rig, levels: NDArray, exact_px: NDArray, rounding_px: float | NDArray = 0.0) -> Outcome:
@@ -147,14 +147,14 @@ def modulation_exact(modulation: float, steps: int = 18) -> Outcome:
     exact = _exact_phase(frames, 2 * cases.high_precision().pi * wide(range(steps)) / steps)
     condition = (MEAN + modulation) / modulation
     bound = math.sqrt(2) * 2 * (steps + 4 * math.pi + 2) * U64 * condition + 2 * math.pi * U64
-    return worst(difference(decoding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
+    return worst(difference(coding.wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
 def _expects(modulation: float, spread: float) -> cases.Expects:
     """What is expected of a modulation that is measured within ``spread`` of its value."""
-    if abs(modulation - decoding.MIN_MODULATION) <= spread:
+    if abs(modulation - coding.MIN_MODULATION) <= spread:
         return "either"
-    return "number" if modulation > decoding.MIN_MODULATION else "refusal"
+    return "number" if modulation > coding.MIN_MODULATION else "refusal"
 
 
 @PHASE.family("modulation, 8-bit frames", "rad", modulation=MODULATIONS,
@@ -251,7 +251,7 @@ def few_steps(steps: int) -> Outcome:
 def uneven_steps(chosen: int) -> Outcome:
     """wrapped phase of this number of 18 steps, 8-bit frames; bound: asin(g' / 2B), g' = max over directions of sum
     |least-squares weight|"""
-    deltas = 2 * np.pi * np.array(decoding.choose_steps(18, chosen)) / 18
+    deltas = 2 * np.pi * np.array(coding.choose_steps(18, chosen)) / 18
     model = np.stack([np.ones(chosen), np.cos(deltas), np.sin(deltas)], axis=1)
     solve = np.linalg.inv(model.T @ model) @ model.T
     turn = np.linspace(0, np.pi, 3601)
@@ -271,14 +271,14 @@ def close_steps(spread_rad: float) -> Outcome:
     largest, _, least = map(float, np.linalg.svd(model, compute_uv=False))
     strength = float(np.linalg.norm(frames[:, 0], axis=0).max())
     bound = 8 * 3 * U64 * (largest / least) * (MEAN + 100.0) / 100.0 + 3 * U64 * strength / least / 100.0
-    error = difference(decoding.wrapped_phase(frames, deltas).phase[0], _exact_phase(frames, wide(deltas)))
+    error = difference(coding.wrapped_phase(frames, deltas).phase[0], _exact_phase(frames, wide(deltas)))
     return worst(error, bound, condition=largest / least)
 
 
 PHASE.family(
     "equal shifts", "rad", expects="refusal", refuses=DecodeError, about="weights of the shifts 0, 1, 1 rad; against "
     "there is no such phase; bound: two different shifts do not determine the phase",
-)(lambda: decoding.phase_weights([0.0, 1.0, 1.0]))  # fmt: skip
+)(lambda: coding.phase_weights([0.0, 1.0, 1.0]))  # fmt: skip
 
 
 @PHASE.family("dead frame", "mm", expects="refusal", refuses=DecodeError, steps=(18, 9, 6, 4), level=(0, 255))
@@ -324,7 +324,7 @@ def pitch(pitch_px: float) -> Outcome:
 def edge_blend(pitch_px: float, blend: float) -> Outcome:
     """coordinate of pixels that see both cells, at every edge of the code"""
     rig = coded_rig(pitch_px)
-    cells = optics.cell_count(rig.pattern_length("vertical"), pitch_px)
+    cells = coding.cell_count(rig.pattern_length("vertical"), pitch_px)
     edges = np.ceil(np.arange(1, cells) * (pitch_px / 2))
     positions_px = edges - 1 + blend  # between the last pixel of a cell and the first of the next
     levels, steps = direction_levels(rig, positions_px), rig.sequence.steps
@@ -349,13 +349,13 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
-    centres = optics.cell_centres_rad(912, 18.0)
+    centres = coding.cell_centres_rad(912, 18.0)
     cells = np.arange(len(centres), dtype=np.int32)
-    absolute, agrees = optics.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
+    absolute, agrees = coding.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
     two_pi = 2 * cases.high_precision().pi
     exact = phase_rad + two_pi * cases.by_mpmath("floor", (wide(centres) - phase_rad) / two_pi + 0.5)
     near = np.abs(exact.astype(float) - centres)
-    may_flag = float(np.mean(near > optics.INCONSISTENT_RAD - 1e-9))
+    may_flag = float(np.mean(near > coding.INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
 
@@ -368,11 +368,11 @@ def arctangent(scale: float, code: str) -> Outcome:
     cosine = scale * np.concatenate([np.cos(turn), [1.0, -1, 0, 0, -1, 1]])
     sine = scale * np.concatenate([np.sin(turn), [0.0, 0, 1, -1, -1e-17, 1e-300]])
     if code == "compiled" and numba_enabled():
-        from fpp_ml_bench.decoding.kernels import _minus_atan2
+        from fpp_ml_bench.coding.kernels import _minus_atan2
 
         phase = np.array([_minus_atan2(a, b) for a, b in zip(sine, cosine, strict=True)])
     else:
-        phase = decoding.minus_atan2(sine, cosine)
+        phase = coding.minus_atan2(sine, cosine)
     error = difference(phase, -cases.by_mpmath("atan2", wide(sine), wide(cosine)))
     error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi and -pi are the same angle
     bound = np.maximum(4 * U64 * np.abs(phase), 2.0**-1073)
@@ -383,7 +383,7 @@ def arctangent(scale: float, code: str) -> Outcome:
 def order_range() -> Outcome:
     """-atan2 of signed zeros and the smallest sines at a negative cosine; against the interval [-pi, pi); bound: exact:
     +pi is mapped to -pi"""
-    phase = decoding.minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
+    phase = coding.minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 
@@ -397,7 +397,7 @@ def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
     frames[flipped] = 255 - np.asarray(frames[flipped])
     decoded = decoding.decode_stack(frames, rig, mask=inside)
     bound_mm = _rounding_px(rig) / _px_per_m(rig) * MM_PER_M * np.sqrt(2) * 1.01
-    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != decoding.Reason.DECODED)
+    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != coding.Reason.DECODED)
 
 
 @ORDER.family("flipped bit, one direction", "px", expects="either", bit=range(7))
@@ -409,17 +409,17 @@ def flipped_bit_alone(bit: int) -> Outcome:
     levels, row = direction_levels(rig, positions_px), rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
     cells, bits = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int), rig.sequence.bits("vertical")
-    read = np.asarray(optics.gray_to_binary(optics.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
-    centres = optics.cell_centres_rad(912, pitch)
+    read = np.asarray(coding.gray_to_binary(coding.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
+    centres = coding.cell_centres_rad(912, pitch)
     centre = centres[np.minimum(read, len(centres) - 1)]
     absolute = positions_px * 2 * np.pi / pitch
     slip = np.floor((centre - absolute) / (2 * np.pi) + 0.5)
     slipped_px = positions_px + pitch * slip
     off = np.abs(absolute + 2 * np.pi * slip - centre)
-    refused = (read >= len(centres)) | (off > optics.INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
+    refused = (read >= len(centres)) | (off > coding.INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
     error, flagged = coordinate_error(rig, levels, slipped_px)
     # Within half a grey level of a limit both results are correct.
-    wrong_flag = (flagged != refused) & ~(np.abs(off - optics.INCONSISTENT_RAD) < 0.01)
+    wrong_flag = (flagged != refused) & ~(np.abs(off - coding.INCONSISTENT_RAD) < 0.01)
     silent = float(np.mean(~flagged & (slip != 0)))
     note = f"{silent:.0%} of the pixels are wrong by whole periods, which only both directions together can detect"
     return worst(np.where(wrong_flag, np.inf, error), _rounding_px(rig), flagged & ~wrong_flag, note=note)
@@ -435,7 +435,7 @@ ORDER.family(
 def cell_off_pattern(cell: int) -> Outcome:
     """a pixel whose code names a cell beyond the pattern; against there is no such cell; bound: must be masked"""
     rig = optics.paper_rig(32)
-    bright = (int(optics.binary_to_gray(cell)) >> np.arange(6, -1, -1)[:, None]) & 1
+    bright = (int(coding.binary_to_gray(cell)) >> np.arange(6, -1, -1)[:, None]) & 1
     waves = sinusoids(np.linspace(-3, 3, 50), rig.sequence.steps)[:, 0]
     levels = np.concatenate([waves, np.repeat(MEAN + MODULATION * (2.0 * bright - 1), 50, axis=1)])
     return worst(0.0, flagged=coordinate_error(rig, levels, np.zeros(50))[1])

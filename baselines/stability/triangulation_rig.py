@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench import decoding, optics
+from fpp_ml_bench import coding, decoding, optics
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.stability import cases
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, difference, wide, worst
@@ -405,7 +405,7 @@ def folding_camera(k1: float) -> Outcome:
     x, y = camera.rays()
     without = np.isnan(x) | np.isnan(y)
     decoded = decoding.decode_stack(frames, replace(base, camera=camera), direction="vertical")
-    given = without & ((decoded.depth_mm != 0) | (decoded.reason == decoding.Reason.DECODED))
+    given = without & ((decoded.depth_mm != 0) | (decoded.reason == coding.Reason.DECODED))
     note = f"{without.mean():.0%} of the pixels have no ray; the corner {'has none' if without[0, 0] else 'has a ray'}"
     return worst(np.where(given, np.inf, 0.0), 0.0, decoded.depth_mm == 0, note=note)
 

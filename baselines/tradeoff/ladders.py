@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route import PhaseMethod
+from fpp_ml_bench.coding import Limits
 from fpp_ml_bench.constants import VIEWS, sample_name
-from fpp_ml_bench.decoding import Limits, decode_direction, decode_stack, depth_from_both, plan_direction
+from fpp_ml_bench.decoding import decode_direction, decode_stack, depth_from_both, plain_plan
 from fpp_ml_bench.evaluation.score import evaluate, score_sample
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, build, single_mesh, solid_mesh, write_ply
 from fpp_ml_bench.loaders.sample import Row, stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
-from fpp_ml_bench.optics import PAPER_SEQUENCE, Rig, Sequence, paper_rig
+from fpp_ml_bench.optics import PAPER_SEQUENCE, Rig, paper_rig
 
 OBJECT, VIEW = "power_drill", "A60"
 FRAMES_SIZE, BUILT_SIZE, READ_SIZE, ROW_SIZE, BATCH_SIZE = 360, 240, 480, 32, 240
@@ -85,7 +86,7 @@ def _pixel_rung(rig: Rig, make: Callable[[Rig], Work], size: int, folder: Path) 
 
 
 def _frame_rung(rig: Rig, make: Callable[[Rig], Work], steps: int, folder: Path) -> Rung:
-    sequence = Sequence(steps, rig.sequence.bits_horizontal, rig.sequence.bits_vertical)
+    sequence = replace(rig.paper_sequence, steps=steps)
     return Rung(len(sequence), make(replace(rig.scaled(FRAMES_SIZE), sequence=sequence)))
 
 
@@ -104,7 +105,7 @@ def _decode(rig: Rig) -> Work:
 
 def _phase(rig: Rig) -> Work:
     """On the whole image at once."""
-    frames, plan = _captured(rig), plan_direction(rig, "vertical", rig.sequence.steps, Limits())
+    frames, plan = _captured(rig), plain_plan(rig, "vertical", rig.sequence.steps, Limits())
     return partial(decode_direction, np.stack([frames[index].reshape(-1) for index in plan.frames]), plan, Limits())
 
 

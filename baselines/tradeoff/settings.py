@@ -16,14 +16,15 @@ from fpp_ml_bench.baselines.method import Frames, Method, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
+from fpp_ml_bench.coding import MIN_MODULATION, Limits, decode_cells
 from fpp_ml_bench.constants import MM_PER_M, sample_name, split_sample_name
-from fpp_ml_bench.decoding import MIN_MODULATION, Directions, Limits, plan_direction
+from fpp_ml_bench.decoding import Directions, plain_plan
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
 from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig, decode_cells
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 VIEWS_AN_OBJECT, QUICK_VIEWS = 2, 1
 CLASSICAL_DIRECTIONS: tuple[Directions, ...] = ("vertical", "horizontal", "both")
@@ -210,7 +211,7 @@ class DecodeInType(ClassicalMethod):
         if rig.projector.is_distorted:
             raise DecodeError("float32 against float64 is compared for a projector without distortion; this rig's has")
         self.number: Callable[[Any], Any] = np.dtype(dtype).type
-        self.plan = plan_direction(rig, direction, steps, Limits())
+        self.plan = plain_plan(rig, direction, steps, Limits())
         # Axis of the projector's image across the fringes; components of R (x, y, 1) along it and forward, (H, W).
         self.axis = 0 if direction == "vertical" else 1
         x, y = (axis.astype(dtype) for axis in rig.camera.rays())

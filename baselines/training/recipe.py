@@ -12,11 +12,11 @@ from pydantic import Field, ValidationError, model_validator
 
 from fpp_ml_bench.baselines.networks import NETWORKS
 from fpp_ml_bench.baselines.training.tables import GAN, PRESETS, ROWS, TABLES, check_loss
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError, SubmissionError
 from fpp_ml_bench.evaluation.submission import read_plain_file
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.optics import CONFIGS
 from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"

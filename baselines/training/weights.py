@@ -17,11 +17,11 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.loaders.storage import Manifest, benchmark_of, intended_benchmark
-from fpp_ml_bench.optics import CONFIGS
 from fpp_ml_bench.schema import Count, Scalar, Text, problems_of
 
 if TYPE_CHECKING:

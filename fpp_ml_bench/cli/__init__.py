@@ -31,7 +31,10 @@ EXTRAS = {
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "build": ("build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
-    "import": ("import_tree", "read a published tree (PNG + .mat) into the same dataset format"),
+    "import": ("import_tree", "read a published tree, or a scanner's captures, into the same dataset format"),
+    "calibrate": ("calibrate", "find the rig that took captures, from frames and their depth"),
+    "patterns": ("patterns", "write the images to project, for any sequence"),
+    "decode": ("decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
     "info": ("info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
     "verify": ("verify", "check a dataset: checksums, missing and foreign files, split leaks"),
     "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),

@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench import optics
+from fpp_ml_bench import coding, optics
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
-from fpp_ml_bench.constants import PRESETS
+from fpp_ml_bench.constants import CONFIGS, PRESETS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.machine import usable_cores
@@ -22,6 +22,7 @@ EXAMPLES = (
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
+    "fpp-bench build data/lab --decode-with found.yaml            ground truth by the rig that a calibration found",
     "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
 
@@ -33,10 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
-    parser.add_argument("--frames", choices=optics.CONFIGS, default="all", help="frames to store (default: all)")
+    parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
+    parser.add_argument("--decode-with", type=Path, metavar="FILE",
+                        help="rig that a calibration found: it decodes the ground truth and is the dataset's; "
+                             "--rig photographs")  # fmt: skip
     parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
     parser.add_argument("--light", default="paper", metavar="NAME|FILE",
                         help="paper, workshop, hard, or a YAML file with other numbers (default: paper)")  # fmt: skip
@@ -60,10 +64,10 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     if args.rig is not None and args.size is not None:
         rig = rig.scaled(args.size)
     if args.pitch is not None:
-        sequence = rig.sequence
+        sequence = rig.paper_sequence
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
             lengths = (rig.pattern_length(direction) for direction in optics.DIRECTIONS)
-            horizontal, vertical = (optics.bits_needed(length, args.pitch) for length in lengths)
+            horizontal, vertical = (coding.bits_needed(length, args.pitch) for length in lengths)
             horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
             sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
         rig = replace(rig, pitch_horizontal_px=args.pitch, pitch_vertical_px=args.pitch, sequence=sequence)
@@ -80,7 +84,8 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
         light = light.changed("camera", **render.camera_noise(args.noise_sigma))
     if args.shadows:
         light = light.changed("bounces", shadows=True)
-    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own)
+    found = None if args.decode_with is None else optics.load_rig(args.decode_with)
+    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own, found)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,5 +1,6 @@
 """Console output: a progress bar on standard error, and numbers with units for tables."""
 
+import argparse
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -31,6 +32,17 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda steps: progress.advance(task, steps)
+
+
+def working_range(text: str) -> tuple[float, float]:
+    """Type of an option: NEAR,FAR in mm."""
+    try:
+        near, far = (float(part) for part in text.split(","))
+    except ValueError:
+        near, far = 1.0, 0.0
+    if not 0 < near < far < 1e9:
+        raise argparse.ArgumentTypeError(f"expected NEAR,FAR in mm such as 350,450, got {text!r}")
+    return near, far
 
 
 def gigabytes(count: float) -> str:

@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from fpp_ml_bench import optics
+from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli.console import gigabytes, millimetres
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders import render, storage
 
 SUMMARY = "What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."
 EXAMPLES = ("fpp-bench info data/mini", "fpp-bench info data/mini --json | jq .splits")
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
             "bytes": sum(file.bytes for file in opened.manifest.files),
             "settings": opened.manifest.settings,
             "rig": opened.manifest.rig,
+            "calibration_error": None if (error := _calibration_error(opened.manifest)) is None else error._asdict(),
             "splits": statistics,
             "all": storage.whole_statistics(opened.manifest),
             "samples": opened.splits,
@@ -49,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
     near, far = rig.working_range_mm
-    periods = " / ".join(f"{rig.periods_in_range(d):.2f} {d}" for d in optics.DIRECTIONS)
-    settings = {key: value for key, value in manifest.settings.items() if key not in ("objects", "user_meshes")}
+    long = ("objects", "user_meshes", render.PHOTOGRAPHED_BY)
+    settings = {key: value for key, value in manifest.settings.items() if key not in long}
     if isinstance(settings.get("light"), dict):
         settings["light"] = settings["light"].get("name")
     generator = manifest.generator
@@ -63,9 +64,11 @@ def run(args: argparse.Namespace) -> int:
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    pitches = f"{rig.pitch_horizontal_px:g} / {rig.pitch_vertical_px:g} px"
-    print(f"fringes         pitch {pitches}; periods in range {periods}")
-    print(f"sampling        {rig.image_px_per_period('vertical'):.1f} image px a period at the standoff")
+    if error := _calibration_error(manifest):
+        lengths = f"{error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most"
+        print(f"calibration     decoded with this rig, photographed by another; depths differ by {lengths}")
+    for line in _fringe_lines(rig):
+        print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
     table = Table("", title=title, title_justify="left")
@@ -76,6 +79,28 @@ def run(args: argparse.Namespace) -> int:
         table.add_row(row_title, *map(cell, statistics))
     Console().print(table)
     return 0
+
+
+def _calibration_error(manifest: "storage.Manifest") -> "calibration.VolumeError | None":
+    """Depth error of the stated rig over the working range, where another rig photographed."""
+    photographed_by = manifest.settings.get(render.PHOTOGRAPHED_BY)
+    if photographed_by is None:
+        return None
+    return calibration.volume_error_mm(optics.rig_from_dict(manifest.rig), optics.rig_from_dict(photographed_by))
+
+
+def _fringe_lines(rig: "optics.Rig") -> list[str]:
+    """How the rig codes, and how the camera samples the fringes: the vertical ones where there are both."""
+    ways = rig.fringe_directions
+    if isinstance(rig.sequence, optics.Sequence):
+        coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
+    else:
+        coded = "; ".join(f"{way} {rig.code(way).title}" for way in rig.directions)
+    if not ways:
+        return [f"code            {coded}"]
+    periods = " / ".join(f"{rig.periods_in_range(way):.2f} {way}" for way in ways)
+    sampled = f"{rig.image_px_per_period(ways[-1]):.1f} image px a period at the standoff"
+    return [f"fringes         {coded}; periods in range {periods}", f"sampling        {sampled}"]
 
 
 def _share(value: float | None) -> str:

@@ -17,7 +17,17 @@ METHOD_HELP = (
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
-    "phase": ("fringe", "frames", "error_mm", "prior", "no_shading", "min_confidence", "white_grey", "ambient_grey"),
+    "phase": (
+        "fringe",
+        "frames",
+        "error_mm",
+        "prior",
+        "no_shading",
+        "min_confidence",
+        "white_grey",
+        "ambient_grey",
+        "mask",
+    ),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
     "constant": ("at",),
     "trained networks": ("depth_range", "frame", "device"),
@@ -31,9 +41,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
     add = parser.add_argument_group("classical").add_argument
-    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18 (default: all)")
+    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18, with Gray code (default: all)")
     add("--direction", choices=("horizontal", "vertical", "both"),
-        help="fringes to use: one direction is enough for a depth (default: both)")  # fmt: skip
+        help="fringes to use: one direction is enough for a depth (default: all that the rig codes)")  # fmt: skip
     add("--fewest", action="store_const", const=True,
         help="capture only the Gray frames that the rig's range needs: with both directions usually none")  # fmt: skip
     add("--depth-noise", type=float, metavar="MM",
@@ -57,6 +67,9 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--ambient-grey", type=float, metavar="GREY",
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
              "image's darkest)")  # fmt: skip
+    add("--mask", metavar="FILE",
+        help="object mask of phase: an image of the frames' size, above 0 on the object in every sample (default: "
+             "found in each image)")  # fmt: skip
     add(
         "--weights",
         metavar="FILE",
@@ -83,7 +96,7 @@ class Photographed(Protocol):
     @property
     def size(self) -> tuple[int, int]: ...
     @property
-    def sequence(self) -> "optics.Sequence": ...
+    def sequence(self) -> "optics.AnySequence": ...
     @property
     def manifest(self) -> "storage.Manifest": ...
 
@@ -153,8 +166,7 @@ def _network(path: Path, args: argparse.Namespace, opened: Photographed) -> "bas
 
 
 def _classical(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    usual = opened.sequence.steps if args.steps is None else args.steps
-    steps = usual if args.depth_noise is None else _steps_for(args, opened)
+    steps = args.steps if args.depth_noise is None else _steps_for(args, opened)
     return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
 
 
@@ -184,7 +196,7 @@ def _steps_for(args: argparse.Namespace, opened: Photographed) -> int:
 def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", *_SHARED)}
+    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", "mask", *_SHARED)}
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 

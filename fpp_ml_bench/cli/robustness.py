@@ -96,7 +96,7 @@ class Scenes:
         return self.rig.camera.height, self.rig.camera.width
 
     @property
-    def sequence(self) -> "optics.Sequence":
+    def sequence(self) -> "optics.AnySequence":
         return self.rig.sequence
 
     @property

@@ -2,114 +2,117 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import optics
+from fpp_ml_bench import coding
+from fpp_ml_bench.coding import (
+    CLIPPED_STEPS_DIVISOR,
+    STAGE_REASONS,
+    Code,
+    Coordinates,
+    Limits,
+    PhaseShift,
+    Reason,
+    choose_steps,
+    minus_atan2,
+    phase_weights,
+    weighted_sums,
+)
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding.phase import choose_steps, compiled_kernels, minus_atan2, phase_weights, weighted_sums
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
-from fpp_ml_bench.optics import AXES, Direction, Maps, Rig
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.machine import numba_enabled
+from fpp_ml_bench.optics import AXES, Direction, Maps, Rig, Sequence
 
-MIN_MODULATION = 5.0
-"""Grey levels. At a read noise of 1 grey level and only 3 steps the phase noise is then 0.16 rad: a tenth of the pi/2
-that the fringe order tolerates, about 7 mm of depth at 1.8 m. Less means shadow, glare or no projector light."""
-CLIPPED_STEPS_DIVISOR = 9
-"""A pixel may be saturated in N // 9 of its N steps (2 of 18, none below 9). N steps cancel harmonics up to N - 2, so
-that a clipped crest then distorts the phase by under 5 mrad; with few steps it would be tens of mrad."""
-MAX_DISAGREEMENT_PX = 1.5
-"""Projector px between a pixel's measured (u, v) and its epipolar line. Noise at the least modulation and 3 steps
-gives a sigma of 0.5 px; a fringe order that is wrong by 1 shifts an 18 px fringe by more than 10 px."""
 SLACK_PX = 1e-3
 """Allowance for rounding: coordinates and residuals are exact to about 1e-9 px."""
 
 
-class Reason(IntEnum):
-    """Why a pixel has no depth. Where several reasons apply, the lowest code is stored.
-
-    NO_RAY: the camera's lens model has no inverse at this pixel, or the ray does not meet the measured projector plane
-    in front of both devices. NOT_ASKED: the pixel is outside the mask.
-    """
-
-    DECODED = 0
-    NO_RAY = 1
-    LOW_MODULATION = 2
-    SATURATED = 3
-    INCONSISTENT_ORDER = 4
-    OUTSIDE_PATTERN = 5
-    DIRECTIONS_DISAGREE = 6
-    OUTSIDE_RANGE = 7
-    NOT_ASKED = 8
-
-
-_STAGE_REASONS = (Reason.LOW_MODULATION, Reason.SATURATED, Reason.INCONSISTENT_ORDER, Reason.OUTSIDE_PATTERN)
-
-
 @dataclass(frozen=True)
-class Limits:
-    """Conditions that a decoded pixel meets; the defaults are explained beside their constants."""
-
-    min_modulation: float = MIN_MODULATION
-    max_clipped_steps: int | None = None
-    max_disagreement_px: float = MAX_DISAGREEMENT_PX
-    ambiguous_fraction: float = optics.AMBIGUOUS_FRACTION
-
-
-@dataclass(frozen=True)
-class DirectionPlan:
-    """What decoding a direction needs besides the grey levels; the same for every pixel."""
+class CodePlan:
+    """What decoding a direction needs besides the grey levels; the same for every pixel. ``rows`` are the frame indices
+    in the order in which `decode` takes the grey levels."""
 
     direction: Direction
-    sinusoids: tuple[int, ...]
-    gray: tuple[int, ...]
-    weights: NDArray[np.float64]
-    centres_rad: NDArray[np.float64]
-    pitch_px: float
+    code: Code
     length_px: int
-    max_clipped_steps: int
+    rows: tuple[int, ...]
     constant_levels: Mapping[int, int] = field(default_factory=dict)
     """Grey level by frame index of the frames that need not be captured: the same at every pixel the camera sees."""
-
-    @property
-    def rows(self) -> tuple[int, ...]:
-        """Frame indices in the order in which `decode_direction` takes the grey levels."""
-        return self.sinusoids + self.gray
 
     @property
     def frames(self) -> tuple[int, ...]:
         """Indices of the frames that must be captured and read."""
         return tuple(index for index in self.rows if index not in self.constant_levels)
 
-
-def plan_direction(rig: Rig, direction: Direction, steps: int, limits: Limits) -> DirectionPlan:
-    """Plan for a direction with ``steps`` of the rig's sinusoids; raises `DecodeError` for an impossible number."""
-    chosen = choose_steps(rig.sequence.steps, steps)
-    available = rig.sequence.sinusoids(direction)
-    pitch, length = rig.pitch(direction), rig.pattern_length(direction)
-    allowed = limits.max_clipped_steps
-    return DirectionPlan(
-        direction, sinusoids=tuple(available[i] for i in chosen), gray=tuple(rig.sequence.gray(direction)),
-        weights=phase_weights(2 * np.pi * np.array(chosen) / rig.sequence.steps),
-        centres_rad=optics.cell_centres_rad(length, pitch), pitch_px=pitch, length_px=length,
-        max_clipped_steps=steps // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
-    )  # fmt: skip
+    def decode(self, grey: NDArray, limits: Limits) -> Coordinates:
+        """Projector coordinate of a block from its grey levels, uint8 or float32 (rows, n)."""
+        return self.code.decode(grey, self.length_px, limits)
 
 
 @dataclass(frozen=True)
-class Coordinates:
-    """A block's measurement in one direction: coordinate (px), modulation (grey levels) and phase (rad), float64 (n,)
-    each, and the reason codes, uint8 (n,)."""
+class DirectionPlan(CodePlan):
+    """The plan of the paper's kind of code, which has compiled kernels, with some of its steps."""
 
-    coordinate_px: NDArray[np.float64]
-    modulation: NDArray[np.float64]
-    phase: NDArray[np.float64]
-    reason: NDArray[np.uint8]
+    sinusoids: tuple[int, ...] = ()
+    weights: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
+    centres_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    pitch_px: float = 0.0
+    max_clipped_steps: int = 0
 
-    def at(self, indices: NDArray[np.intp]) -> "Coordinates":
-        """The coordinates of the pixels at ``indices`` only."""
-        return Coordinates(*(values[indices] for values in vars(self).values()))
+    @property
+    def gray(self) -> tuple[int, ...]:
+        return self.rows[len(self.sinusoids) :]
+
+    def decode(self, grey: NDArray, limits: Limits) -> Coordinates:
+        return decode_direction(grey, self, limits)
+
+
+def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Limits) -> CodePlan:
+    """Plan for a direction with ``steps`` of the rig's sinusoids, all with None. Raises `DecodeError` for an impossible
+    number, and for some of the steps of a code of another kind than the paper's."""
+    code, length, rows = rig.code(direction), rig.pattern_length(direction), rig.sequence.coded(direction)
+    if not isinstance(code, PhaseShift) or not code.is_plain:
+        if steps is not None:
+            raise DecodeError(
+                f"steps: some of the steps can be chosen only with sinusoids of one period in equal steps from pixel 0 "
+                f"and Gray code in half periods; the {direction} code of this rig is another: leave steps out"
+            )
+        flat = (rig.sequence.black, rig.sequence.white) if code.needs_flat else ()
+        return CodePlan(direction, code, length, (*rows, *(index for index in flat if index is not None)))
+    available = rig.sequence.sinusoids(direction)
+    chosen = choose_steps(len(available), len(available) if steps is None else steps)
+    allowed = limits.max_clipped_steps
+    sinusoids = tuple(available[i] for i in chosen)
+    return DirectionPlan(
+        direction, code, length, (*sinusoids, *rig.sequence.gray(direction)), sinusoids=sinusoids,
+        weights=phase_weights(2 * np.pi * np.array(chosen) / len(available)),
+        centres_rad=coding.cell_centres_rad(length, code.pitch_px), pitch_px=code.pitch_px,
+        max_clipped_steps=len(chosen) // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
+    )  # fmt: skip
+
+
+def plain_plan(rig: Rig, direction: Direction, steps: int | None, limits: Limits) -> DirectionPlan:
+    """`plan_direction` for a rig with the paper's kind of code; `DecodeError` for any other."""
+    plan = plan_direction(rig, direction, steps, limits)
+    if not isinstance(plan, DirectionPlan):
+        raise DecodeError(
+            f"the {direction} code of this rig is not of the paper's kind: sinusoids of one period in equal steps from "
+            "pixel 0 and Gray code in half periods"
+        )
+    return plan
+
+
+def compiled_kernels() -> ModuleType | None:
+    """The triangulation's compiled kernels, or None where NumPy is to be used."""
+    if not numba_enabled():
+        return None
+    from fpp_ml_bench.decoding import kernels
+
+    return kernels
 
 
 def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
@@ -129,30 +132,25 @@ def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
     return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
 
 
-def decode_direction(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
-    """Projector coordinate of a block from its grey levels, uint8 (frames of the plan, n)."""
+def decode_direction(grey: NDArray, plan: DirectionPlan, limits: Limits) -> Coordinates:
+    """Projector coordinate of a block from its grey levels, uint8 or float32 (rows of the plan, n)."""
     steps, count = len(plan.sinusoids), grey.shape[1]
-    if kernels := compiled_kernels():
+    if grey.dtype == np.uint8 and (kernels := coding.compiled_kernels()):
         results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
         thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
         code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
-        reasons = tuple(float(reason) for reason in _STAGE_REASONS)
-        kernels.decode_block(grey, plan.weights, code, (*thresholds, optics.INCONSISTENT_RAD), reasons, results)
+        reasons = tuple(float(reason) for reason in STAGE_REASONS)
+        kernels.decode_block(grey, plan.weights, code, (*thresholds, coding.INCONSISTENT_RAD), reasons, results)
         return Coordinates(*results)
     mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
     modulation = np.sqrt(cosine * cosine + sine * sine)
     phase = minus_atan2(sine, cosine)
-    cells, trusted = optics.decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
-    absolute, consistent = optics.absolute_phase(phase, cells, plan.centres_rad)
+    cells, trusted = coding.decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
+    absolute, consistent = coding.absolute_phase(phase, cells, plan.centres_rad)
     coordinate = absolute * (plan.pitch_px / (2 * np.pi))
-    faults = (
-        modulation < limits.min_modulation,
-        (grey[:steps] == GREY_LEVELS).sum(axis=0) > plan.max_clipped_steps,
-        ~(trusted & consistent),
-        (coordinate < -0.5) | (coordinate > plan.length_px - 0.5),
-    )
-    reason = np.select(faults, [np.uint8(code) for code in _STAGE_REASONS], np.uint8(0))
-    return Coordinates(coordinate, modulation, phase, reason)
+    saturated = (grey[:steps] >= GREY_LEVELS).sum(axis=0) > plan.max_clipped_steps
+    inconsistent = ~(trusted & consistent)
+    return Coordinates.judged(coordinate, modulation, phase, saturated, inconsistent, plan.length_px, limits)
 
 
 def depth_and_reason(
@@ -173,8 +171,7 @@ def depth_and_reason(
         lower = np.minimum(*reasons)
         reason = np.where(lower == 0, np.maximum(*reasons), lower)
         u, v = (measured[direction].coordinate_px for direction in AXES)
-        # 1 / sigma is proportional to modulation over pitch: both directions have the same number of steps.
-        weights = tuple(measured[direction].modulation / rig.pitch(direction) for direction in AXES)
+        weights = tuple(_relative_precision(measured[direction], rig, direction) for direction in AXES)
         disagreement_px = np.empty(len(reason))
         if kernels:
             kernels.depth_from_both(rays, (u, v), weights, geometry(rig), (depth_mm, disagreement_px))
@@ -188,6 +185,14 @@ def depth_and_reason(
     reason[(reason == 0) & outside] = Reason.OUTSIDE_RANGE
     reason[((reason == 0) & missing) | np.isnan(rays[0])] = Reason.NO_RAY
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
+
+
+def _relative_precision(measured: Coordinates, rig: Rig, direction: Direction) -> NDArray[np.float64]:
+    """1 / sigma of a coordinate, up to a factor that both directions share."""
+    if isinstance(rig.sequence, Sequence):
+        return measured.modulation / rig.pitch(direction)  # both directions have the same number of steps
+    with np.errstate(divide="ignore"):
+        return 1.0 / rig.code(direction).sigma_px(measured.modulation, 1.0)
 
 
 def within_reach(coordinate_px: NDArray, rays: Maps, direction: Direction, rig: Rig, limits: Limits) -> NDArray:

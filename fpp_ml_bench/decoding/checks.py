@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding.blocks import DirectionPlan, Limits
+from fpp_ml_bench.coding import Limits
+from fpp_ml_bench.decoding.blocks import DirectionPlan
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
@@ -40,21 +41,27 @@ def check_limits(limits: Limits) -> None:
 
 
 def flat_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
-    """The frames at the indices ``used``, checked and flattened to uint8 (H * W,)."""
+    """The frames at the indices ``used``, checked and flattened to uint8 or float32 (H * W,), all of one dtype."""
     expected = (rig.camera.height, rig.camera.width)
     if len(frames) != len(rig.sequence):
         raise DecodeError(
             f"expected the {len(rig.sequence)} frames of the rig's sequence, got {len(frames)}; "
             "put None in the place of a frame that was not captured"
         )
-    flat = {}
+    flat: dict[int, NDArray] = {}
     for index in used:
         frame, title = frames[index], f"frame {rig.sequence.frames[index].title}"
         if frame is None:
             raise DecodeError(f"{title}: expected an image, got None; this decoding needs the frame, capture it")
         image = np.asarray(frame)
-        if image.dtype != np.uint8:
-            raise DecodeError(f"{title}: expected uint8 grey levels, got dtype {image.dtype}")
+        if image.dtype not in (np.uint8, np.float32):
+            raise DecodeError(
+                f"{title}: expected uint8 grey levels, or float32 of 0 to 255 for deeper images, got {image.dtype}"
+            )
+        if flat and image.dtype != next(iter(flat.values())).dtype:
+            raise DecodeError(f"{title}: expected the dtype of the other frames, got {image.dtype}")
+        if image.dtype == np.float32 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 255):
+            raise DecodeError(f"{title}: expected float32 grey levels of 0 to 255; scale them by 255 / full scale")
         if image.shape != expected:
             raise DecodeError(
                 f"{title}: expected shape (H, W) = {expected} of the rig's camera, got {image.shape}; "

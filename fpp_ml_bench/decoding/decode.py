@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding import Coordinates, Limits, Reason
 from fpp_ml_bench.decoding import blocks
-from fpp_ml_bench.decoding.blocks import Coordinates, DirectionPlan, Limits, Reason
+from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan
 from fpp_ml_bench.decoding.checks import check_frames, check_limits, flat_frames, mask_indices
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
 from fpp_ml_bench.errors import DecodeError
@@ -80,7 +81,7 @@ class _Image:
 
     frames: dict[int, NDArray[np.uint8]]
     rig: Rig
-    plans: list[DirectionPlan]
+    plans: list[CodePlan]
     limits: Limits
     joint: JointCode | None
     pixels: NDArray[np.intp] | None
@@ -118,9 +119,9 @@ class _Image:
     def _rays(self, block: _Block) -> Maps:
         return self.rays[0][block.pixels], self.rays[1][block.pixels]
 
-    def _measure(self, block: _Block, plan: DirectionPlan) -> None:
+    def _measure(self, block: _Block, plan: CodePlan) -> None:
         """Measure a direction at the block's pixels; gathers the grey levels of its frames first."""
-        levels = np.empty((len(plan.rows), len(block)), dtype=np.uint8)
+        levels = np.empty((len(plan.rows), len(block)), dtype=next(iter(self.frames.values())).dtype)
         for row, index in zip(levels, plan.rows, strict=True):
             if index in plan.constant_levels:
                 row[:] = plan.constant_levels[index]
@@ -129,8 +130,10 @@ class _Image:
             else:
                 # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
                 self.frames[index].take(block.pixels, out=row, mode="clip")
-        decode = decode_wrapped if self.joint else blocks.decode_direction
-        block.measured[plan.direction] = decode(levels, plan, self.limits)
+        if self.joint and isinstance(plan, DirectionPlan):
+            block.measured[plan.direction] = decode_wrapped(levels, plan, self.limits)
+        else:
+            block.measured[plan.direction] = plan.decode(levels, self.limits)
 
     def _keep_within_reach(self, block: _Block) -> None:
         """Reduce the block to the pixels that can still get a depth after the first direction, if they are few. A
@@ -172,13 +175,15 @@ def decode_stack(
 ) -> Decoded:  # fmt: skip
     """Depth in mm from a captured sequence.
 
-    ``frames``: all frames of ``rig.sequence`` in order, uint8 (H, W) each: a list of views or an array (F, H, W); a
-    frame that is not needed may be None. Black and white never are: the Gray code's threshold is the sinusoids' mean.
-    ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both"
-    needs both at every pixel, weighs them by (modulation / pitch)^2, and rejects pixels at which the two coordinates
-    disagree by more than ``limits.max_disagreement_px`` across the epipolar line.
-    ``steps``: how many of each direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible.
-    Where they can't be even (N is not a multiple), the phase is the least-squares solution.
+    ``frames``: all frames of ``rig.sequence`` in order, uint8, or float32 of 0 to 255 for deeper images, (H, W) each: a
+    list of views or an array (F, H, W); a frame that is not needed may be None. Behind sinusoids black and white never
+    are: the Gray code's threshold is the sinusoids' mean.
+    ``direction``: "vertical" fringes measure the projector's u and "horizontal" its v, each enough for a depth; "both",
+    all that the rig codes, needs them at every pixel, weighs them by 1 / sigma^2, and rejects pixels at which the two
+    coordinates disagree by more than ``limits.max_disagreement_px`` across the epipolar line.
+    ``steps``: how many of each direction's N sinusoids to use, 3 to N (default: all), spread as evenly as possible;
+    with the paper's kind of code only. Where they can't be even (N is not a multiple), the phase is the least-squares
+    solution.
     ``mask`` bool (H, W): pixels to decode; all others get `Reason.NOT_ASKED` and have no influence. The result is the
     same bit by bit for any number of ``threads``, and inside the mask the same as without a mask. ``details``: also
     return coordinates, modulation and wrapped phase.
@@ -197,16 +202,16 @@ def decode_stack(
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
     check_limits(limits := limits or Limits())
-    step_count = rig.sequence.steps if steps is None else steps
-    directions: tuple[Direction, ...] = DIRECTIONS if direction == "both" else (direction,)
-    plans, joint = [blocks.plan_direction(rig, name, step_count, limits) for name in directions], None
+    directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
+    plans, joint = [blocks.plan_direction(rig, name, steps, limits) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
     flat, shape = flat_frames(frames, used, rig), (rig.camera.height, rig.camera.width)
     pixels = mask_indices(mask, shape)
     for plan in plans:
-        check_frames(flat, plan, pixels, rig)
+        if isinstance(plan, DirectionPlan):
+            check_frames(flat, plan, pixels, rig)
     # With a mask of most of the image, decoding whole blocks and clearing the rest is faster than reading by index.
     dense = pixels is not None and not details and len(pixels) > MOST_PICKED_SHARE * shape[0] * shape[1]
     dense = dense and skipping_enabled()

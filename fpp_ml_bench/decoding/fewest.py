@@ -14,12 +14,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding import MAX_DISAGREEMENT_PX, Coordinates, Limits, Reason, binary_to_gray, cell_count, cell_of
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
-from fpp_ml_bench.decoding.blocks import MAX_DISAGREEMENT_PX, Coordinates, DirectionPlan, Limits, Reason
-from fpp_ml_bench.decoding.phase import compiled_kernels
+from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan, compiled_kernels
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
-from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, binary_to_gray, cell_count, cell_of
+from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig
 
 _GRID = 33
 """Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""
@@ -30,19 +30,21 @@ modulation) has a sigma of 0.5 px, usual pixels have 0.02 px."""
 
 
 def reach_of(rig: Rig) -> NDArray[np.float64]:
-    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane,
-    (3, 2 `AXES`, n); NaN outside the projector's view."""
+    """Projector px of a grid of the camera's rays at the near and far end of the range and on the background plane (at
+    the far end where none is known), (3, 2 `AXES`, n); NaN outside the projector's view."""
     rows = np.linspace(0, rig.camera.height - 1, _GRID).round().astype(int)
     columns = np.linspace(0, rig.camera.width - 1, _GRID).round().astype(int)
     x, y = (axis[np.ix_(rows, columns)].ravel() for axis in rig.camera.rays())
-    return np.array([blocks.projected((x, y), depth_m, rig) for depth_m in (*blocks.range_m(rig), rig.background_m)])
+    near_m, far_m = blocks.range_m(rig)
+    background_m = far_m if rig.background_m is None else rig.background_m
+    return np.array([blocks.projected((x, y), depth_m, rig) for depth_m in (near_m, far_m, background_m)])
 
 
 @lru_cache(maxsize=16)
 def gray_levels_in_view(rig: Rig, direction: Direction) -> tuple[int | None, ...]:
     """Grey level of each Gray bit (0 = most significant) that is the same everywhere in the camera's view, at any depth
     in the range and on the background; None for a bit that changes."""
-    in_view, bits = reach_of(rig)[:, AXES.index(direction)], rig.sequence.bits(direction)
+    in_view, bits = reach_of(rig)[:, AXES.index(direction)], len(rig.sequence.gray(direction))
     in_view = in_view[np.isfinite(in_view)]
     if not in_view.size:
         return (None,) * bits
@@ -129,13 +131,18 @@ def fewest_steps(
     return None
 
 
-def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPlan], JointCode | None]:
-    """The plans with only the Gray frames that the working range needs, and the joint code if it replaces them all."""
-    joint = orders_from_phases(rig) if len(plans) == 2 else None
+def fewest_plans(rig: Rig, plans: list[CodePlan]) -> tuple[list[CodePlan], JointCode | None]:
+    """The plans with only the Gray frames that the working range needs, and the joint code if it replaces them all;
+    those of codes that are not the paper's kind as they are."""
+    plain = [plan for plan in plans if isinstance(plan, DirectionPlan)]
+    joint = orders_from_phases(rig) if len(plain) == 2 else None
     if joint is not None and joint.unambiguous:
-        return [replace(plan, gray=()) for plan in plans], joint
-    fewer = []
+        return [replace(plan, rows=plan.sinusoids) for plan in plain], joint
+    fewer: list[CodePlan] = []
     for plan in plans:
+        if not isinstance(plan, DirectionPlan):
+            fewer.append(plan)
+            continue
         levels = zip(plan.gray, gray_levels_in_view(rig, plan.direction), strict=True)
         fewer.append(replace(plan, constant_levels={frame: level for frame, level in levels if level is not None}))
     return fewer, None
@@ -143,7 +150,7 @@ def fewest_plans(rig: Rig, plans: list[DirectionPlan]) -> tuple[list[DirectionPl
 
 def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Phase and modulation of a block without Gray frames; reasons that depend on a fringe order are cleared."""
-    coordinates = blocks.decode_direction(grey, plan, limits)
+    coordinates = plan.decode(grey, limits)
     reason = coordinates.reason
     reason[(reason == Reason.INCONSISTENT_ORDER) | (reason == Reason.OUTSIDE_PATTERN)] = 0
     return coordinates

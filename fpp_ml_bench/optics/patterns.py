@@ -1,38 +1,47 @@
-"""The projected patterns: N-step sinusoids and a phase-aligned Gray code, as 8-bit images.
+"""The projected patterns as 8-bit images, from the codes of a rig's sequence (`fpp_ml_bench.coding`).
 
-Step n of the fringes of period P is ``127.5 + 127.5 cos(2 pi w / P + 2 pi n / N)`` along the varying coordinate w
-(paper Eq. 1). The Gray code counts HALF periods (see `fpp_ml_bench.optics.gray_code`): cell j holds the pixels with
-floor(w / (P / 2)) = j, in reflected binary code, most significant bit first, 0 or 255.
+The paper's: step n of the fringes of period P is ``127.5 + 127.5 cos(2 pi w / P + 2 pi n / N)`` along the varying
+coordinate w (paper Eq. 1), and the Gray code counts HALF periods: cell j holds the pixels with floor(w / (P / 2)) = j,
+in reflected binary code, most significant bit first, 0 or 255.
 """
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding import Code
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import FppBenchError, RigError
-from fpp_ml_bench.optics.gray_code import binary_to_gray, cell_of
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.portable import cosine_of_turns
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 
 def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
     """Frame ``index`` along the coordinate it varies with, uint8: (height,) for horizontal fringes and code, (width,)
     for vertical, (1,) for black and white. Raises `RigError` for an index outside the sequence."""
-    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
-        raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
+    _check(rig, index)
     frame = rig.sequence.frames[index]
+    if frame.kind == "crossed":
+        raise RigError(f"pattern {index}: crossed fringes vary along rows and columns; they are an image, no profile")
     if frame.direction is None:
         return np.array([0 if frame.kind == "black" else GREY_LEVELS], dtype=np.uint8)
-    position = np.arange(rig.pattern_length(frame.direction))
-    pitch = rig.pitch(frame.direction)
-    if frame.kind == "sinusoid":
-        steps, half = rig.sequence.steps, GREY_LEVELS / 2
-        turns = (position * steps + frame.step * pitch) / (pitch * steps)
-        return np.rint(half + half * cosine_of_turns(turns)).astype(np.uint8)
-    bit = binary_to_gray(cell_of(position, pitch)) >> (rig.sequence.bits(frame.direction) - 1 - frame.step) & 1
-    return (bit * GREY_LEVELS).astype(np.uint8)
+    profiles = _profiles(rig.code(frame.direction), rig.pattern_length(frame.direction))
+    profile: NDArray[np.uint8] = profiles[rig.sequence.coded(frame.direction).index(index)]
+    return profile
+
+
+def _check(rig: Rig, index: int) -> None:
+    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(rig.sequence):
+        raise RigError(f"pattern {index!r}: this rig's sequence has frames 0 to {len(rig.sequence) - 1}")
+
+
+@lru_cache(maxsize=8)
+def _profiles(code: Code, length_px: int) -> NDArray[np.uint8]:
+    profiles = code.profiles(length_px)
+    profiles.setflags(write=False)
+    return profiles
 
 
 def pattern_profiles(rig: Rig) -> NDArray[np.uint8]:
@@ -43,7 +52,11 @@ def pattern_profiles(rig: Rig) -> NDArray[np.uint8]:
 
 
 def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
-    """Frame ``index`` as the projector shows it, uint8 (h_p, w_p); a read-only view of its profile."""
+    """Frame ``index`` as the projector shows it, uint8 (h_p, w_p); read-only where it varies along one coordinate."""
+    _check(rig, index)
+    if rig.sequence.frames[index].kind == "crossed":
+        rows, columns = (_profiles(rig.code(way), rig.pattern_length(way))[0] * 1.0 for way in DIRECTIONS)
+        return np.rint((rows[:, None] + columns) / 2).astype(np.uint8)
     profile = pattern_profile(rig, index)
     column = rig.sequence.frames[index].direction == "horizontal"
     return np.broadcast_to(profile[:, None] if column else profile, (rig.projector.height, rig.projector.width))

@@ -1,8 +1,14 @@
 """Pinhole model with lens distortion: the camera, or a projector as an inverse camera.
 
-Pixel centres lie at integer coordinates, so that an image W px wide spans -0.5 to W - 0.5, and the lens is OpenCV's
-model with the coefficients (k1, k2, p1, p2, k3), `distortion_polynomial`. It folds back beyond some radius; a point out
-there has no image, and `distort` and `undistort` answer NaN for it.
+Pixel centres lie at integer coordinates, so that an image W px wide spans -0.5 to W - 0.5, and the lens is one of
+OpenCV's models (calib3d), by the number of its coefficients, `distortion_polynomial`:
+
+    5    k1, k2, p1, p2, k3    radial and tangential
+    8    ..., k4, k5, k6       the radial factor is a ratio, with 1 + k4 r^2 + k5 r^4 + k6 r^6 below
+    12   ..., s1, s2, s3, s4   thin prism
+    14   ..., tau_x, tau_y     sensor tilted about its axes, in rad
+
+The lens folds back beyond some radius; a point out there has no image, and `distort` and `undistort` answer NaN for it.
 """
 
 import math
@@ -16,11 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.errors import RigError
 
-Coefficients = tuple[float, float, float, float, float]
+Coefficients = tuple[float, ...]
+"""5, 8, 12 or 14 of them."""
 Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 INVERSE_TOLERANCE = 1e-12
 """Largest accepted error of the inverse, distorted again, in normalised units: 2e-9 px at the paper's focal length."""
+COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
+"""With four, k3 is 0."""
 MAX_ITERATIONS = 50
 START_TABLE = 4096
 MAX_CONDITION = 2.0**26
@@ -33,28 +42,68 @@ def is_distorted(coefficients: Coefficients) -> bool:
 
 
 def fold_radius_squared(coefficients: Coefficients) -> float:
-    """r^2 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing, ``inf`` where it never does."""
-    k1, k2, _, _, k3 = coefficients
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    """r^2 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6), or its ratio to 1 + k4 r^2 + k5 r^4 + k6 r^6, stops growing or
+    becomes infinite; ``inf`` where it never does."""
+    k1, k2, _, _, k3 = coefficients[:5]
+    if any(coefficients[5:8]):
+        above, below = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([*coefficients[7:4:-1], 1.0])
+        # The numerator of d/dr of r above / below, in r^2.
+        slope = above * below + np.poly1d([2.0, 0.0]) * (above.deriv() * below - above * below.deriv())
+        roots = np.concatenate([slope.roots, below.roots])
+    else:
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and root.real > 0]
     # The root finder's last digits differ between processors; where the fold is counts to eleven.
     return float(f"{min(real, default=math.inf):.11g}")
 
 
 def _radial(r2: NDArray, coefficients: Coefficients) -> NDArray:
-    k1, k2, _, _, k3 = coefficients
-    return 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    k1, k2, _, _, k3 = coefficients[:5]
+    above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return above / _below(r2, coefficients) if len(coefficients) > 5 else above
+
+
+def _below(r2: NDArray, coefficients: Coefficients) -> NDArray:
+    k4, k5, k6 = coefficients[5:8]
+    return 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+
+
+def _twice_radial_slope(r2: NDArray, radial: NDArray, coefficients: Coefficients) -> NDArray:
+    """2 d radial / d r^2."""
+    k1, k2, _, _, k3 = coefficients[:5]
+    above = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+    if len(coefficients) == 5:
+        return above
+    k4, k5, k6 = coefficients[5:8]
+    return (above - 2.0 * radial * (k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2))) / _below(r2, coefficients)
+
+
+def _tilt(coefficients: Coefficients) -> NDArray[np.float64]:
+    """(3, 3): projects what an upright sensor sees onto the tilted one, along the rays."""
+    (cx, sx), (cy, sy) = ((math.cos(tau), math.sin(tau)) for tau in coefficients[12:])
+    turn = np.array([[cy, sy * sx, -sy * cx], [0.0, cx, sx], [sy, -cy * sx, cy * cx]])
+    return np.array([[turn[2, 2], 0.0, -turn[0, 2]], [0.0, turn[2, 2], -turn[1, 2]], [0.0, 0.0, 1.0]]) @ turn
+
+
+def _through(matrix: NDArray, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Normalised coordinates through a projective map, and their divisor: not positive behind the sensor."""
+    u, v, ahead = (float(row[0]) * x + float(row[1]) * y + float(row[2]) for row in matrix)
+    return u / ahead, v / ahead, ahead
 
 
 def distortion_polynomial(x: NDArray, y: NDArray, coefficients: Coefficients) -> Maps:
     """The model without a look at its fold: arithmetic only, so that arrays of any library pass through."""
-    _, _, p1, p2, _ = coefficients
+    _, _, p1, p2, _ = coefficients[:5]
     r2, cross = x * x + y * y, x * y
     radial = _radial(r2, coefficients)
-    return (
-        x * radial + 2.0 * p1 * cross + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * cross,
-    )
+    xd = x * radial + 2.0 * p1 * cross + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * cross
+    if len(coefficients) > 8:
+        s1, s2, s3, s4 = coefficients[8:12]
+        xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
+    if len(coefficients) > 12:
+        xd, yd, _ = _through(_tilt(coefficients), xd, yd)
+    return xd, yd
 
 
 def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
@@ -65,6 +114,9 @@ def distort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
     with np.errstate(invalid="ignore", over="ignore"):
         xd, yd = distortion_polynomial(x, y, coefficients)
         folded = ~(x * x + y * y < fold_radius_squared(coefficients))
+        if len(coefficients) > 12:
+            tilt = _tilt(coefficients)
+            folded |= ~(_through(tilt, *distortion_polynomial(x, y, coefficients[:12]))[2] > 0)
     return np.where(folded, np.nan, xd), np.where(folded, np.nan, yd)
 
 
@@ -79,6 +131,8 @@ def _radial_start(xd: NDArray[np.float64], yd: NDArray[np.float64], coefficients
         reach *= 2
     radius = np.linspace(0.0, min(reach, fold), START_TABLE)
     distorted = radius * _radial(radius * radius, coefficients)
+    if not distorted[-1] >= distorted[-2]:  # just beyond a pole
+        distorted[-1] = np.inf
     shrink = np.interp(measured, distorted, radius) / np.where(measured > 0, measured, 1.0)
     return xd * shrink, yd * shrink
 
@@ -90,20 +144,26 @@ def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
     xd, yd = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not is_distorted(coefficients):
         return xd.copy(), yd.copy()
-    k1, k2, p1, p2, k3 = coefficients
+    upright, (_, _, p1, p2, _) = coefficients[:12], coefficients[:5]
     with np.errstate(all="ignore"):
-        xi, yi = _radial_start(xd, yd, coefficients)
+        xu, yu = xd, yd
+        if len(coefficients) > 12:
+            xu, yu, _ = _through(np.linalg.inv(_tilt(coefficients)), xd, yd)
+        xi, yi = _radial_start(xu, yu, upright)
         for _ in range(MAX_ITERATIONS):
-            fx, fy = distortion_polynomial(xi, yi, coefficients)
-            ex, ey = fx - xd, fy - yd
+            fx, fy = distortion_polynomial(xi, yi, upright)
+            ex, ey = fx - xu, fy - yu
             r2 = xi * xi + yi * yi
-            radial = _radial(r2, coefficients)
-            slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))
+            radial = _radial(r2, upright)
+            slope = _twice_radial_slope(r2, radial, upright)
             jxx = radial + slope * xi * xi + 2.0 * p1 * yi + 6.0 * p2 * xi
             jyy = radial + slope * yi * yi + 6.0 * p1 * yi + 2.0 * p2 * xi
-            jxy = slope * xi * yi + 2.0 * p1 * xi + 2.0 * p2 * yi
-            determinant = jxx * jyy - jxy * jxy
-            dx, dy = (jyy * ex - jxy * ey) / determinant, (jxx * ey - jxy * ex) / determinant
+            jxy = jyx = slope * xi * yi + 2.0 * p1 * xi + 2.0 * p2 * yi
+            if len(upright) > 8:
+                prism_x, prism_y = (2.0 * (upright[i] + 2.0 * upright[i + 1] * r2) for i in (8, 10))
+                jxx, jxy, jyx, jyy = jxx + prism_x * xi, jxy + prism_x * yi, jyx + prism_y * xi, jyy + prism_y * yi
+            determinant = jxx * jyy - jxy * jyx
+            dx, dy = (jyy * ex - jxy * ey) / determinant, (jxx * ey - jyx * ex) / determinant
             xi, yi = xi - dx, yi - dy
             if not np.any(np.maximum(np.abs(dx), np.abs(dy)) > 1e-15):
                 break
@@ -127,19 +187,22 @@ def number(value: object, name: str, *, positive: bool = False) -> float:
     return float(value)
 
 
-def numbers(value: object, count: int, name: str) -> tuple[float, ...]:
-    """``value`` as ``count`` finite floats; raises `RigError` naming the key and the entry."""
+def numbers(value: object, counts: int | tuple[int, ...], name: str) -> tuple[float, ...]:
+    """``value`` as finite floats, as many as ``counts`` allows; raises `RigError` naming the key and the entry."""
+    counts = (counts,) if isinstance(counts, int) else counts
+    expected = f"{name}: expected {' or '.join(map(str, counts))} numbers"
     if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
-        raise RigError(f"{name}: expected {count} numbers, got {value!r}")
+        raise RigError(f"{expected}, got {value!r}")
     entries = list(value)
-    require(len(entries) == count, f"{name}: expected {count} numbers, got {len(entries)}")
+    require(len(entries) in counts, f"{expected}, got {len(entries)}")
     return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Size and intrinsics in px, distortion (k1, k2, p1, p2, k3). Raises `RigError` for sizes that are not positive
-    integers, focal lengths that are not positive, non-finite values."""
+    """Size and intrinsics in px, distortion as in this module's docstring; to four coefficients k3 = 0 is added. Raises
+    `RigError` for sizes that are not positive integers, focal lengths that are not positive, non-finite values, another
+    number of coefficients."""
 
     width: int
     height: int
@@ -157,7 +220,8 @@ class Pinhole:
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, number(getattr(self, name), name, positive=name in ("fx", "fy")))
-        object.__setattr__(self, "distortion", numbers(self.distortion, 5, "distortion"))
+        distortion = numbers(self.distortion, COEFFICIENT_COUNTS, "distortion")
+        object.__setattr__(self, "distortion", distortion if len(distortion) > 4 else (*distortion, 0.0))
         w, h = self.width, self.height
         matrix = np.array([[self.fx / w, 0, (self.cx + 0.5) / w], [0, self.fy / h, (self.cy + 0.5) / h], [0, 0, 1]])
         condition = float(np.linalg.cond(matrix)) if np.isfinite(matrix).all() else math.inf

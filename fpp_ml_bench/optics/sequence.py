@@ -1,32 +1,42 @@
 """The projected sequence: what each frame shows, and which frames a configuration needs.
 
-The order is the paper's (Section 3.2): N horizontal sinusoids, N vertical sinusoids, horizontal Gray code, vertical
-Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52 frames. *Horizontal* fringes have horizontal stripes: they vary
-along the projector's rows and measure its coordinate ``v``. *Vertical* fringes vary along its columns, measure ``u``.
+*Horizontal* fringes have horizontal stripes: they vary along the projector's rows and measure its coordinate ``v``.
+*Vertical* fringes vary along its columns, measure ``u``. The paper's order (Section 3.2) is `Sequence`: N horizontal
+sinusoids, N vertical sinusoids, horizontal Gray code, vertical Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52
+frames. Any other sequence is a `CodedSequence`: a code of `fpp_ml_bench.coding` for one direction or both.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding import Code, Fringes, GrayCells, Kind, PhaseShift, equal_shifts
+from fpp_ml_bench.constants import CONFIGS
+from fpp_ml_bench.errors import RigError
 
 Direction = Literal["horizontal", "vertical"]
-Kind = Literal["sinusoid", "gray", "black", "white"]
 
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
 """The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
-CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A projected frame: ``step`` is n of a sinusoid (phase shift 2 pi n / N) or the Gray bit, 0 = most significant."""
+    """A projected frame: ``step`` is n of a sinusoid or the Gray bit, 0 = most significant, ``inverse`` or not;
+    ``fringe`` numbers the periods of a code with several."""
 
     index: int
     kind: Kind
     direction: Direction | None = None
     step: int = 0
+    fringe: int = 0
+    inverse: bool = False
 
     @property
     def column(self) -> str:
@@ -34,16 +44,95 @@ class Frame:
 
     @property
     def title(self) -> str:
-        part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}",
-                "gray": f"{self.direction} Gray bit {self.step}"}.get(self.kind, self.kind)  # fmt: skip
+        period = f" of period {self.fringe}" if self.fringe else ""
+        inverse = ", inverse" if self.inverse else ""
+        part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}{period}",
+                "gray": f"{self.direction} Gray bit {self.step}{inverse}"}.get(self.kind, self.kind)  # fmt: skip
         return f"{self.index}: {part}"
 
 
-@dataclass(frozen=True)
-class Sequence:
-    """The frames of a capture: ``steps`` sinusoids and ``bits`` Gray-code frames per direction, black and white."""
+class AnySequence(ABC):
+    """The frames of a capture."""
 
-    steps: int = 18
+    @property
+    @abstractmethod
+    def frames(self) -> tuple[Frame, ...]:
+        """All frames in the order in which they are projected."""
+
+    @property
+    @abstractmethod
+    def directions(self) -> tuple[Direction, ...]:
+        """The directions that are coded, in the order of `DIRECTIONS`."""
+
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Phase steps of the finest sinusoids, the fewest of the coded directions."""
+
+    @abstractmethod
+    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
+        """Every set of sinusoids of one period in equal steps: direction, frame indices, and shifts in turns."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """The entry ``sequence`` of a rig file."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+    def coded(self, direction: Direction) -> tuple[int, ...]:
+        """Frame indices of a direction's code, in the code's own order: sinusoids, then Gray code."""
+        found = [frame for frame in self.frames if frame.direction == direction]
+        ranked = sorted(found, key=lambda frame: (frame.kind != "sinusoid", frame.index))
+        return tuple(frame.index for frame in ranked)
+
+    def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
+        """Frame indices of a direction's finest sinusoids, in the order of their steps; none where it has none."""
+        finest = self._finest(direction)
+        return tuple(
+            frame.index for frame in self.frames
+            if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == finest
+        )  # fmt: skip
+
+    def gray(self, direction: Direction) -> tuple[int, ...] | range:
+        """Frame indices of a direction's Gray code, most significant bit first; none where it has none."""
+        return tuple(f.index for f in self.frames if f.kind == "gray" and f.direction == direction)
+
+    def bits(self, direction: Direction) -> int:
+        """Gray bits of a direction."""
+        return sum(not self.frames[index].inverse for index in self.gray(direction))
+
+    def _finest(self, direction: Direction) -> int:
+        return 0
+
+    @property
+    def black(self) -> int | None:
+        return next((frame.index for frame in self.frames if frame.kind == "black"), None)
+
+    @property
+    def white(self) -> int | None:
+        return next((frame.index for frame in self.frames if frame.kind == "white"), None)
+
+    def config(self, name: str) -> tuple[int, ...]:
+        """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty where the sequence has
+        none."""
+        horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
+        single = (horizontal or vertical or (0,))[:1]
+        frames = (single, horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
+        if name not in CONFIGS:
+            raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
+        return frames[CONFIGS.index(name)]
+
+
+@dataclass(frozen=True)
+class Sequence(AnySequence):
+    """The paper's kind: ``steps`` sinusoids, of a period that the rig names, and ``bits`` Gray-code frames per
+    direction, black and white."""
+
+    steps: int = 18  # type: ignore[assignment]  # a field is the property that is asked for
     bits_horizontal: int = 7
     bits_vertical: int = 7
 
@@ -57,11 +146,23 @@ class Sequence:
     def __len__(self) -> int:
         return 2 * self.steps + self.bits_horizontal + self.bits_vertical + 2
 
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
+    @property
+    def directions(self) -> tuple[Direction, ...]:
+        return DIRECTIONS
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
 
     def bits(self, direction: Direction) -> int:
         return self.bits_horizontal if direction == "horizontal" else self.bits_vertical
+
+    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
+        turns = np.arange(self.steps) / self.steps
+        return [(direction, tuple(self.sinusoids(direction)), turns) for direction in DIRECTIONS]
+
+    def code(self, direction: Direction, pitch_px: float) -> PhaseShift:
+        """The code of a direction whose fringes have a period of ``pitch_px``."""
+        return _paper_code(self.steps, self.bits(direction), pitch_px)
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
@@ -72,12 +173,10 @@ class Sequence:
         return tuple(Frame(i, *d) for i, d in enumerate(described))
 
     def sinusoids(self, direction: Direction) -> range:
-        """Frame indices of a direction's sinusoids, in the order of their phase shift."""
         first = 0 if direction == "horizontal" else self.steps
         return range(first, first + self.steps)
 
     def gray(self, direction: Direction) -> range:
-        """Frame indices of a direction's Gray code, most significant bit first."""
         first = 2 * self.steps + (0 if direction == "horizontal" else self.bits_horizontal)
         return range(first, first + self.bits(direction))
 
@@ -89,13 +188,134 @@ class Sequence:
     def white(self) -> int:
         return len(self) - 1
 
-    def config(self, name: str) -> tuple[int, ...]:
-        """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``."""
-        horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
-        frames = ((0,), horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
-        if name not in CONFIGS:
-            raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
-        return frames[CONFIGS.index(name)]
+
+@lru_cache
+def _paper_code(steps: int, bits: int, pitch_px: float) -> PhaseShift:
+    return PhaseShift((Fringes(pitch_px, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch_px / 2, bits))
+
+
+@dataclass(frozen=True)
+class CodedSequence(AnySequence):
+    """A ``horizontal`` or ``vertical`` code, or both, and the ``order`` of what is projected: directions, black and
+    white; or ``crossed`` in place of both directions, a single frame that is the mean of their single frames."""
+
+    horizontal: Code | None
+    vertical: Code | None
+    order: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not self.directions:
+            raise RigError("sequence: no direction is coded; describe horizontal, vertical or both")
+        crossed = "crossed" in self.order
+        if crossed and (len(self.directions) < 2 or any(len(self.code(d).shown) != 1 for d in self.directions)):
+            raise RigError("sequence.order: crossed needs a code of a single frame for both directions (steps: 1)")
+        known = ("crossed", "black", "white") if crossed else (*self.directions, "black", "white")
+        for name in self.order:
+            if name not in known or self.order.count(name) > 1:
+                raise RigError(f"sequence.order: expected each of {', '.join(known)} at most once, got {self.order}")
+        for direction in self.directions:
+            code = self.code(direction)
+            needed = ("crossed" if crossed else direction, *(("black", "white") if code.needs_flat else ()))
+            missing = [name for name in needed if name not in self.order]
+            if missing:
+                raise RigError(f"sequence.order: {', '.join(missing)} missing, which the {direction} code needs")
+
+    @property
+    def directions(self) -> tuple[Direction, ...]:
+        return tuple(direction for direction in DIRECTIONS if getattr(self, direction) is not None)
+
+    def code(self, direction: Direction, pitch_px: float | None = None) -> Code:
+        """The code of a direction. Raises `RigError` where it has none."""
+        code: Code | None = getattr(self, direction)
+        if code is None:
+            raise RigError(f"this rig projects no {direction} fringes or codes, only {self.directions[0]} ones")
+        return code
+
+    @property
+    def steps(self) -> int:
+        return min(len(self.sinusoids(direction)) for direction in self.directions)
+
+    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
+        found = []
+        for direction in self.directions:
+            code = self.code(direction)
+            for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
+                steps = len(fringe.shifts_deg)
+                indices = tuple(f.index for f in self.frames if f.direction == direction and f.kind == "sinusoid"
+                                and f.fringe == number)  # fmt: skip
+                for sign in (1, -1):
+                    if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
+                        found.append((direction, indices, sign * np.arange(steps) / steps))
+                        break
+        return found
+
+    @cached_property
+    def frames(self) -> tuple[Frame, ...]:
+        frames: list[Frame] = []
+        for name in self.order:
+            if name in ("black", "white"):
+                frames.append(Frame(len(frames), "black" if name == "black" else "white"))
+                continue
+            if name == "crossed":
+                frames.append(Frame(len(frames), "crossed"))
+                continue
+            direction: Direction = "horizontal" if name == "horizontal" else "vertical"
+            frames += [Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
+                       for i, shown in enumerate(self.code(direction).shown)]  # fmt: skip
+        return tuple(frames)
+
+    def coded(self, direction: Direction) -> tuple[int, ...]:
+        return self._crossed() or super().coded(direction)
+
+    def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
+        return self._crossed() if direction in self.directions and self._crossed() else super().sinusoids(direction)
+
+    def _crossed(self) -> tuple[int, ...]:
+        return tuple(frame.index for frame in self.frames if frame.kind == "crossed")
+
+    def _finest(self, direction: Direction) -> int:
+        code = getattr(self, direction)
+        return code.finest if isinstance(code, PhaseShift) else 0
+
+    def to_dict(self) -> dict[str, Any]:
+        codes = {direction: self.code(direction).to_dict() for direction in self.directions}
+        return {"order": list(self.order)} | {str(direction): code for direction, code in codes.items()}
+
+
+def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
+    """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError` naming the key."""
+    from fpp_ml_bench.coding import code_from_dict
+
+    if not isinstance(entries, Mapping):
+        raise RigError(f"sequence: expected a mapping, got {entries!r}")
+    paper = ("steps", "bits_horizontal", "bits_vertical")
+    coded = ("order", *DIRECTIONS)
+    if any(key in entries for key in coded):
+        unknown = [key for key in entries if key not in coded]
+        if unknown:
+            raise RigError(f"sequence: unknown key {unknown[0]}; expected {', '.join(coded)}")
+        codes = {
+            direction: code_from_dict(entries[direction], lengths_px[direction], f"sequence.{direction}")
+            for direction in DIRECTIONS if direction in entries
+        }  # fmt: skip
+        order = entries.get("order", list(codes))
+        if not isinstance(order, list) or not all(isinstance(name, str) for name in order):
+            raise RigError(f"sequence.order: expected a list of names, got {order!r}")
+        return CodedSequence(codes.get("horizontal"), codes.get("vertical"), tuple(order))
+    problems = [f"unknown key {key}" for key in entries if key not in paper]
+    problems += [f"missing key {key}" for key in paper if key not in entries]
+    if problems:
+        raise RigError(
+            f"sequence: {', '.join(problems)}; expected exactly {', '.join(paper)}, or a code for each direction under "
+            f"{' and '.join(DIRECTIONS)}"
+        )
+    for key in paper:
+        if isinstance(entries[key], bool) or not isinstance(entries[key], int):
+            raise RigError(f"sequence.{key}: expected a whole number, got {entries[key]!r}")
+    try:
+        return Sequence(**entries)
+    except ValueError as error:
+        raise RigError(f"sequence: {error}") from error
 
 
 PAPER_SEQUENCE = Sequence()

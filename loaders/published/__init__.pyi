@@ -2,8 +2,12 @@ from .exporting import FORMS as FORMS
 from .exporting import SAMPLE_FORMS as SAMPLE_FORMS
 from .exporting import chosen_splits as chosen_splits
 from .exporting import export as export
+from .files import matrix_bytes as matrix_bytes
 from .files import parse_matrix as parse_matrix
 from .files import png_chunks as png_chunks
+from .fitting import AGREEING_MM as AGREEING_MM
+from .fitting import depth_difference_mm as depth_difference_mm
+from .fitting import tree_views as tree_views
 from .importing import import_notes as import_notes
 from .importing import import_tree as import_tree
 from .importing import plan_import as plan_import

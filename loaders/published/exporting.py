@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import optics
-from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS
+from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS, VIEWS
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
@@ -20,8 +20,15 @@ from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.published.files import matrix_bytes, png_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage import ALL_SPLITS, MESH_FOLDER, DatasetFolder, depth_range_mm, write_parquet
-from fpp_ml_bench.optics import Direction
+from fpp_ml_bench.loaders.storage import (
+    ALL_SPLITS,
+    GENERATED,
+    MESH_FOLDER,
+    DatasetFolder,
+    depth_range_mm,
+    write_parquet,
+)
+from fpp_ml_bench.optics import Direction, Sequence
 
 FORMS = ("parquet", "mat", "meshes", "patterns")
 SAMPLE_FORMS = ("parquet", "mat")
@@ -133,6 +140,12 @@ def export(
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
         raise BuildError(f"{out}: lies in the dataset itself; give another folder")
+    views = {row["view"] for split in splits for row in dataset.manifest.samples[split]}
+    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and views <= set(VIEWS)):
+        raise DatasetError(
+            f"{dataset.path}: the published layout holds views {', '.join(VIEWS)} and the paper's kind of frames, and "
+            "this dataset has others; export it as parquet"
+        )
     meshes = _meshes(dataset, splits) if "meshes" in forms else []
     with exporting(out) as staging:
         for form in forms:
@@ -154,7 +167,7 @@ def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
     paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
     for path in paths:
         if not path.is_file():
-            imported = dataset.manifest.origin == "imported"
+            imported = dataset.manifest.origin != GENERATED
             hint = "imported datasets have no meshes" if imported else "run: fpp-bench verify"
             raise DatasetError(f"{path}: the mesh is missing; {hint}")
     return paths

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
-from fpp_ml_bench.errors import BuildError, LayoutError, RigError
+from fpp_ml_bench.errors import LayoutError, RigError
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.published import tree as published_tree
 from fpp_ml_bench.loaders.published.files import read_grey_png, read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
-from fpp_ml_bench.loaders.storage import MANIFEST, WORK_FOLDER, Assembly, Manifest, Progress, ShardPlan
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.loaders.storage import Assembly, Manifest, Progress, ShardPlan
+from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
 IMPORTED = "imported"
 _CHECK_THREADS = 4
@@ -82,7 +82,7 @@ class SampleReader:
                 problems.append(f"{sample.frames[0]}: differs from the single-shot input {sample.fringes[0]}")
             if self.order is not None:
                 problems += self._misfits(sample, present, self.order)
-                ordered = self.order.frames(self.rig.sequence)
+                ordered = self.order.frames(self.rig.paper_sequence)
                 frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
         if problems or depth_mm is None:
             raise LayoutError("\n".join(problems))
@@ -227,16 +227,7 @@ def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress
     When a file is wrong, all others are checked too, so that the `LayoutError` lists every wrong file. Raises
     `BuildError` as a build does, and when the tree changed after ``folder`` was finished."""
     samples = plan.reader.tree.by_name
-    if (folder / MANIFEST).is_file():
-        for sample in samples.values():
-            if path := _changed_after(sample, folder / MANIFEST):
-                raise BuildError(
-                    f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
-                )
-    for shard in plan.assembly.plans:  # one of which a source file changed after it was written is read again
-        receipt = folder / WORK_FOLDER / f"{shard.name}.json"
-        if receipt.is_file() and any(_changed_after(samples[stem], receipt) for stem, _, _ in shard.samples):
-            receipt.unlink()
+    storage.forget_outdated(folder, plan.assembly.plans, lambda sample: samples[sample].files)
     try:
         return storage.assemble(folder, plan.assembly, workers, progress)
     except LayoutError as error:
@@ -259,7 +250,7 @@ def import_notes(manifest: Manifest) -> list[str]:
     if settings["frame_order"]:
         notes.append(f"frame order of the raw scans: {settings['frame_order']}")
         order = parse_order(settings["frame_order"])
-        first_file = (order or FrameOrder()).frames(manifest.sequence)[0]
+        first_file = (order or FrameOrder()).frames(rig_from_dict(manifest.rig).paper_sequence)[0]
         if first_file.index != SINGLE_SHOT_FRAME:
             notes.append(
                 f"the published single-shot input, A_0.png, is a {first_file.direction} fringe, stored in column "
@@ -301,15 +292,8 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
         refusals.append(
             f"{sample.frames[0].parent}: fits no named frame order. Mismatch with the paper's order: {misfits[0]}"
         )
-    raise published_tree.layout_error(tree.root, refusals)
-
-
-def _changed_after(sample: PublishedSample, moment: Path) -> Path | None:
-    """A file of the sample that changed after the file ``moment`` was written, or None. Unlike the modification time
-    alone, copying or setting times can't reset what is compared here."""
-    written = moment.stat().st_mtime_ns
-    for path in sample.files:
-        status = path.stat()
-        if max(status.st_ctime_ns, status.st_mtime_ns) > written:
-            return path
-    return None
+    hint = (
+        "the order is checked with the rig's axes, given by --rig or else the paper's; for a projector that is turned, "
+        "give a rough rig, from which fpp-bench calibrate --from-depth TREE --camera ROUGH finds the exact one"
+    )
+    raise published_tree.layout_error(tree.root, [*refusals, hint])

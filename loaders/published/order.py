@@ -13,7 +13,7 @@ from itertools import combinations, compress, product
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding import phase_weights, weighted_sums
+from fpp_ml_bench.coding import phase_weights, weighted_sums
 from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Frame, Rig, Sequence
 
@@ -37,6 +37,8 @@ MODIFIERS = (WHITE_FIRST, BACKWARD_STEPS, LEAST_BIT_FIRST)
 _LINES = 24
 _LEAST_CONTRAST = 10.0
 _LEAST_LIT = 0.02
+_SAME_MEAN = 0.1
+"""Grey levels by which the means of two images of the same may differ by noise."""
 _MIDDLE = (0.25, 0.75)
 _MOST_MIDDLE_OF_GRAY, _LEAST_MIDDLE_OF_SINUSOID = 0.15, 0.2
 """A sinusoid has a third of its pixels in the middle half of its range, a two-valued frame only its blurred edges."""
@@ -97,12 +99,13 @@ def all_orders() -> Iterator[FrameOrder]:
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
     """The named order that the images of a raw scan fit, or None."""
     measured = _Lines(files)
-    return next((order for order in all_orders() if not _misfits(measured, order.frames(rig.sequence), rig)), None)
+    sequence = rig.paper_sequence
+    return next((order for order in all_orders() if not _misfits(measured, order.frames(sequence), rig)), None)
 
 
 def check_order(files: list[NDArray[np.uint8]], order: FrameOrder, rig: Rig) -> list[str]:
     """Contradictions between ``order`` and the images of a raw scan, uint8 (H, W) in file order; empty if they fit."""
-    return _misfits(_Lines(files), order.frames(rig.sequence), rig)
+    return _misfits(_Lines(files), order.frames(rig.paper_sequence), rig)
 
 
 class _Lines:
@@ -120,9 +123,10 @@ class _Lines:
 def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
     """Contradictions between the files and ``frames``. Cheap checks come first; the others run only if those pass."""
     file_of_frame = {frame.index: number for number, frame in enumerate(frames)}
-    black, white = file_of_frame[rig.sequence.black], file_of_frame[rig.sequence.white]
+    black, white = file_of_frame[rig.paper_sequence.black], file_of_frame[rig.paper_sequence.white]
     darkest, brightest = int(lines.mean.argmin()), int(lines.mean.argmax())
-    if (darkest, brightest) != (black, white):
+    # A code with more bits than its cells need has a first frame that is black all over, too.
+    if max(lines.mean[black] - lines.mean[darkest], lines.mean[brightest] - lines.mean[white]) > _SAME_MEAN:
         return [
             f"A_{darkest}.png is the darkest and A_{brightest}.png the brightest image; expected black in "
             f"A_{black}.png and white in A_{white}.png"
@@ -133,7 +137,7 @@ def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
     problems = _two_valued(lines, frames, lit, black, white)
     if not problems:
         for direction in DIRECTIONS:
-            sinusoids, codes = rig.sequence.sinusoids(direction), rig.sequence.gray(direction)
+            sinusoids, codes = rig.paper_sequence.sinusoids(direction), rig.paper_sequence.gray(direction)
             problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], lit, direction, rig)
             limit = [(part[black] + part[white]) / 2 for part in lines.parts]
             problems += _codes(lines, [file_of_frame[i] for i in codes], lit, direction, rig, limit)
@@ -161,7 +165,7 @@ def _expected_gradient(direction: Direction, rig: Rig) -> NDArray[np.float64]:
     coordinates_px = []
     for offset in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5)):
         x, y = camera.normalised(*(centre + offset))
-        point = np.array([float(np.asarray(x)), float(np.asarray(y)), 1.0]) * rig.background_m
+        point = np.array([float(np.asarray(x)), float(np.asarray(y)), 1.0]) * rig.background
         coordinates_px.append(float(rig.project(point)[0 if direction == "vertical" else 1]))
     return np.array([coordinates_px[1] - coordinates_px[0], coordinates_px[2] - coordinates_px[0]])
 

@@ -1,3 +1,10 @@
+from .boards import BOARD_FILE as BOARD_FILE
+from .boards import BOARD_POSES as BOARD_POSES
+from .boards import PAPER_BOARD as PAPER_BOARD
+from .boards import BoardPose as BoardPose
+from .boards import board_poses as board_poses
+from .boards import fitting_board as fitting_board
+from .boards import photograph_board as photograph_board
 from .builder import assembly_of as assembly_of
 from .builder import build as build
 from .builder import explain_build as explain_build
@@ -18,6 +25,7 @@ from .projector import PatternLight as PatternLight
 from .raycast import Hits as Hits
 from .raycast import PixelRays as PixelRays
 from .raycast import TracedObject as TracedObject
+from .scene import PHOTOGRAPHED_BY as PHOTOGRAPHED_BY
 from .scene import BuildSettings as BuildSettings
 from .scene import SolidMesh as SolidMesh
 from .scene import UserMesh as UserMesh

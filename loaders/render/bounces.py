@@ -48,24 +48,24 @@ class PlaneLight:
         way = np.column_stack([x, y, np.ones(4)])
         way = way[:, :1] * rig.R[0] + way[:, 1:2] * rig.R[1] + way[:, 2:] * rig.R[2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = (rig.background_m - centre[2]) / way[:, 2]
+            share = (rig.background - centre[2]) / way[:, 2]
         across = centre[:2] + share[:, None] * way[:, :2]
         frames = len(pattern.table)
         if not (np.isfinite(across).all() and (share > 0).all()):  # a projector that looks past the plane
-            return cls(np.zeros((1, 1, frames)), np.zeros(2), 1.0, rig.background_m)
+            return cls(np.zeros((1, 1, frames)), np.zeros(2), 1.0, rig.background)
         corner, extent = across.min(axis=0), np.ptp(across, axis=0)
         cell = float(extent.max()) / PLANE_CELLS
         columns, rows = (max(int(np.ceil(length / cell)), 1) for length in extent)
         fine_x = corner[0] + (np.arange(columns * PLANE_POINTS) + 0.5) * (cell / PLANE_POINTS)
         fine_y = corner[1] + (np.arange(rows * PLANE_POINTS) + 0.5) * (cell / PLANE_POINTS)
         grid = np.stack(np.meshgrid(fine_x, fine_y), axis=-1).reshape(-1, 2)
-        points = np.column_stack([grid, np.full(len(grid), rig.background_m)])
+        points = np.column_stack([grid, np.full(len(grid), rig.background)])
         arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
         table = np.zeros((frames, len(points)))
         pattern.read(arriving.place, arriving.irradiance, table)
         albedo = (1.0 - light.surface.gloss) * light.surface.albedo
         cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
-        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background_m)
+        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background)
 
     def upon(self, surfels: Surfels, degrees: float, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""

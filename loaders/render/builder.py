@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.calibration import volume_error_mm
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import storage
@@ -52,8 +53,11 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
 
 
 def assembly_of(settings: BuildSettings) -> Assembly:
-    """What there is to do for a build, and its manifest so far."""
-    rig, generator = settings.rig, {"name": "fpp-ml-bench", "version": __version__}
+    """What there is to do for a build, and its manifest so far. Raises `CalibrationError` where the rig to decode with
+    has no depth in a part of the range."""
+    if settings.decode_with is not None:
+        volume_error_mm(settings.decode_with, settings.rig)
+    rig, generator = settings.stated_rig, {"name": "fpp-ml-bench", "version": __version__}
     size = rig.camera.height, rig.camera.width
     described, stored = settings.describe(), settings.stored
     manifest = Manifest(storage.GENERATED, generator, described, rig.to_dict(), size, stored, exact=True)

@@ -31,7 +31,7 @@ class Lighting:
     def __init__(self, rig: Rig, light: Light, pattern: PatternLight) -> None:
         self.rig, self.light, self.pattern = rig, light, pattern
         x, y = (rays.ravel() for rays in rig.camera.rays())
-        self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background_m
+        self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background
         self._normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), self._points_m.shape)
         self._empty = self._plane()
         self.modes, self.mix = pattern.modes(rig.sequence)

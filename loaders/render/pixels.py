@@ -69,7 +69,7 @@ def mixed_pixels(
         place = np.minimum(np.searchsorted(sub.pixels, ray), sub.pixels.size - 1)
         of = np.where(sub.pixels[place] == ray, place, -1)
     hit = of >= 0
-    depth_m, triangle = np.full(ray.size, rig.background_m), np.full(ray.size, -1, dtype=np.int32)
+    depth_m, triangle = np.full(ray.size, rig.background), np.full(ray.size, -1, dtype=np.int32)
     normals = np.tile([0.0, 0.0, -1.0], (ray.size, 1))
     depth_m[hit], triangle[hit], normals[hit] = sub.depth_m[of[hit]], sub.triangle[of[hit]], sub.normals[of[hit]]
     seen = np.repeat(central[pixels], total)

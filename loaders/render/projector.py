@@ -15,7 +15,7 @@ from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import DIRECTIONS, Rig, Sequence, pattern_profiles
+from fpp_ml_bench.optics import AnySequence, Rig, pattern_profiles
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 
 FINE = 4
@@ -60,12 +60,14 @@ class PatternLight:
         levels, per_px = np.array([0.0]), 1
         if light.defocus_px > 0:
             levels, per_px = _levels(defocus_variance_px2(rig, light, _distances(rig)).max()), FINE
+        if any(frame.kind == "crossed" for frame in rig.sequence):
+            raise BuildError("crossed fringes can't be rendered yet: project the two directions as frames of their own")
         response = response_table(light.response)
         vertical = np.array([frame.direction == "vertical" for frame in rig.sequence])
         length = max(rig.projector.width, rig.projector.height)
         fine = np.arange((length - 1) * per_px + 1) / per_px
         rows = []
-        footprint = {direction: rig.pitch(direction) / rig.image_px_per_period(direction) for direction in DIRECTIONS}
+        footprint = {direction: rig.projector_px_per_image_px(direction) for direction in rig.directions}
         for frame, profile in zip(rig.sequence, pattern_profiles(rig), strict=True):
             known = rig.pattern_length(frame.direction) if frame.direction else 1
             linear = response[profile[:known]]
@@ -75,22 +77,22 @@ class PatternLight:
         table = np.pad(np.array(rows, dtype=np.float32), ((0, 0), (0, 0), (0, 1)), mode="edge")
         return cls(table, vertical, levels, per_px)
 
-    def modes(self, sequence: Sequence) -> tuple["PatternLight", NDArray[np.float32]]:
+    def modes(self, sequence: AnySequence) -> tuple["PatternLight", NDArray[np.float32]]:
         """Fewer patterns that stand for all in diffuse light: black is left out, and the steps of a direction's
         sinusoids are their mean and first harmonic. Higher harmonics, of a response that is no line, do not survive the
         way over another surface. Returns them and the weights ``mix`` float32 (F, J) that give every frame again."""
         count = len(self.table)
         taken, given, vertical = [], [], []  # per mode: the weight of each frame in it, and its weight in each frame
-        for direction in DIRECTIONS:
-            frames = list(sequence.sinusoids(direction))
-            steps = np.arange(len(frames)) / len(frames)
-            cosine, sine = cosine_of_turns(steps), sine_of_turns(steps)
+        sets = sequence.equal_steps()
+        for direction, indices, turns in sets:
+            frames = list(indices)
+            cosine, sine = cosine_of_turns(turns), sine_of_turns(turns)
             for weights, scale in ((np.ones(len(frames)), 1.0), (cosine, 2.0), (sine, 2.0)):
                 taken.append(np.zeros(count))
                 given.append(np.zeros(count))
                 taken[-1][frames], given[-1][frames] = scale / len(frames) * weights, weights
                 vertical.append(direction == "vertical")
-        sinusoids = {*sequence.sinusoids("horizontal"), *sequence.sinusoids("vertical")}
+        sinusoids = {index for _, indices, _ in sets for index in indices}
         for frame in (frame for frame in range(count) if frame not in sinusoids and frame != sequence.black):
             taken.append(np.eye(count)[frame])
             given.append(np.eye(count)[frame])
@@ -182,7 +184,7 @@ def blurred(signal: NDArray[np.float64], variance: float) -> NDArray[np.float64]
 
 def _distances(rig: Rig) -> NDArray[np.float64]:
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
-    return np.array([near_m, far_m, rig.background_m])
+    return np.array([near_m, far_m, rig.background])
 
 
 def _levels(most: float) -> NDArray[np.float64]:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
+from fpp_ml_bench.constants import CONFIGS, MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
-from fpp_ml_bench.optics import CONFIGS, Rig, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:  # the name of a benchmark needs settings alone
@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # the name of a benchmark needs settings alone
 
 PlacementRule = Literal["fixed", "varied"]
 PLACEMENTS: tuple[PlacementRule, ...] = ("fixed", "varied")
+PHOTOGRAPHED_BY = "photographed_by"
+"""Key of the settings that holds the true rig of a dataset that was decoded with another."""
 
 _MARGIN_PX = 2.0
 
@@ -49,6 +51,9 @@ class UserMesh:
 class BuildSettings:
     """Everything that decides the bytes of a dataset.
 
+    ``rig`` photographs. ``decode_with`` is what a calibration found of it: the ground truth is decoded with that rig,
+    and it is the dataset's, as in a lab.
+
     ``objects`` and ``user_meshes`` are kept in one order, the benchmark's, the unseen ones and then the users' by name,
     whatever order they were given in: it is the order of the rows.
     """
@@ -60,6 +65,7 @@ class BuildSettings:
     seed: int = 42
     light: Light = field(default_factory=lambda: named_light("paper"))
     user_meshes: tuple[UserMesh, ...] = field(default=())
+    decode_with: Rig | None = None
 
     def __post_init__(self) -> None:
         names = {*OBJECTS, *UNSEEN, *(mesh.name for mesh in self.user_meshes)}
@@ -83,14 +89,21 @@ class BuildSettings:
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
+        if self.decode_with is not None:
+            _check_same_devices(self.rig, self.decode_with)
         if self.light.projector.defocus_px > 0:
             from fpp_ml_bench.loaders.render.projector import check_focus  # loads numba
 
             check_focus(self.rig, self.light.projector)
 
+    @property
+    def stated_rig(self) -> Rig:
+        """The rig that the dataset states: it decodes the ground truth, and methods get it."""
+        return self.rig if self.decode_with is None else self.decode_with
+
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
-        return {
+        described = {
             "objects": list(self.objects), "placement": self.placement, "frames": self.stored, "seed": self.seed,
             "light": self.light.model_dump(mode="json"),
             "user_meshes": [
@@ -99,6 +112,25 @@ class BuildSettings:
                 for mesh in self.user_meshes
             ],
         }  # fmt: skip
+        return described if self.decode_with is None else {**described, PHOTOGRAPHED_BY: self.rig.to_dict()}
+
+
+def _check_same_devices(rig: Rig, other: Rig) -> None:
+    """Raise `BuildError` where frames that ``rig`` takes can't be decoded by ``other``."""
+    for device in ("camera", "projector"):
+        sizes = [(part.width, part.height) for part in (getattr(rig, device), getattr(other, device))]
+        if sizes[0] != sizes[1]:
+            (w, h), (other_w, other_h) = sizes
+            raise BuildError(
+                f"the rig to decode with has a {device} of {other_w} x {other_h} px, and the one that photographs "
+                f"{w} x {h} px; calibrate at the size that is built"
+            )
+    codes = [[one.code(direction) for direction in one.directions] for one in (rig, other)]
+    if list(rig.sequence) != list(other.sequence) or codes[0] != codes[1]:
+        raise BuildError(
+            "the rig to decode with has another sequence or pitch than the one that photographs; give both the same "
+            "pitch_px and sequence"
+        )
 
 
 def preset_settings(preset: str, size: int | None = None, light: str = "paper") -> BuildSettings:

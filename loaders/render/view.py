@@ -58,8 +58,9 @@ class Studio:
         self._vignetting = vignetting(camera, falloff) if falloff else None
         self._lens = gaussian_weights(blur_px**2, 3.0).astype(np.float32) if blur_px else None
         self.stored = stored_frames(rig.sequence, settings.stored)
-        # Frames that the ground truth is decoded from and that are not stored: all others but black and white.
-        unneeded = {*self.stored, rig.sequence.black, rig.sequence.white}
+        # Frames that the ground truth is decoded from and that are not stored: all others, mostly but black and white.
+        flat = any(rig.code(direction).needs_flat for direction in rig.directions)
+        unneeded = {*self.stored, *(() if flat else (rig.sequence.black, rig.sequence.white))}
         self.unstored = tuple(i for i in range(len(rig.sequence)) if i not in unneeded)
         self._frames = np.zeros((len(rig.sequence), camera.height, camera.width), dtype=np.uint8)
 
@@ -101,9 +102,9 @@ class Studio:
             shaded = lit.gain > 0 if light.bounces.shadows else None
             mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across, shaded)
             mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
-        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self._brightness(stream), stream)
+        return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream)
 
-    def _brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
+    def brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
         """The view's exposure times the lens's vignetting, for every pixel or one for all."""
         exposure = self.light.camera.exposure
         if isinstance(exposure, tuple):
@@ -181,7 +182,7 @@ class Studio:
         shape, pixels, lit = self._frames.shape[1:], scene.hits.pixels, scene.lit
         flags, cover = np.zeros(self._pixels.size, dtype=np.uint8), np.full(self._pixels.size, 255, dtype=np.uint8)
         flags[pixels[lit.gain == 0]] |= np.uint8(Flag.UNLIT)
-        bounced = np.zeros_like(lit.gain) if lit.bounced is None else lit.bounced[self.rig.sequence.white]
+        bounced = np.zeros_like(lit.gain) if lit.bounced is None else self._of_white(lit.bounced)
         white = (lit.gain + lit.ambient + bounced) * self._of(scene.brightness, pixels, lit)
         flags[pixels[white + self.light.camera.black_grey >= GREY_LEVELS]] |= np.uint8(Flag.SATURATED)
         flags[pixels[(bounced > STRONG_SHARE * lit.gain) & (lit.gain > 0)]] |= np.uint8(Flag.INTERREFLECTION)
@@ -190,9 +191,18 @@ class Studio:
             cover[scene.mixed.pixels] = np.rint(255 * scene.mixed.share).astype(np.uint8)
         return flags.reshape(shape), cover.reshape(shape)
 
+    def _of_white(self, bounced: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What white light would bring, of what each frame's brings, float32 (F, n): without a white frame twice the
+        mean of the fringes, whose steps add up to half of it."""
+        sequence = self.rig.sequence
+        if sequence.white is not None:
+            return bounced[sequence.white]  # type: ignore[no-any-return]
+        fringes = list(sequence.sinusoids(self.rig.fringe_directions[0]))
+        return 2 * bounced[fringes].mean(axis=0)  # type: ignore[no-any-return]
+
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Decoded depth of the exposed frames at the object's pixels ``seen`` bool (H, W); float32 (H, W), 0 beyond."""
-        rig = self.settings.rig
+        rig = self.settings.stated_rig
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))

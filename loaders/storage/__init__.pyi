@@ -1,6 +1,7 @@
 from .assembly import Assembly as Assembly
 from .assembly import Progress as Progress
 from .assembly import assemble as assemble
+from .assembly import forget_outdated as forget_outdated
 from .benchmark import EARLIER as EARLIER
 from .benchmark import Benchmark as Benchmark
 from .benchmark import benchmark_of as benchmark_of
@@ -10,6 +11,7 @@ from .card import RIG_FILE as RIG_FILE
 from .card import ground_truth_summary as ground_truth_summary
 from .card import split_statistics as split_statistics
 from .card import whole_statistics as whole_statistics
+from .manifest import CAPTURED as CAPTURED
 from .manifest import GENERATED as GENERATED
 from .manifest import MANIFEST as MANIFEST
 from .manifest import MESH_FOLDER as MESH_FOLDER
@@ -28,6 +30,7 @@ from .parquet import write_shard as write_shard
 from .shards import ShardPlan as ShardPlan
 from .shards import ShardWriter as ShardWriter
 from .shards import depth_range_mm as depth_range_mm
+from .shards import plan_rows as plan_rows
 from .shards import plan_shards as plan_shards
 from .store import ALL_SPLITS as ALL_SPLITS
 from .store import DatasetFolder as DatasetFolder

@@ -96,6 +96,29 @@ def writing(folder: Path) -> Iterator[Path]:
                 shutil.rmtree(work, ignore_errors=True)
 
 
+def forget_outdated(folder: Path, plans: list[ShardPlan], files: Callable[[str], Iterable[Path]]) -> None:
+    """Let shards of an interrupted import be written again where a source file, of ``files`` by sample, changed after
+    they were. Raises `BuildError` for a finished import of which one changed."""
+    if (manifest := folder / MANIFEST).is_file():
+        for path in (path for plan in plans for sample, _, _ in plan.samples for path in files(sample)):
+            if _changed_after(path, manifest):
+                raise BuildError(
+                    f"{folder}: holds a finished import, and {path} changed after it; give another folder or delete it"
+                )
+    for plan in plans:
+        receipt = folder / WORK_FOLDER / f"{plan.name}.json"
+        sources = (path for sample, _, _ in plan.samples for path in files(sample))
+        if receipt.is_file() and any(_changed_after(path, receipt) for path in sources):
+            receipt.unlink()
+
+
+def _changed_after(path: Path, moment: Path) -> bool:
+    """Whether a file changed after the file ``moment`` was written. Unlike the modification time alone, copying or
+    setting times can't reset what is compared here."""
+    status = path.stat()
+    return max(status.st_ctime_ns, status.st_mtime_ns) > moment.stat().st_mtime_ns
+
+
 def _assemble(folder: Path, scratch: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
     _check_settings(folder, scratch, assembly)
     for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing

@@ -11,13 +11,13 @@ import numpy as np
 from fpp_ml_bench import __version__
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, features, group_columns, stored_groups
-from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.optics import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
-CARD_HEAD = """\
+_HEAD = """\
 ---
-license: mit
+license: {license}
 pretty_name: FPP-ML-Bench
 task_categories:
 - depth-estimation
@@ -29,7 +29,6 @@ tags:
 - metrology
 configs:
 """
-"""Front matter of every card, up to its configurations."""
 _CARD = """\
 - config_name: single_shot
   default: true
@@ -45,13 +44,18 @@ _CARD = """\
 from fpp_ml_bench import load_dataset            # every configuration, memory-mapped, no copy
 {split} = load_dataset("THIS FOLDER", "{config}", split="{split}")
 
-import datasets                                   # frame 0 and depth
+import datasets                                   # frame {first} and depth
 {split} = datasets.load_dataset("THIS FOLDER", "single_shot", split="{split}")   # through its cache
 {split} = datasets.load_from_disk("THIS FOLDER")["{split}"]                      # in place
 ```
 
 `fpp-bench info` says what is in it, `fpp-bench verify` proves it intact. Made by fpp-ml-bench {package}.
 """
+
+
+def card_head(manifest: Manifest) -> str:
+    """Front matter of every card, up to its configurations; captures are under no licence until their owner says so."""
+    return _HEAD.format(license="unknown" if manifest.origin == CAPTURED else "mit")
 
 
 def data_version(fingerprint: str) -> str:
@@ -75,17 +79,17 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         }  # fmt: skip
         contents[f"{split}/dataset_info.json"] = {
             "citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
-            "license": "mit",
+            "license": "" if manifest.origin == CAPTURED else "mit",
         }  # fmt: skip
     for name, content in contents.items():
         write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
     save_rig(rig, folder / RIG_FILE)
     paths = (f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples)
-    text = CARD_HEAD + _CARD.format(
+    text = card_head(manifest) + _CARD.format(
         version=data_version(manifest.fingerprint), data_files="\n".join(paths), origin=manifest.origin,
         rows=sum(len(rows) for rows in manifest.samples.values()), height=manifest.size[0], width=manifest.size[1],
         stored=manifest.stored, split=next(iter(manifest.samples)),
-        config=available_configs(sequence, manifest.stored)[-1], package=__version__,
+        config=available_configs(sequence, manifest.stored)[-1], package=__version__, first=frames[0],
     )  # fmt: skip
     write_atomically(folder / "README.md", text.encode())
     return ["README.md", RIG_FILE, *contents]

@@ -12,13 +12,15 @@ from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.optics import AnySequence, rig_from_dict
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"
 MESH_FOLDER = "meshes"
 GENERATED = "generated"
 """`Manifest.origin` of a dataset that the builder made."""
+CAPTURED = "captured"
+"""That of a dataset decoded from a scanner's captures; objects have any views."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,8 @@ class Manifest:
         return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
     @property
-    def sequence(self) -> Sequence:
-        return Sequence(**self.rig["sequence"])
+    def sequence(self) -> AnySequence:
+        return rig_from_dict(self.rig).sequence
 
     @property
     def stored_frames(self) -> tuple[int, ...]:

@@ -27,7 +27,7 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, RANGE, config_columns
-from fpp_ml_bench.loaders.storage.card import CARD_HEAD, data_version
+from fpp_ml_bench.loaders.storage.card import card_head, data_version
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -248,7 +248,7 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     # Exports of the same dataset with different splits must not share a cache entry.
     identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
     configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
-    return CARD_HEAD + _CARD.format(
+    return card_head(manifest) + _CARD.format(
         configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(), origin=manifest.origin,
         rows=sum(len(dataset.samples(split)) for split in splits), height=dataset.size[0], width=dataset.size[1],
         fingerprint=manifest.fingerprint, config=dataset.configs[0], split=splits[0],

@@ -27,7 +27,7 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.optics import AnySequence
 
 BLOCK_BYTES = 1 << 22
 _BLOCKS = 4
@@ -129,6 +129,8 @@ def _write_block(descriptor: int, view: memoryview) -> None:
 
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
+ROWS_PER_SHARD, SHARD_PX = 24, 1 << 26
+"""A shard's frame and depth map of every row are in memory until it is written: 0.3 GB for so many pixels."""
 Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
 """Files of a written shard, and per row its labels and measurements."""
 
@@ -152,14 +154,29 @@ class ShardPlan:
         return f"{self.split}/{stem}" if group == DATA_GROUP else f"frames/{self.split}/{stem}"
 
 
-def plan_shards(split: str, objects: dict[str, list[tuple[str, str, str]]]) -> list[ShardPlan]:
+Sample = tuple[str, str, str]
+"""Sample, object and view."""
+
+
+def plan_shards(split: str, objects: dict[str, list[Sample]]) -> list[ShardPlan]:
     """Shards of a split from its objects' samples, four objects or a few more each, in the given order."""
     names = list(objects)
-    count = max(1, len(names) // OBJECTS_PER_SHARD)
+    chunks = np.array_split(np.arange(len(names)), max(1, len(names) // OBJECTS_PER_SHARD))
+    return _numbered(split, [tuple(sample for i in chunk for sample in objects[names[i]]) for chunk in chunks])
+
+
+def plan_rows(split: str, samples: list[Sample], image_px: int) -> list[ShardPlan]:
+    """Shards of a split from samples of any number of views: as many as four objects of six views have, or fewer where
+    their images of ``image_px`` would fill the memory."""
+    most = int(np.clip(SHARD_PX // image_px, 1, ROWS_PER_SHARD))
+    chunks = np.array_split(np.arange(len(samples)), -(-len(samples) // most))
+    return _numbered(split, [tuple(samples[i] for i in chunk) for chunk in chunks])
+
+
+def _numbered(split: str, chunks: list[tuple[Sample, ...]]) -> list[ShardPlan]:
     plans, first_row = [], 0
-    for index, chunk in enumerate(np.array_split(np.arange(len(names)), count)):
-        rows = tuple(sample for i in chunk for sample in objects[names[i]])
-        plans.append(ShardPlan(split, index, count, first_row, rows))
+    for index, rows in enumerate(chunks):
+        plans.append(ShardPlan(split, index, len(chunks), first_row, rows))
         first_row += len(rows)
     return plans
 
@@ -189,7 +206,7 @@ class ShardWriter:
     lie in ``scratch``."""
 
     def __init__(
-        self, folder: Path, scratch: Path, sequence: Sequence, stored: str, exact: bool, size: tuple[int, int]
+        self, folder: Path, scratch: Path, sequence: AnySequence, stored: str, exact: bool, size: tuple[int, int]
     ) -> None:
         self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
         self._groups = layout.stored_groups(sequence, stored)

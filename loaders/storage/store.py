@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import SPLITS
+from fpp_ml_bench.constants import CONFIGS, SPLITS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, config_columns, stored_groups
 from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
-from fpp_ml_bench.optics import CONFIGS, Rig, Sequence, rig_from_dict
+from fpp_ml_bench.optics import AnySequence, Rig, rig_from_dict
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -75,7 +75,7 @@ class DatasetFolder:
         return rig_from_dict(self.manifest.rig)
 
     @cached_property
-    def sequence(self) -> Sequence:
+    def sequence(self) -> AnySequence:
         return self.manifest.sequence
 
     @property

@@ -16,7 +16,7 @@ from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, Predic
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, build, camera_noise, solid_mesh
 from fpp_ml_bench.loaders.sample import VOID, Flag
 from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics import paper_rig, rig_from_dict
 
 STEPS = (3, 4, 6, 9, 18)
 
@@ -144,8 +144,71 @@ def test_steps_out_of_bounds(opened, steps):
         ClassicalMethod(opened.rig, steps=steps)
 
 
+UNIT_CUE = {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1}
+GRAY = {"scheme": "gray", "cell_px": 2}
+PLAIN = {"scheme": "phase-shift", "pitch_px": 18, "steps": 9, "gray": {}}
+
+
+@pytest.mark.parametrize(
+    ("sequence", "direction", "title", "frames"),
+    [
+        ({"vertical": UNIT_CUE}, "vertical", "Classical, vertical phase-shift 57 + 912 px", 6),
+        ({"vertical": GRAY}, "vertical", "Classical, vertical Gray code, cells of 2 px", 11),
+        (
+            {"horizontal": UNIT_CUE, "vertical": PLAIN}, "both",
+            "Classical, horizontal phase-shift 57 + 912 px, vertical phase-shift 18 px + Gray code", 22,
+        ),
+        ({"vertical": PLAIN}, "vertical", "Classical 9-step + Gray code, vertical fringes", 16),
+    ],
+)  # fmt: skip
+def test_any_rig(sequence, direction, title, frames):
+    """All that the rig codes; with the paper's kind of code the paper's title and settings."""
+    data = paper_rig(TINY_SIZE).to_dict()
+    del data["pitch_px"]
+    rig = rig_from_dict({**data, "sequence": {"order": ["white", *sequence, "black"], **sequence}})
+    method = ClassicalMethod(rig)
+    assert (method.title, method.direction, len(method.frames_used)) == (title, direction, frames)
+    assert set(method.settings) == {"direction", "steps" if "9-step" in title else "code", "threads"}
+    grey = np.full((TINY_SIZE, TINY_SIZE), 40, np.uint8)
+    used = [grey if i in method.frames_used else None for i in range(len(rig.sequence))]
+    assert not method.predict(used).any()  # nothing varies, and no frame is missing
+    for gone in (method.frames_used[0], method.frames_used[-1]):
+        with pytest.raises(DecodeError, match="got None"):
+            method.predict([None if i == gone else frame for i, frame in enumerate(used)])
+
+
+def one_direction(code):
+    data = paper_rig(TINY_SIZE).to_dict()
+    del data["pitch_px"]
+    return rig_from_dict({**data, "sequence": {"order": ["white", "vertical"], "vertical": code}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "said"),
+    [
+        ({"origin_px": 3}, {}, "needs fringes with a crest on pixel 0.*origin_px 3"),
+        (
+            {"steps": None, "sign": None, "shifts_deg": [90, 210, 330]},
+            {},
+            "vertical frame is shifted.*90 deg",
+        ),
+        ({"sign": 1}, {"error_mm": 3.0}, "error_mm needs fringes of one period with Gray code"),
+    ],
+)
+def test_the_phase_route_refuses_fringes_that_it_would_take_for_others(changes, options, said):
+    rig = one_direction({key: value for key, value in {**UNIT_CUE, **changes}.items() if value is not None})
+    with pytest.raises(PredictionError, match=said):
+        load_method("phase", rig, **options)
+
+
+def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
+    assert load_method("phase", one_direction({**UNIT_CUE, "sign": 1}), frames=3).frames_used == (1, 2, 3)
+    assert load_method("phase", one_direction(UNIT_CUE)).settings["direction"] == "vertical"
+    assert load_method("constant", one_direction(UNIT_CUE)).frames_used == (1,)
+
+
 def test_methods_by_name(opened):
-    assert tuple(METHODS) == ("classical", "phase", "phase-net")
+    assert tuple(METHODS) == ("classical", "phase", "phase-net", "constant")
     assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
     network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper-individual")

@@ -11,7 +11,8 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.decoding import Limits, Reason, decode_stack
+from fpp_ml_bench.coding import Limits, Reason
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.loaders.render import (
     Exposure,
     Lighting,

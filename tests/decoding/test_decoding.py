@@ -9,7 +9,7 @@ import pytest
 from captures import LENSES, PAPER, TURNED, capture, tilted
 
 from fpp_ml_bench.baselines.stability import coded_rig, plane_stack
-from fpp_ml_bench.decoding.blocks import Limits, Reason
+from fpp_ml_bench.coding import Limits, Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
@@ -90,7 +90,7 @@ def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
 
 @NEEDS_NUMBA
 def test_the_compiled_arctangent_is_numpys_on_every_side():
-    from fpp_ml_bench.decoding.kernels import _minus_atan2
+    from fpp_ml_bench.coding.kernels import _minus_atan2
 
     angles = np.concatenate([np.linspace(-np.pi, np.pi, 5001), np.arange(-8, 9) * np.pi / 8])
     for radius in (1e-3, 1.0, 250.0):
@@ -201,7 +201,10 @@ def test_frames_that_are_not_used_may_be_missing():
     [
         (lambda f: f[:-1], {}, "52 frames.*got 51"),
         (lambda f: [x[:, :-1] for x in f], {}, r"expected shape.*\(200, 200\).*got \(200, 199\)"),
-        (lambda f: [x.astype(np.float32) for x in f], {}, "expected uint8.*float32"),
+        (lambda f: [x.astype(np.float64) for x in f], {}, "expected uint8.*float64"),
+        (lambda f: [x.astype(np.float32) + 300 for x in f], {}, "float32 grey levels of 0 to 255"),
+        (lambda f: [x.astype(np.float32) * np.nan for x in f], {}, "float32 grey levels of 0 to 255"),
+        (lambda f: [*(x.astype(np.float32) for x in f[:9]), *f[9:]], {}, "dtype of the other frames"),
         (lambda f: [np.stack([x] * 3, axis=-1) for x in f], {}, r"got \(200, 200, 3\)"),
         (lambda f: f, {"direction": "diagonal"}, "horizontal, vertical or both"),
         (lambda f: f, {"steps": 2}, "3 to the 18"),

@@ -10,7 +10,7 @@ from flat_planes import DIRECT
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.decoding.blocks import Limits
+from fpp_ml_bench.coding import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, orders_from_phases
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh

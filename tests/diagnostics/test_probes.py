@@ -22,7 +22,8 @@ from fpp_ml_bench.baselines.diagnostics.fits import (
 from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
 from fpp_ml_bench.baselines.diagnostics.linear_report import score
 from fpp_ml_bench.baselines.stability import U32
-from fpp_ml_bench.decoding import depth_from_coordinate, wrapped_phase
+from fpp_ml_bench.coding import wrapped_phase
+from fpp_ml_bench.decoding import depth_from_coordinate
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 

@@ -8,12 +8,12 @@ import torch
 from conftest import tiny_settings
 from torch.utils.data import DataLoader
 
-from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
+from fpp_ml_bench.constants import CONFIGS, FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.render import BuildSettings, build, plan_build
 from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
 from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
-from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 
 def paper(depth_mm, name):

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.optics import Pinhole, Rig, load_rig, paper_rig, rig_from_dict, rotation_matrix, save_rig
 from fpp_ml_bench.optics.pinhole import distort, fold_radius_squared, undistort
-from fpp_ml_bench.optics.rig import Pinhole, Rig, load_rig, paper_rig, rig_from_dict, rotation_matrix, save_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 DISTORTION = (-0.21, 0.11, 0.0013, -0.0021, -0.02)

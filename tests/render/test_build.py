@@ -9,6 +9,7 @@ import trimesh
 from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.constants import (
+    CONFIGS,
     MINI_OBJECTS,
     OBJECTS,
     PRESETS,
@@ -26,7 +27,7 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
 from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
-from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 PAPER = named_light("paper")
 NOISY = PAPER.changed("camera", **camera_noise(2.0))

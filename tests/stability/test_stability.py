@@ -111,12 +111,12 @@ def break_arctangent(monkeypatch):
     def arctan(sine, cosine):
         return -np.arctan(sine / cosine)  # loses the quadrant
 
-    monkeypatch.setattr("fpp_ml_bench.decoding.phase.minus_atan2", arctan)
+    monkeypatch.setattr("fpp_ml_bench.coding.phase.minus_atan2", arctan)
     return cases_of("phase", "modulation, real frames", "gamma")
 
 
 def break_interval(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.decoding.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    monkeypatch.setattr("fpp_ml_bench.coding.minus_atan2", lambda y, x: -np.arctan2(y, x))
     return cases_of("order", "interval of the phase")
 
 

@@ -13,13 +13,14 @@ from conftest import TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
 from scored_dataset import write_predictions
 
+from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.published import FrameOrder, import_notes, parse_order
 from fpp_ml_bench.loaders.published import exporting as export_tree
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
 from fpp_ml_bench.loaders.sample import config_columns
-from fpp_ml_bench.optics import CONFIGS, PAPER_SEQUENCE
+from fpp_ml_bench.optics import PAPER_SEQUENCE
 
 TRAINING = Path("training_datasets")
 SCANS = Path("fpp_synthetic_dataset")

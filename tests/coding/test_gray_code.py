@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fpp_ml_bench.decoding import wrapped_phase
-from fpp_ml_bench.optics.gray_code import (
+from fpp_ml_bench.coding import wrapped_phase
+from fpp_ml_bench.coding.gray_code import (
     absolute_phase,
     binary_to_gray,
     bits_needed,

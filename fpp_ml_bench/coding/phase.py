@@ -26,10 +26,10 @@ class Phase(NamedTuple):
 
 
 def compiled_kernels() -> ModuleType | None:
-    """The decoder's compiled kernels, or None where NumPy is to be used."""
+    """The codes' compiled kernels, or None where NumPy is to be used."""
     if not numba_enabled():
         return None
-    from fpp_ml_bench.decoding import kernels
+    from fpp_ml_bench.coding import kernels
 
     return kernels
 

@@ -1,0 +1,170 @@
+"""Calibration boards: where their points are, and finding them in an image.
+
+A board's points lie in a grid of ``columns`` x ``rows``, row by row. For ``checker`` and ``charuco`` they are the inner
+corners. ``circles-asymmetric`` is OpenCV's: every other row is shifted, point (i, j) lies at ((2 j + i % 2) s, i s).
+
+The grid's labels may come out turned by 180 degrees, from pose to pose: `calibrate` does not mind, since camera and
+projector get theirs from the same label. They are never mirrored.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.errors import CalibrationError
+
+KINDS = ("checker", "circles", "circles-asymmetric", "charuco")
+SUBPIX_SHARE = 0.17
+"""Half the window of a checker's corner, in squares: its edges are straight there, and enough pixels see them."""
+FEWEST_CORNERS = 8
+"""Of a charuco board, of which a part may be out of sight."""
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
+
+
+@dataclass(frozen=True)
+class Board:
+    """``columns`` x ``rows`` points ``spacing_mm`` apart. ``detail_mm``: the circles' radius (0: not known, their bias
+    is not corrected) or the side of charuco's markers; ``dictionary``: the markers', by OpenCV's name. Raises
+    `CalibrationError` for an unknown kind and impossible numbers."""
+
+    kind: str
+    columns: int
+    rows: int
+    spacing_mm: float
+    detail_mm: float = 0.0
+    dictionary: str = "DICT_4X4_1000"
+
+    def __post_init__(self) -> None:
+        wrong = None
+        if self.kind not in KINDS:
+            wrong = f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}"
+        elif min(self.columns, self.rows) < 3:
+            wrong = f"expected at least 3 x 3 points, got {self.columns} x {self.rows}"
+        elif not 0 < self.spacing_mm < np.inf:
+            wrong = f"spacing_mm: expected a positive number of mm, got {self.spacing_mm!r}"
+        elif not 0 <= self.detail_mm < self.spacing_mm:
+            wrong = f"radius or marker: expected mm below the spacing of {self.spacing_mm:g} mm, got {self.detail_mm!r}"
+        elif self.kind == "charuco" and (not self.detail_mm or not hasattr(cv2.aruco, self.dictionary)):
+            got = f"{self.detail_mm:g} mm and {self.dictionary}"
+            wrong = f"charuco needs its markers' side in mm and the name of an OpenCV dictionary, got {got}"
+        if wrong:
+            raise CalibrationError(f"board: {wrong}")
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.columns}x{self.rows}:{self.spacing_mm:g}"
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the circles, 0 for other boards or where it is not known."""
+        return self.detail_mm if self.kind.startswith("circles") else 0.0
+
+    def points_mm(self) -> NDArray[np.float64]:
+        """The points on the board, (n, 3) float64 in mm; z is 0."""
+        row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
+        if self.kind == "circles-asymmetric":
+            column = 2 * column + row % 2
+        return np.stack([column, row, np.zeros_like(row)], axis=1) * float(self.spacing_mm)
+
+    def find(self, image: NDArray[np.uint8], name: str = "image") -> NDArray[np.float64]:
+        """Image coordinates (n, 2) float64 px of the points in an 8-bit image (H, W); NaN for corners of a charuco
+        board that are out of sight. Of a circle it is the centroid of its image, which is not the image of its centre.
+        Raises `CalibrationError` with ``name`` where the board is not found."""
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise CalibrationError(f"{name}: expected an 8-bit grey image, got {image.dtype} of shape {image.shape}")
+        low, high = np.percentile(image, [1, 99.5])
+        stretched = np.clip((image - low) * (255 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+        find = {"checker": self._corners, "charuco": self._charuco}.get(self.kind, self._circles)
+        corners = find(image, stretched)
+        if corners is None:
+            part = "" if self.kind != "charuco" else f" (at least {FEWEST_CORNERS} of its corners)"
+            raise CalibrationError(
+                f"{name}: the board {self} was not found{part}; expected {self.columns} x {self.rows} "
+                f"{'circles' if self.kind.startswith('circles') else 'inner corners'}, in focus, lit, and with a "
+                "margin around them: look at the image, and give the board's numbers of points"
+            )
+        return self._right_handed(corners.reshape(-1, 2).astype(np.float64))
+
+    def _right_handed(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The grids with a mirror plane, which a finder may label from either side, labelled x right, y down."""
+        if self.kind in ("checker", "circles"):
+            grid = corners.reshape(self.rows, self.columns, 2)
+            across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+            if across[0] * down[1] - across[1] * down[0] < 0:
+                return np.ascontiguousarray(grid[:, ::-1]).reshape(-1, 2)
+        return corners
+
+    def _corners(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
+        size = (self.columns, self.rows)
+        accurate = cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_ACCURACY
+        for flags in (accurate, accurate + cv2.CALIB_CB_EXHAUSTIVE):
+            found, corners = cv2.findChessboardCornersSB(stretched, size, flags=flags)
+            if found:
+                return _refined(image, corners)
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(stretched, size, flags=flags)
+        return _refined(image, corners) if found else None
+
+    def _circles(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
+        settings: Any = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
+        settings.minArea, settings.maxArea = 12.0, image.size / (self.columns * self.rows)
+        settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 10
+        settings.minDistBetweenBlobs, settings.filterByConvexity, settings.minInertiaRatio = 4, False, 0.05
+        flags = cv2.CALIB_CB_SYMMETRIC_GRID if self.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
+        for dark in (True, False):
+            picture = stretched if dark else 255 - stretched
+            for clustering in (0, cv2.CALIB_CB_CLUSTERING):
+                found, centres = cv2.findCirclesGrid(
+                    picture, (self.columns, self.rows), flags=flags + clustering,
+                    blobDetector=cv2.SimpleBlobDetector_create(settings),  # type: ignore[attr-defined]
+                )  # fmt: skip
+                if found:
+                    return centres
+        return None
+
+    def _charuco(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        squares = (self.columns + 1, self.rows + 1)
+        board = cv2.aruco.CharucoBoard(squares, self.spacing_mm, self.detail_mm, dictionary)
+        found, labels, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(stretched)
+        if labels is None or len(labels) < FEWEST_CORNERS:
+            return None
+        corners = np.full((self.columns * self.rows, 2), np.nan)
+        corners[np.ravel(labels)] = _refined(image, found).reshape(-1, 2)
+        return corners
+
+
+def _refined(image: NDArray[np.uint8], corners: NDArray) -> NDArray:
+    """Corners at the saddle points of the grey levels: on drawn boards nearer to the truth than the finders' own."""
+    corners = corners.reshape(-1, 1, 2).astype(np.float32)
+    half = int(np.clip(SUBPIX_SHARE * nearest_px(corners[:, 0]).min(), 3, 15))
+    return cv2.cornerSubPix(image.astype(np.float32), corners, (half, half), (-1, -1), _STOP)
+
+
+def nearest_px(corners: NDArray) -> NDArray[np.float64]:
+    """Distance (n,) in px of each corner (n, 2) to its nearest neighbour; NaN for corners that are NaN."""
+    distances = np.hypot(*(corners[:, None] - corners[None]).astype(np.float64).transpose(2, 0, 1))
+    np.fill_diagonal(distances, np.inf)
+    nearest = np.min(np.where(np.isnan(distances), np.inf, distances), axis=1)
+    return np.where(np.isnan(corners[:, 0]), np.nan, nearest)
+
+
+def parse_board(text: str) -> Board:
+    """The board that ``text`` names: ``KIND:COLUMNSxROWS:SPACING[:DETAIL[:DICTIONARY]]`` in mm, such as
+    ``checker:9x13:10``, ``circles:5x9:20:6`` (radius 6 mm), ``charuco:7x10:20:15:DICT_5X5_100`` (markers of 15 mm).
+    Raises `CalibrationError`."""
+    kind, *rest = text.strip().split(":")
+    try:
+        columns, rows = (int(count) for count in rest[0].lower().split("x"))
+        spacing, detail, dictionary, *more = [*rest[1:], *("", "0", Board.dictionary)[len(rest) - 1 :]]
+        if more:
+            raise ValueError
+        spacing_mm, detail_mm = float(spacing), float(detail)
+    except (ValueError, IndexError):
+        raise CalibrationError(
+            "board: expected KIND:COLUMNSxROWS:SPACING in mm, such as checker:9x13:10, or circles:5x9:20:6 for circles "
+            f"with a radius of 6 mm, got {text!r}"
+        ) from None
+    return Board(kind, columns, rows, spacing_mm, detail_mm, dictionary)

@@ -1,0 +1,242 @@
+"""The projector from views whose depth is known: pose, intrinsics and fringe pitch, with the camera given.
+
+Phase and depth alone determine the projector in periods (`projection`): all but the size of its pixels. The pitch in
+px then follows from one more fact: the pitch itself, the focal length in px, or (by default) the pattern's size, with
+square pixels and the principal point in the pattern's middle, (W - 1) / 2 px. A pitch that is within its uncertainty a
+whole number of px, or fits the pattern a whole number of times, is taken as that; also one that is a little farther off
+(`_PITCH_SHARE`), unless the fit gets worse by it.
+
+The phase's origin is the centre of pixel 0, as in the patterns; another origin would shift the principal point.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.calibration.depth_views import MOST_PX, DepthView
+from fpp_ml_bench.calibration.projection import ROBUST, Projection, projection_from
+from fpp_ml_bench.calibration.refinement import CENTRE, NAMES, PITCH, POSE, Measured, Projector, measured_in, refined
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding import depth_from_both
+from fpp_ml_bench.errors import CalibrationError, RigError
+from fpp_ml_bench.optics import AXES, Pinhole, Rig
+
+LEAST_PX = 200
+MOST_SIGMA_PX = 1.5
+"""Robust standard deviation above which the frames are not those of the depth: the decoder's limit for a pixel."""
+MOST_RELATIVE_ERROR = 0.02
+"""Of the pitch and the focal length: above it, the views don't determine them."""
+MOST_OFF_SQUARE = 0.01
+_SIGMAS = 3.0
+_PITCH_SHARE, _PITCH_PX = 0.005, 0.25
+"""A pitch this near to a whole one may be it, whatever its standard error: the part that noise does not explain."""
+_MOST_APART_PX = 0.5
+_MOST_WORSE, _WORSE_PX = 1.05, 1e-3
+_SMALLEST_PX = 1e-4
+_LEVELS = 99.9, 0.1
+_STEP_MM, _BEHIND_M = 10, 0.1
+
+Pair = tuple[float, float]
+
+
+class Residual(NamedTuple):
+    """Depth of the fitted rig from the phases minus the depth given, of ``pixels``: median, robust standard deviation
+    (1.4826 MAD) and RMS in mm, and the RMS distance of projected from measured coordinates in projector px. At
+    ``missing`` further pixels the rig gives no depth. NaN where there is no pixel."""
+
+    name: str
+    pixels: int
+    missing: int
+    median_mm: float
+    sigma_mm: float
+    rms_mm: float
+    rms_px: float
+
+
+@dataclass(frozen=True)
+class DepthFit:
+    """What a fit found: residuals by view and of all views together; the pitch as measured before it was rounded, and
+    its standard error, (vertical, horizontal) in px; and what the pitch was taken from, a sentence."""
+
+    views: tuple[Residual, ...]
+    total: Residual
+    pitch_px: Pair
+    pitch_error_px: Pair
+    pitch_from: str
+
+
+def fit_projector(
+    views: Iterable[DepthView], rig: Rig, size: tuple[int, int] | None = None, *, pitch_px: Pair | None = None,
+    focal_px: float | None = None, lens: bool = False, most_px: int = MOST_PX,
+) -> tuple[Rig, DepthFit]:  # fmt: skip
+    """The rig whose projector gives the views' depth from their phases, by robust least squares over all of them.
+
+    Of ``rig`` the camera, the sequence and the distances are kept; the working range is widened to hold the depths.
+    ``size``: the projector's (width, height) in px, by default that of ``rig``. ``pitch_px``, (vertical, horizontal),
+    or ``focal_px``: what is known of the projector; the principal point is then fitted. ``lens``: fit the projector's
+    first radial term too. Raises `CalibrationError` where the views don't determine a projector or no projector
+    explains them."""
+    if pitch_px is not None and focal_px is not None:
+        raise CalibrationError("pitch_px and focal_px: expected one of them, got both; each follows from the other")
+    views = list(views)
+    count = sum(len(view.depth_mm) for view in views)
+    if count < LEAST_PX:
+        raise CalibrationError(
+            f"expected at least {LEAST_PX} pixels with depth and with both phases, got {count} in {len(views)} views; "
+            "the Gray code must count half periods, and the depth must be that of the frames"
+        )
+    width, height = size or (rig.projector.width, rig.projector.height)
+    measured = measured_in(views, most_px)
+    start = projection_from(measured.points_m, measured.periods.T)
+    search = _Search(measured.only(start.kept), (width, height), frozenset({"k1"} if lens else ()))
+    if pitch_px is not None:
+        fitted = first = search.with_pitch(start, pitch_px)
+        pitch_from = "given"
+    elif focal_px is not None:
+        fitted, first, pitch_from = search.with_focal(start, focal_px)
+    else:
+        fitted, first, pitch_from = search.with_middle(start)
+    _check_fit(fitted, first)
+    result = _rig_of(fitted, rig, (width, height), measured.points_m[:, 2] * MM_PER_M)
+    differences = [_differences(view, result) for view in views]
+    residuals = tuple(_residual(view.name, values) for view, values in zip(views, differences, strict=True))
+    total = _residual("all", np.concatenate(differences, axis=1))
+    errors = first.errors.get("pitch_u", 0.0), first.errors.get("pitch_v", 0.0)
+    return result, DepthFit(residuals, total, first.pair("pitch_u", "pitch_v"), errors, pitch_from)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The fits of a projector of ``size`` px (W, H), in the order that what is known of it allows."""
+
+    measured: Measured
+    size: tuple[int, int]
+    lens: frozenset[str]
+
+    def _fit(self, start: Projector, *free: frozenset[str]) -> Projector:
+        return refined(self.measured, start, POSE.union(self.lens, *free))
+
+    def with_pitch(self, start: Projection, pitch_px: Pair) -> Projector:
+        return self._fit(_projector(start, pitch_px), frozenset({"focal", "aspect"}), CENTRE)
+
+    def with_focal(self, start: Projection, focal_px: float) -> tuple[Projector, Projector, str]:
+        pitch_u, pitch_v = (focal_px / start.focal).tolist()
+        free = self._fit(_projector(start, (pitch_u, pitch_v)), CENTRE, PITCH)
+        fitted, rounded = self._rounded(free, CENTRE)
+        return fitted, free, f"focal length given{rounded}"
+
+    def with_middle(self, start: Projection) -> tuple[Projector, Projector, str]:
+        middle = tuple((length - 1) / 2 for length in self.size)
+        if not (start.centre > 0).all():
+            raise CalibrationError(
+                f"the principal point lies outside the pattern (at {start.centre[0]:.3g} and {start.centre[1]:.3g} "
+                "periods), so the pitch can't be taken from the pattern's middle; give the pitch or the focal length"
+            )
+        begun = _projector(start, (middle[0] / start.centre[0], middle[1] / start.centre[1]))
+        begun = begun.having(c_u=middle[0], c_v=middle[1])
+        free = self._fit(begun, frozenset({"focal", "aspect"}), PITCH)
+        off, error = abs(free.values["aspect"] - 1), free.errors["aspect"]
+        if off > max(MOST_OFF_SQUARE, _SIGMAS * error):
+            raise CalibrationError(
+                f"with the principal point in the middle of {self.size[0]} x {self.size[1]} px, the pixels would not "
+                f"be square (aspect {free.values['aspect']:.4f} +- {error:.4f}). Give the projector's size, its pitch "
+                "or its focal length"
+            )
+        square = self._fit(free.having(aspect=1.0), frozenset({"focal"}), PITCH)
+        fitted, rounded = self._rounded(square, frozenset())
+        return fitted, square, f"square pixels, principal point in the pattern's middle{rounded}"
+
+    def _rounded(self, found: Projector, centre: frozenset[str]) -> tuple[Projector, str]:
+        """The fit with a whole pitch where the found one may be it, else the found one; and words that say so."""
+        pitches, words, certain = {}, [], True
+        for name, length in zip(("pitch_u", "pitch_v"), self.size, strict=True):
+            if whole := _whole_pitch(found.values[name], found.errors[name], length):
+                pitches[name], title = whole
+                words.append(title)
+                certain &= abs(pitches[name] - found.values[name]) <= _SIGMAS * found.errors[name]
+        if not pitches:
+            return found, ""
+        start = found.having(**pitches)
+        fitted = self._fit(start, frozenset({"focal"}), centre, PITCH - pitches.keys())
+        if not certain and fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
+            return found, ""
+        return fitted, "; rounded to " + " and ".join(dict.fromkeys(words))
+
+
+def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[float, str] | None:
+    """The whole number of px, or the whole part of the pattern's length, that a measured pitch may be, and its name."""
+    noise_px = _SIGMAS * error_px + _SMALLEST_PX
+    whole, part = float(round(pitch_px)), length_px / round(length_px / pitch_px)
+    if noise_px < _MOST_APART_PX and abs(whole - pitch_px) <= max(noise_px, min(_PITCH_SHARE * pitch_px, _PITCH_PX)):
+        return whole, "whole px"
+    # Parts of the pattern lie closer together, so that one of them is near any pitch.
+    next_part = length_px / (length_px / part + 1)
+    if noise_px < (part - next_part) / 4 and abs(part - pitch_px) <= noise_px:
+        return part, f"{length_px} px / {length_px / part:.0f}"
+    return None
+
+
+def _projector(start: Projection, pitch_px: Pair) -> Projector:
+    (focal_u, focal_v), (c_u, c_v) = (start.focal * pitch_px).tolist(), (start.centre * pitch_px).tolist()
+    numbers = 0.0, 0.0, 0.0, *start.t.tolist(), focal_u, focal_v / focal_u, c_u, c_v, *pitch_px, 0.0
+    return Projector(dict(zip(NAMES, numbers, strict=True)), start.R, {})
+
+
+def _check_fit(found: Projector, first: Projector) -> None:
+    for name in ("pitch_u", "pitch_v", "focal"):
+        value, error = first.values[name], first.errors.get(name, 0.0)
+        if not error <= MOST_RELATIVE_ERROR * abs(value):
+            raise CalibrationError(
+                f"the views determine the projector's {name.replace('_', ' of ')} only to {value:.2f} +- {error:.2g} "
+                "px; give views at more places and distances, or the pitch"
+            )
+    if not found.sigma_px <= MOST_SIGMA_PX:
+        raise CalibrationError(
+            f"the best projector misses the phases by {found.sigma_px:.2f} px (robust standard deviation), expected at "
+            f"most {MOST_SIGMA_PX} px: the depth is not that of these frames, or not by this camera; check both, and "
+            "the frame order"
+        )
+
+
+def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArray[np.float64]) -> Rig:
+    """``rig`` with the projector found, its distances widened to hold ``depths_mm``."""
+    focal, aspect = found.pair("focal", "aspect")
+    c_u, c_v = found.pair("c_u", "c_v")
+    high_mm, low_mm = np.percentile(depths_mm, _LEVELS).tolist()
+    near = min(rig.working_range_mm[0], _STEP_MM * math.floor(low_mm / _STEP_MM - 1))
+    far = max(rig.working_range_mm[1], _STEP_MM * math.ceil(high_mm / _STEP_MM + 1))
+    x, y, z = (float(found.values[name]) for name in ("t_x", "t_y", "t_z"))
+    try:
+        return replace(
+            rig, projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
+            rotation=tuple(map(tuple, found.rotation.tolist())), translation_m=(x, y, z),
+            pitch_vertical_px=found.values["pitch_u"], pitch_horizontal_px=found.values["pitch_v"],
+            working_range_mm=(near, far), background_m=max(rig.background_m, far / MM_PER_M + _BEHIND_M),
+        )  # fmt: skip
+    except RigError as error:
+        raise CalibrationError(f"the projector found is not one of this sequence and size: {error}") from error
+
+
+def _differences(view: DepthView, rig: Rig) -> NDArray[np.float64]:
+    """Depth by the rig minus the depth given in mm, and projected minus measured u and v in px, (3, n)."""
+    pitches = np.array([[rig.pitch(direction)] for direction in AXES])
+    (u_px, v_px), weights = view.periods * pitches, (view.modulation / pitches) ** 2
+    x, y = view.rays
+    depth_mm = depth_from_both((x, y), u_px, v_px, rig, weights[0], weights[1]).depth_mm
+    projected_u, projected_v = rig.project(view.points_m)
+    return np.stack([depth_mm - view.depth_mm, projected_u - u_px, projected_v - v_px])
+
+
+def _residual(name: str, differences: NDArray[np.float64]) -> Residual:
+    depth_mm, u_px, v_px = differences[:, np.isfinite(differences).all(axis=0)]
+    missing = differences.shape[1] - len(depth_mm)
+    if not len(depth_mm):
+        return Residual(name, 0, missing, *[math.nan] * 4)
+    median = float(np.median(depth_mm))
+    sigma = ROBUST * float(np.median(np.abs(depth_mm - median)))
+    rms_mm, rms_px = (math.sqrt(float(np.mean(squares))) for squares in (depth_mm**2, u_px**2 + v_px**2))
+    return Residual(name, len(depth_mm), missing, median, sigma, rms_mm, rms_px)

@@ -1,0 +1,238 @@
+"""From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each pose does to it."""
+
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.calibration.bundle import Bundle, spread
+from fpp_ml_bench.calibration.checks import check_poses, check_solution, check_start
+from fpp_ml_bench.calibration.circles import without_bias
+from fpp_ml_bench.calibration.lens import MODELS, Lens
+from fpp_ml_bench.calibration.projector_points import Pose
+from fpp_ml_bench.calibration.relabel import same_labels
+from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose
+from fpp_ml_bench.errors import CalibrationError
+
+Lenses = str | Lens | tuple[Lens, Lens]
+WEIGHT_ROUNDS = 4
+CIRCLE_ROUNDS = 10
+CIRCLE_TOLERANCE_PX = 1e-7
+
+
+def calibrate(
+    poses: Sequence[Pose],
+    board: Board,
+    camera_size: tuple[int, int],
+    projector_size: tuple[int, int],
+    lens: Lenses = "radial-3+tangential",
+    *,
+    estimate_board: bool = False,
+    baseline_mm: float | None = None,
+    hold_out: bool = True,
+) -> Calibration:
+    """Calibrate a rig from at least three poses of a flat board; sizes are (width, height) in px.
+
+    ``lens``: a model of `MODELS` or a `Lens` for both devices, or a pair for camera and projector. No point is
+    rejected. Camera and projector residuals are weighted by the inverse of the variances that they show, the
+    projector's with the own uncertainty of each point. ``estimate_board``: the board's points are estimated too, about
+    their nominal places (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect planar target,
+    ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the baseline has this
+    length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out errors (a fit for
+    each pose; needs four).
+
+    Raises `CalibrationError` for too few or parallel poses, other image sizes, mirrored images, points outside the
+    projector, and where the captures don't determine the rig; it names the pose."""
+    lenses = _pair(lens)
+    sizes = (camera_size, projector_size)
+    check_poses(poses, board, sizes)
+    if baseline_mm is not None and not 0 < baseline_mm < np.inf:
+        raise CalibrationError(f"baseline_mm: expected a positive number of mm, got {baseline_mm!r}")
+    bundle, x, jacobian, free, alone = _without_circle_bias(poses, board, sizes, lenses)
+    if estimate_board:
+        poses = same_labels(poses, board, bundle, x)
+        bundle, x, jacobian, free, alone = _without_circle_bias(poses, board, sizes, lenses, free_board=True)
+    root = spread(jacobian, free)
+    check_solution(bundle, x, np.linalg.norm(root, axis=1))
+    held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
+    return _result(bundle, x, root, free.shape[1], alone, held_out, board, sizes, baseline_mm)
+
+
+def compare_lenses(
+    poses: Sequence[Pose],
+    board: Board,
+    camera_size: tuple[int, int],
+    projector_size: tuple[int, int],
+    lenses: Iterable[Lenses] = tuple(MODELS),
+    *,
+    estimate_board: bool = False,
+    baseline_mm: float | None = None,
+) -> list[Calibration]:
+    """`calibrate` with each of the ``lenses``; smallest held-out error first. Needs four poses."""
+    if len(poses) < 4:
+        raise CalibrationError(f"comparing lens models needs at least 4 poses, got {len(poses)}; name the model")
+    sizes, options = (camera_size, projector_size), {"estimate_board": estimate_board, "baseline_mm": baseline_mm}
+    found = [calibrate(poses, board, *sizes, lens, **options) for lens in lenses]  # type: ignore[arg-type]
+    return sorted(found, key=lambda calibration: calibration.held_out_rms_px)
+
+
+def _pair(lens: Lenses) -> tuple[Lens, Lens]:
+    lens = Lens(lens) if isinstance(lens, str) else lens
+    return lens if isinstance(lens, tuple) else (lens, lens)
+
+
+def _without_circle_bias(
+    poses: Sequence[Pose], board: Board, sizes: tuple, lenses: tuple[Lens, Lens], free_board: bool = False
+) -> tuple[Bundle, NDArray, NDArray, NDArray, tuple[float, float]]:
+    """The fit, with the bias of circles' centroids taken off and fitted again until it stays."""
+    start, alone = _start(poses, board, sizes, lenses)
+    bundle = Bundle(poses, board.points_mm(), lenses, free_board)
+    x, jacobian, free = _weighted_fit(bundle, start)
+    for _ in range(CIRCLE_ROUNDS if board.radius_mm else 0):
+        targets = [without_bias(pose, bundle, x, i, board.radius_mm) for i, pose in enumerate(poses)]
+        change = max(np.nanmax(np.abs(new[0] - old[0])) for new, old in zip(targets, bundle.targets, strict=True))
+        bundle.targets = targets
+        x, jacobian, free = _weighted_fit(bundle, x)
+        if change < CIRCLE_TOLERANCE_PX:
+            break
+    return bundle, x, jacobian, free, alone
+
+
+def _start(
+    poses: Sequence[Pose], board: Board, sizes: tuple, lenses: tuple[Lens, Lens]
+) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """All parameters from OpenCV's calibrations of each device and of the pair, and the RMS of each device alone. First
+    with one radial term, from which the full model then starts."""
+    points = board.points_mm().astype(np.float32)
+    intrinsics, rms, views = [], [], []
+    for device, (size, lens) in enumerate(zip(sizes, lenses, strict=True)):
+        seen = [[pose.corners_px, pose.projector.points_px][device] for pose in poses]
+        kept = [np.isfinite(pixels).all(1) for pixels in seen]
+        objects = [points[keep] for keep in kept]
+        images = [pixels[keep].astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        simple = Lens("radial-1" if lens.model != "none" else "none", True, lens.centred)
+        try:
+            _, matrix, distortion, turns, _ = cv2.calibrateCamera(objects, images, size, None, None, flags=simple.flags)
+            if device == 0:
+                check_start(poses, turns)
+            # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the
+            # image gets a margin of its own size all round.
+            margin = np.array(size, dtype=np.float32)
+            matrix, distortion = np.array(matrix, dtype=np.float64), np.ravel(distortion).astype(np.float64)
+            matrix[:2, 2] += np.array(size)
+            error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+                objects, [image + margin for image in images], tuple(3 * length for length in size), matrix,
+                np.resize(distortion, 5), flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
+            )  # fmt: skip
+            matrix = np.array(matrix, dtype=np.float64)
+            matrix[:2, 2] -= np.array(size)
+        except cv2.error as problem:
+            raise CalibrationError(
+                f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): "
+                "the board has to be seen from different directions, and its points labelled alike in all poses"
+            ) from problem
+        distortion = np.resize(np.ravel(distortion), lens.coefficients)
+        if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
+            raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
+        intrinsics.append((matrix, distortion))
+        rms.append(float(error))
+        views.append((turns, shifts))
+    rotations, centres = [], []
+    for pose in range(len(poses)):
+        turn = [cv2.Rodrigues(np.asarray(turns[pose]))[0] for turns, _ in views]
+        shift = [np.asarray(shifts[pose]).ravel() for _, shifts in views]
+        rotations.append(turn[1] @ turn[0].T)
+        centres.append(shift[1] - rotations[-1] @ shift[0])
+    u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))  # the mean rotation
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    parts = [
+        np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
+        for matrix, distortion in intrinsics
+    ]
+    stereo = [cv2.Rodrigues(rotation)[0].ravel(), np.median(centres, axis=0)]
+    boards = [np.ravel(part) for turn, shift in zip(*views[0], strict=True) for part in (turn, shift)]
+    return np.concatenate([*parts, *stereo, *boards, board.points_mm().ravel()]), (rms[0], rms[1])
+
+
+def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    """The fit, repeated with the variances of camera and projector that the last one showed."""
+    x, jacobian, free = bundle.fit(start)
+    for _ in range(WEIGHT_ROUNDS):
+        before = np.array(bundle.extra_px)
+        bundle.weigh(x, free.shape[1])
+        x, jacobian, free = bundle.fit(x)
+        if np.allclose(before, bundle.extra_px, rtol=1e-3):
+            break
+    return x, jacobian, free
+
+
+def _held_out(bundle: Bundle, x: NDArray[np.float64]) -> list[float]:
+    errors = []
+    for index in range(len(bundle.poses)):
+        others = [i for i in range(len(bundle.poses)) if i != index]
+        rig, _, _ = bundle.fit(x, others)
+        fitted, _, _ = bundle.fit(rig, [index], only_poses=True)
+        errors.append(rms_px(*bundle.residuals(fitted, index)))
+    return errors
+
+
+def rms_px(*residuals: NDArray[np.float64]) -> float:
+    """Root of the mean squared length of all residuals (n, 2), NaN left out: OpenCV's reprojection error."""
+    squares = np.concatenate([(residual**2).sum(1) for residual in residuals])
+    return float(np.sqrt(np.nanmean(squares)))
+
+
+def _result(
+    bundle: Bundle, x: NDArray, root: NDArray, unknowns: int, alone: tuple[float, float], held_out: list[float],
+    board: Board, sizes: tuple, baseline_mm: float | None,
+) -> Calibration:  # fmt: skip
+    sigma = np.linalg.norm(root, axis=1)
+    devices = []
+    for part, lens, (width, height) in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
+        (fx, fy, cx, cy, *terms), sigmas = x[part].tolist(), sigma[part].tolist()
+        device = Device(lens, width, height, fx, fy, cx, cy, tuple(terms), tuple(sigmas[:4]), tuple(sigmas[4:]))
+        devices.append(device)
+    turn, shift = x[bundle.stereo][:3], x[bundle.stereo][3:]
+    along = shift / np.linalg.norm(shift)
+    of_shift = root[bundle.stereo][3:]
+    scale, factor = f"from the board's spacing of {board.spacing_mm:g} mm", 1.0
+    baseline_sigma = float(np.linalg.norm(along @ of_shift))
+    if baseline_mm is not None:
+        factor = baseline_mm / float(np.linalg.norm(shift))
+        spacing = f"{board.spacing_mm * factor:.4f}"
+        scale = f"from the baseline of {baseline_mm:g} mm; the board's spacing is then {spacing} mm"
+        of_shift, baseline_sigma = of_shift - np.outer(along, along @ of_shift), 0.0
+    fitted = []
+    every: list[list[NDArray]] = [[], []]
+    for index, pose in enumerate(bundle.poses):
+        residuals = bundle.residuals(x, index)
+        for all_residuals, residual in zip(every, residuals, strict=True):
+            all_residuals.append(residual)
+        place = x[bundle.pose(index)]
+        fitted.append(
+            FittedPose(
+                pose.name, tuple(place[:3].tolist()), tuple((factor * place[3:]).tolist()), rms_px(residuals[0]),
+                rms_px(residuals[1]), rms_px(*residuals), held_out[index], *bundle.targets[index], *residuals,
+            )
+        )  # fmt: skip
+    rotation = cv2.Rodrigues(turn)[0].tolist()
+    return Calibration(
+        devices[0], devices[1], tuple(map(tuple, rotation)), tuple((factor * shift).tolist()),
+        tuple(sigma[bundle.stereo][:3].tolist()), tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
+        factor * baseline_sigma, board.spacing_mm * factor, scale, rms_px(*every[0]), rms_px(*every[1]),
+        rms_px(*every[0], *every[1]), alone, bundle.extra_px, _bic(bundle, x, unknowns), bundle.free_board,
+        factor * x[bundle.board].reshape(-1, 3), tuple(fitted),
+    )  # fmt: skip
+
+
+def _bic(bundle: Bundle, x: NDArray, unknowns: int) -> float:
+    """Bayesian information criterion: -2 log likelihood + unknowns x log(coordinates)."""
+    total, count = 0.0, 0
+    for index in range(len(bundle.poses)):
+        for residual, sigma in zip(bundle.residuals(x, index), bundle.sigmas(index), strict=True):
+            seen = np.isfinite(residual)
+            total += float(((residual[seen] / sigma[seen]) ** 2 + np.log(2 * np.pi * sigma[seen] ** 2)).sum())
+            count += int(seen.sum())
+    return total + (unknowns + 2) * float(np.log(count))

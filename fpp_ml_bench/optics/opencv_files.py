@@ -1,0 +1,264 @@
+"""Calibrations of a camera and a projector in OpenCV's files (FileStorage: XML, YAML, JSON).
+
+Tools name the same numbers differently; these names are read: OpenCV's stereo samples (M1, D1, M2, D2 or cameraMatrix1,
+distCoeffs1, ..., R, T), procamcalib and scan3d-capture (cam_K, cam_kc, proj_K, proj_kc, R, T) and SLStudio (Kc, kc, Kp,
+kp, Rp, Tp). In all of them a point goes from the camera's frame to the projector's by ``X_p = R X_c + T``.
+
+On damaged files OpenCV's reader writes outside its memory (OpenCV 5.0: a few thousand random changes of a file end the
+process), so it runs in a process of its own.
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.optics.pinhole import Pinhole, require
+from fpp_ml_bench.optics.rig import Matrix3
+
+UNITS = {"mm": MM_PER_M, "m": 1.0}
+"""Units of a file's translation, in a metre."""
+SUFFIXES = (".xml", ".yaml", ".yml", ".json")
+LARGEST_BYTES = 1 << 24
+TIMEOUT_S = 60
+ROUNDED = 1e-5
+"""Largest accepted |R R^T - I|: a rotation that was rounded to float32 or to six digits."""
+EXACT = 1e-14
+"""A rotation closer than this is taken as it is, so that writing and reading gives the same numbers."""
+
+_NAMES = {
+    "camera matrix": ("M1", "cameraMatrix1", "cam_K", "Cam_K", "Kc"),
+    "camera's distortion": ("D1", "distCoeffs1", "cam_kc", "Cam_kc", "kc"),
+    "projector matrix": ("M2", "cameraMatrix2", "proj_K", "Proj_K", "Kp"),
+    "projector's distortion": ("D2", "distCoeffs2", "proj_kc", "Proj_kc", "Proj_Kc", "kp"),
+    "rotation": ("R", "Rp"),
+    "translation": ("T", "Tp"),
+}
+_SIZES = {"camera": ("imageSize1", "imageSize"), "projector": ("imageSize2",)}
+_WIDTH_AND_HEIGHT = {"camera": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
+_ERRORS = ("cam_error", "proj_error", "stereo_error")
+
+
+@dataclass(frozen=True)
+class OpenCvCalibration:
+    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``*_error_px``: the
+    reprojection errors that the calibrating tool reported, None where the file has none."""
+
+    camera: Pinhole
+    projector: Pinhole
+    rotation: Matrix3
+    translation_m: tuple[float, float, float]
+    camera_error_px: float | None = None
+    projector_error_px: float | None = None
+    stereo_error_px: float | None = None
+
+
+def read_opencv_calibration(
+    *paths: str | Path, camera_size: tuple[int, int] | None = None, projector_size: tuple[int, int] | None = None,
+    unit: str = "mm",
+) -> OpenCvCalibration:  # fmt: skip
+    """The calibration in a file, or in several that hold parts of it (OpenCV's sample writes intrinsics and extrinsics
+    apart). ``camera_size`` and ``projector_size``: (width, height) in px, needed where the files do not store them;
+    ``unit``: mm or m, of the files' translation. A rotation rounded to float32 becomes the nearest exact one. Raises
+    `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
+    require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
+    require(paths, "expected a calibration file, got none")
+    nodes: dict[str, Any] = {}
+    for path in map(Path, paths):
+        content = _nodes(path)
+        twice = ", ".join(name for name in content if name in nodes)
+        require(not twice, f"{path}: {twice} is also in another of the files; give one calibration only")
+        nodes.update(content)
+    file = ", ".join(map(str, paths))
+    try:
+        translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
+        require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
+        return OpenCvCalibration(
+            _device(nodes, "camera", camera_size),
+            _device(nodes, "projector", projector_size),
+            _rotation(_matrix(nodes, "rotation", (3, 3))),
+            tuple((translation / UNITS[unit]).tolist()),
+            *[_error(nodes, name) for name in _ERRORS],
+        )
+    except RigError as error:
+        raise RigError(f"{file}: {error}") from error
+
+
+def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, unit: str = "mm") -> None:
+    """Write a calibration as XML, YAML or JSON (by the suffix) with the names of OpenCV's stereo samples (M1, D1, M2,
+    D2, R, T), sizes as imageSize1 and imageSize2 and errors as cam_error, proj_error and stereo_error. Reading it gives
+    equal numbers; only a translation that is no number of mm by 1000 changes, by its last bit, where ``unit`` is mm.
+    Raises `RigError` for another suffix or unit, or when the file can't be written."""
+    import cv2
+
+    file = Path(path)
+    require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
+    require(file.suffix.lower() in SUFFIXES, f"{file}: expected a file ending in {', '.join(SUFFIXES)}")
+    storage = cv2.FileStorage()
+    storage.open(f"calibration{file.suffix.lower()}", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    for number, device in enumerate((calibration.camera, calibration.projector), 1):
+        matrix = [[device.fx, 0.0, device.cx], [0.0, device.fy, device.cy], [0.0, 0.0, 1.0]]
+        storage.write(f"M{number}", np.array(matrix))
+        storage.write(f"D{number}", np.array([device.distortion]))
+        storage.startWriteStruct(f"imageSize{number}", cv2.FileNode_SEQ | cv2.FileNode_FLOW)
+        storage.write("", device.width)
+        storage.write("", device.height)
+        storage.endWriteStruct()
+    storage.write("R", np.array(calibration.rotation))
+    storage.write("T", np.array([[_in_unit(t, UNITS[unit])] for t in calibration.translation_m]))
+    errors = calibration.camera_error_px, calibration.projector_error_px, calibration.stereo_error_px
+    for name, error_px in zip(_ERRORS, errors, strict=True):
+        if error_px is not None:
+            storage.write(name, error_px)
+    try:
+        write_atomically(file, storage.releaseAndGetString().encode())
+    except OSError as error:
+        raise RigError(f"{file}: can't be written: {error.strerror or error}") from error
+
+
+def _in_unit(length_m: float, per_metre: float) -> float:
+    """The number that, read again, gives ``length_m`` to the last bit, where there is one."""
+    near = length_m * per_metre
+    return next(
+        (n for n in (near, np.nextafter(near, -np.inf), np.nextafter(near, np.inf)) if n / per_metre == length_m), near
+    )
+
+
+def _device(nodes: dict[str, Any], name: str, given: tuple[int, int] | None) -> Pinhole:
+    matrix = _matrix(nodes, f"{name} matrix", (3, 3))
+    (fx, skew, cx), (zero, fy, cy), last = matrix.tolist()
+    upper = skew == zero == 0.0 and last == [0.0, 0.0, 1.0]
+    require(upper, f"{name} matrix: expected fx 0 cx, 0 fy cy, 0 0 1 (no skew), found {matrix.tolist()}")
+    distortion = _matrix(nodes, f"{name}'s distortion", None).ravel()
+    width, height = _size(nodes, name, given)
+    try:
+        return Pinhole(width, height, fx, fy, cx, cy, tuple(distortion.tolist()))
+    except RigError as error:
+        raise RigError(f"{name}: {error}; a calibration in px with OpenCV's lens model is needed") from error
+
+
+def _size(nodes: dict[str, Any], name: str, given: tuple[int, int] | None) -> tuple[int, int]:
+    """(width, height) in the files, or as given."""
+    stored: Any = next((nodes[key] for key in _SIZES[name] if key in nodes), None)
+    pair = _WIDTH_AND_HEIGHT[name]
+    if stored is None and all(key in nodes for key in pair):
+        stored = [nodes[key] for key in pair]
+    stored = np.ravel(stored["data"]).tolist() if isinstance(stored, dict) else stored
+    names = ", ".join((*_SIZES[name], " with ".join(pair)))
+    if stored is None:
+        missing = f"the size of the {name} is not stored ({names}); give {name}_size=(width, height) in px"
+        require(given is not None, missing)
+        return given  # type: ignore[return-value]
+    whole = isinstance(stored, list) and len(stored) == 2 and all(isinstance(n, int | float) for n in stored)
+    whole = whole and all(np.isfinite(n) and n == int(n) for n in stored)
+    require(whole, f"size of the {name}: expected width and height in px ({names}), found {stored!r}")
+    width, height = (int(n) for n in stored)
+    other = f"{name}_size is given as {given}, but the file says {(width, height)}; give the size of the calibration"
+    require(given is None or tuple(given) == (width, height), other)
+    return width, height
+
+
+def _rotation(matrix: NDArray[np.float64]) -> Matrix3:
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    wrong = f"rotation: not orthonormal, |R R^T - I| is {error:.3g} and may be {ROUNDED:g}"
+    require(error <= ROUNDED, f"{wrong}; write more digits, or calibrate again")
+    require(np.linalg.det(matrix) > 0, "rotation: determinant is -1, a mirror image; check the sign of one axis")
+    if error > EXACT:
+        left, _, right = np.linalg.svd(matrix)
+        matrix = left @ right
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _error(nodes: dict[str, Any], name: str) -> float | None:
+    value = nodes.get(name)
+    number = value is None or (isinstance(value, int | float) and np.isfinite(value) and value >= 0)
+    require(number, f"{name}: expected a reprojection error in px, found {value!r}; remove it if it is not known")
+    return None if value is None else float(value)
+
+
+def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -> NDArray[np.float64]:
+    """The finite matrix of one of ``shapes``, or any vector for None, that the nodes hold under one of its names."""
+    names = [name for name in _NAMES[what] if name in nodes]
+    expected = f"{what}: expected a node {' or '.join(_NAMES[what])}"
+    require(names, f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; rename it, or calibrate again")
+    require(len(names) == 1, f"{expected}, found {' and '.join(names)}; keep one of them")
+    node = nodes[names[0]]
+    require(isinstance(node, dict), f"{names[0]} ({what}): expected a matrix, found {printable(node)}")
+    values = np.array(node["data"], dtype=np.float64).reshape(node["shape"])
+    if shapes == (None,):
+        require(values.size == max(values.shape), f"{names[0]} ({what}): expected a vector, found shape {values.shape}")
+    else:
+        sizes = " or ".join(f"{rows} x {columns}" for rows, columns in filter(None, shapes))
+        require(values.shape in shapes, f"{names[0]} ({what}): expected {sizes} numbers, found shape {values.shape}")
+    require(np.isfinite(values).all(), f"{names[0]} ({what}): expected finite numbers, found {values.tolist()}")
+    return values
+
+
+def _nodes(path: Path) -> dict[str, Any]:
+    """The file's top nodes: matrices as shape and data, sequences as lists, numbers and text as they are."""
+    cure = "give a calibration that OpenCV's FileStorage wrote (XML, YAML or JSON)"
+    try:
+        require(path.is_file(), f"{path}: expected a file, found {'a folder' if path.is_dir() else 'none'}; {cure}")
+        size = path.stat().st_size
+        require(size > 0, f"{path}: the file is empty; {cure}")
+        require(size <= LARGEST_BYTES, f"{path}: {size} bytes are too many for a calibration; {cure}")
+        path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise RigError(f"{path}: expected text, found other bytes; {cure}") from None
+    except OSError as error:
+        raise RigError(f"{path}: can't be read: {error.strerror or error}") from error
+    answer = _parsed_elsewhere(str(path.resolve()))
+    if "nodes" not in answer:
+        reason = f": {printable(answer['problem'])}" if "problem" in answer else ""
+        raise RigError(f"{path}: the file is damaged or of another format, OpenCV can't read it{reason}; {cure}")
+    return answer["nodes"]
+
+
+def _parsed_elsewhere(path: str) -> dict[str, Any]:
+    """`_parsed` in another process; nothing where that ended."""
+    command = [sys.executable, "-P", "-m", __name__, path]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIMEOUT_S)
+        return json.loads(done.stdout) if done.returncode == 0 else {}
+    except (subprocess.TimeoutExpired, ValueError):
+        return {}
+
+
+def _parsed(path: str) -> dict[str, Any]:
+    """What the other process answers for a file: its nodes, or the problem."""
+    import cv2
+
+    def value(node: Any) -> Any:
+        if node.isMap():
+            matrix = node.mat()
+            matrix = np.zeros((0, 0)) if matrix is None else np.asarray(matrix, dtype=np.float64)
+            return {"shape": matrix.shape, "data": matrix.ravel().tolist()}
+        if node.isSeq():
+            return [value(node.at(i)) for i in range(node.size())]
+        return int(node.real()) if node.isInt() else node.real() if node.isReal() else node.string()
+
+    name = None
+    try:
+        storage = cv2.FileStorage()
+        if not storage.open(path, cv2.FILE_STORAGE_READ) or storage.root().empty() or not storage.root().isMap():
+            return {"problem": "it has no named nodes"}
+        nodes, names = {}, storage.root().keys()
+        for name in names:
+            nodes[name] = value(storage.getNode(name))
+        return {"nodes": nodes}
+    except (cv2.error, SystemError) as error:
+        if name is not None:
+            return {"problem": f"node {name} is incomplete, or its numbers do not fill its rows and columns"}
+        return {"problem": " ".join(str(error).partition("error: ")[2].split()) or "it can't be parsed"}
+
+
+if __name__ == "__main__":
+    print(json.dumps(_parsed(sys.argv[1])))

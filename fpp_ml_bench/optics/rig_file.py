@@ -1,0 +1,189 @@
+"""Rig files: YAML or JSON. Reading is strict, and writing and reading again gives an equal rig::
+
+    camera:    {width: 960, height: 960, fx: 2285.8, fy: 2285.8, cx: 479.5, cy: 479.5, distortion: [k1, k2, p1, p2, k3]}
+    projector: {width: 912, height: 1140, fx: 1824.0, fy: 1824.0, cx: 455.5, cy: 569.5, distortion: [0, 0, 0, 0, 0]}
+    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]     # 3 x 3, or a rotation vector of three numbers (rad)
+    translation_m: [0.125, -0.1, 0.0]               # X_projector = rotation X_camera + translation_m
+    pitch_px: {horizontal: 18, vertical: 18}        # projector px per period of each direction's fringes
+    sequence: {steps: 18, bits_horizontal: 7, bits_vertical: 7}
+    working_range_mm: [1500, 2100]
+    standoff_m: 1.8                                 # by default the middle of the range
+    background_m: 3.2                               # a plane behind the range; by default none is known
+
+The sequence above is the paper's. Any other is a code for one direction or both, which holds its own periods (no
+``pitch_px`` then)::
+
+    sequence:
+      order: [white, vertical]                      # as captured; by default horizontal, vertical
+      vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
+      # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
+      # or      {scheme: gray, cell_px: 2, inverse: after each}
+      # or      {scheme: composite, pitches_px: [18, 22]}: one frame, the sum; with both directions of steps: 1,
+      #         order: [crossed] is one frame, the mean of theirs
+
+Camera, projector and pose may be those of a calibration by OpenCV (`opencv_files`), in place of these four entries::
+
+    calibration: calibration.xml                    # or {file: ..., unit: mm, camera_size: [W, H], projector_size: ...}
+
+A distortion has 5, 8, 12 or 14 coefficients (`fpp_ml_bench.optics.pinhole`).
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.files import strict_yaml
+from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
+from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, sequence_from_dict
+
+_RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
+_OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
+
+
+def _mapping(value: object, keys: Iterable[str], name: str, optional: Iterable[str] = ()) -> dict[str, Any]:
+    prefix, expected = f"{name}: " if name else "", ", ".join(keys)
+    if not isinstance(value, Mapping):
+        raise RigError(f"{prefix}expected a mapping with the keys {expected}, got {value!r}")
+    problems = [f"unknown key {key}" for key in value if key not in (*keys, *optional)]
+    problems += [f"missing key {key}" for key in keys if key not in value]
+    possible = f", and optionally {', '.join(optional)}" if optional else ""
+    require(not problems, f"{prefix}{', '.join(problems)}; expected exactly {expected}{possible}")
+    return dict(value)
+
+
+def rig_from_dict(data: object) -> Rig:
+    """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
+    anything unknown, missing, of the wrong type, or impossible as a rig."""
+    sequence = data.get("sequence") if isinstance(data, Mapping) else None
+    coded = isinstance(sequence, Mapping) and any(key in sequence for key in ("order", *DIRECTIONS))
+    keys = tuple(key for key in _RIG_KEYS if not (coded and key == "pitch_px"))
+    entries = _mapping(data, keys, "", _OPTIONAL_RIG_KEYS)
+    if not coded:
+        pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
+        entries |= {f"pitch_{direction}_px": pitch[direction] for direction in DIRECTIONS}
+    for device in ("camera", "projector"):
+        values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
+        if isinstance(lens := values["distortion"], list | tuple) and len(lens) == 4:
+            raise RigError(f"{device}.distortion: expected at least 5 numbers, got 4; write k3 too, as 0")
+        try:
+            entries[device] = Pinhole(**values)
+        except RigError as error:
+            raise RigError(f"{device}.{error}") from error
+    turn = entries["rotation"]
+    if isinstance(turn, list | tuple) and len(turn) == 3 and not any(isinstance(v, list | tuple) for v in turn):
+        entries["rotation"] = rotation_matrix(numbers(turn, 3, "rotation")).tolist()
+    lengths: dict[Direction, int] = {
+        "horizontal": entries["projector"].height, "vertical": entries["projector"].width,
+    }  # fmt: skip
+    entries["sequence"] = sequence_from_dict(entries["sequence"], lengths)
+    entries.setdefault("background_m", None)
+    if "standoff_m" not in entries:
+        near, far = numbers(entries["working_range_mm"], 2, "working_range_mm")
+        entries["standoff_m"] = (near + far) / 2 / MM_PER_M
+    return Rig(**entries)
+
+
+def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    mapping: dict[Any, Any] = {}
+    for key, value in pairs:
+        require(key not in mapping, f"key {key} is given twice in the same mapping; keep one entry")
+        mapping[key] = value
+    return mapping
+
+
+def _is_json(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    require(suffix in (".yaml", ".yml", ".json"), f"{path}: expected a rig file ending in .yaml, .yml or .json")
+    return suffix == ".json"
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
+    return _loaded(Path(path), lambda data: rig_from_dict(_with_calibration(data, Path(path).parent)))
+
+
+def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None) -> Rig:
+    """What a rig file says about the projector alone: its size and sequence, before anything is calibrated. The file is
+    a rig file of which only ``projector`` (width and height), ``sequence`` and, with the paper's kind, ``pitch_px`` are
+    looked at. Returns a rig whose lenses, pose and range are placeholders, good for patterns and projector coordinates,
+    with a camera of ``camera_size`` (width, height). Raises `RigError` as `load_rig`."""
+
+    def stand_in(data: object) -> Rig:
+        require(isinstance(data, Mapping), f"expected a mapping with the keys projector and sequence, got {data!r}")
+        entries = dict(data)  # type: ignore[call-overload]
+        device = entries.get("projector")
+        require(isinstance(device, Mapping), f"projector: expected a mapping with width and height, got {device!r}")
+        sizes = {"camera": camera_size or (1, 1)}
+        for key in ("width", "height"):
+            require(key in device, f"projector.{key}: missing")
+        sizes["projector"] = device["width"], device["height"]
+        devices = {}
+        for name, (width, height) in sizes.items():
+            devices[name] = {"width": width, "height": height, "fx": 1e3, "fy": 1e3, "cx": 0.0, "cy": 0.0,
+                             "distortion": [0.0] * 5}  # fmt: skip
+        kept = {key: entries[key] for key in ("sequence", "pitch_px") if key in entries}
+        pose = {"rotation": np.eye(3).tolist(), "translation_m": [0.1, 0.0, 0.0], "working_range_mm": [1.0, 1e9]}
+        return rig_from_dict({**devices, **kept, **pose})
+
+    return _loaded(Path(path), stand_in)
+
+
+def _with_calibration(data: object, folder: Path) -> object:
+    """A rig file's content with camera, projector and pose from the OpenCV file that ``calibration`` names."""
+    if not isinstance(data, Mapping) or "calibration" not in data:
+        return data
+    entries = dict(data)
+    named = entries.pop("calibration")
+    given = named if isinstance(named, Mapping) else {"file": named}
+    twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
+    require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
+    keys = ("file", "unit", "camera_size", "projector_size")
+    unknown = [str(key) for key in given if key not in keys]
+    require(not unknown, f"calibration: unknown key {', '.join(unknown)}; expected some of {', '.join(keys)}")
+    file = given.get("file")
+    require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
+    sizes: dict[str, tuple[int, int]] = {}
+    for key in ("camera_size", "projector_size"):
+        if key in given:
+            width, height = numbers(given[key], 2, f"calibration.{key}")
+            sizes[key] = int(width), int(height)
+    found = read_opencv_calibration(folder / str(file), unit=str(given.get("unit", "mm")), **sizes)  # type: ignore[arg-type]
+    return {
+        **entries, "camera": found.camera.to_dict(), "projector": found.projector.to_dict(),
+        "rotation": [list(row) for row in found.rotation], "translation_m": list(found.translation_m),
+    }  # fmt: skip
+
+
+def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
+    as_json = _is_json(file)
+    try:
+        text = file.read_text(encoding="utf-8")
+        require(text.strip(), f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
+        return build(json.loads(text, object_pairs_hook=_unique_keys) if as_json else strict_yaml(text))
+    except RigError as error:
+        raise RigError(f"{file}: {error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise RigError(f"{file}: can't be read as text: {error}") from error
+    except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
+        problem = str(error) or "nested too deeply"
+        raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error
+
+
+def save_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig as YAML or JSON (by the suffix); `load_rig` gives an equal rig back, to the last bit."""
+    file = Path(path)
+    data = rig.to_dict()
+    text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RigError(f"{file}: can't be written: {error.strerror or error}") from error

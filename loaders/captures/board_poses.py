@@ -1,0 +1,75 @@
+"""Captures of a calibration board: a folder of frames for each pose, to the points that a calibration needs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fpp_ml_bench.calibration import Board, Calibration, Pose, measure_pose
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.loaders.captures.images import read_frames
+from fpp_ml_bench.optics import AXES, Rig, load_projection, rotation_matrix
+
+FEWEST_POSES = 3
+RANGE_MARGIN = 0.1
+"""A calibrated rig's working range is that of the boards' points, widened by this share of their distance."""
+
+
+def pose_folders(captures: Path) -> list[Path]:
+    """The folders of the poses below ``captures``, by name. Raises `CalibrationError` for fewer than three."""
+    if not captures.is_dir():
+        raise CalibrationError(f"{captures}: no such folder; expected one that holds a folder of frames for each pose")
+    folders = sorted(path for path in captures.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if len(folders) < FEWEST_POSES:
+        raise CalibrationError(
+            f"{captures}: expected folders of at least {FEWEST_POSES} poses of the board, found {len(folders)}"
+        )
+    return folders
+
+
+def board_poses(
+    captures: Path, board: Board, sequence: Path, bits: int | None = None, colour: str | None = None,
+    progress: Callable[[int], None] = lambda poses: None,
+) -> tuple[list[Pose], Rig]:  # fmt: skip
+    """The board's points in every pose folder of ``captures``, in camera and projector px, and a rig with the sequence
+    of the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`). ``bits`` and ``colour``
+    as in `read_frames`. Raises FppBenchError naming the pose or file."""
+    rig = load_projection(sequence)
+    if len(rig.directions) < 2:
+        raise CalibrationError(
+            f"{sequence}: codes {rig.directions[0]} only; a calibration needs the projector's columns and rows, so "
+            "project both directions on the board"
+        )
+    poses: list[Pose] = []
+    for folder in pose_folders(captures):
+        frames = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour).frames
+        height, width = frames.shape[1:]
+        if not poses:
+            rig = load_projection(sequence, (width, height))
+        elif poses[0].size != (width, height):
+            expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
+            raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
+        details = decode_stack(frames, rig, details=True).details
+        white = rig.sequence.white
+        lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
+        u_px, v_px = (details[direction].coordinate_px for direction in AXES)
+        poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
+        progress(1)
+    return poses, rig
+
+
+def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:
+    """The rig of a calibration, with the sequence of ``stand_in``; its working range is ``range_mm``, or that of the
+    boards' points and a margin."""
+    depths = []
+    for pose in found.poses:
+        turn = rotation_matrix(pose.rotation_vector)
+        depths.append(found.board_mm @ turn[2] + pose.translation_mm[2])
+    near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
+    return replace(
+        stand_in, camera=found.camera.pinhole(), projector=found.projector.pinhole(), rotation=found.rotation,
+        translation_m=found.translation_m, working_range_mm=(near, far), standoff_m=(near + far) / 2 / MM_PER_M,
+    )  # fmt: skip

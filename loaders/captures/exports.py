@@ -1,0 +1,208 @@
+"""Depth of a capture in the forms that other programs read: .npy, .mat, 16-bit PNG, point cloud and mesh as PLY.
+
+Points are in mm in the camera's frame (x right, y down, z forward), their normals point at the camera.
+"""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import CaptureError
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.loaders.published import matrix_bytes
+from fpp_ml_bench.optics import Pinhole
+
+FORMS = ("npy", "mat", "png", "ply", "mesh")
+STEEPEST = 5.0
+"""Neighbouring pixels are one surface where depth changes by at most this many times their distance across the ray: a
+surface inclined by up to 79 degrees."""
+MM_PER_LEVEL = (0.001, 0.01, 0.1, 1.0, 10.0)
+"""Units of the PNG; the first one in which the largest depth fits is taken."""
+LARGEST_LEVEL = 65534
+"""65535 would not tell from a depth that was cut off, and `fpp-eval` refuses it."""
+
+Part = tuple[slice, slice]
+_ALL, _BEFORE, _AFTER = slice(None), slice(None, -1), slice(1, None)
+_FIRST, _RIGHT, _BELOW, _ACROSS = (_BEFORE, _BEFORE), (_BEFORE, _AFTER), (_AFTER, _BEFORE), (_AFTER, _AFTER)
+"""The corners of every square of four pixels."""
+
+
+def export_capture(
+    folder: str | Path, depth_mm: ArrayLike, camera: Pinhole, grey: ArrayLike | None = None,
+    forms: Sequence[str] = FORMS, step_mm: float | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``:
+
+    npy    depth.npy: float32 mm
+    mat    depth.mat: float32 mm, variable depthMap
+    png    depth_0.1mm.png: 16-bit levels of a unit from 0.001 to 10 mm, the finest that fits; the unit is in the name
+           and in the text chunk mm_per_level
+    ply    points.ply: binary, a point per pixel with depth: position in mm, normal, and ``grey`` (H, W), grey levels of
+           0 to 255, as intensity and colour
+    mesh   mesh.ply: the same points, neighbours joined by triangles
+
+    ``step_mm``: the largest step in depth between neighbours of one surface, by default `STEEPEST` times their
+    distance. Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the camera's,
+    for grey levels that do not fit, an unknown form, or a folder that can't be written."""
+    if not forms or not set(forms) <= set(FORMS):
+        raise CaptureError(f"forms: expected some of {', '.join(FORMS)}, got {', '.join(map(str, forms)) or 'none'}")
+    depth = _checked(depth_mm, camera, "depth_mm").astype(np.float32)
+    if not depth.any():
+        raise CaptureError("depth_mm: no pixel has a depth, so there is nothing to write; check the capture's light")
+    shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)
+    normals = pixel_normals(depth, camera, step_mm) if {"ply", "mesh"} & set(forms) else np.zeros((0, 0, 3))
+    contents: dict[str, bytes] = {}
+    for form in forms:
+        if form == "npy":
+            buffer = io.BytesIO()
+            np.save(buffer, depth)
+            contents["depth.npy"] = buffer.getvalue()
+        elif form == "mat":
+            contents["depth.mat"] = matrix_bytes({"depthMap": depth})
+        elif form == "png":
+            unit = _unit(float(depth.max()))
+            contents[f"depth_{unit:g}mm.png"] = _png(depth, unit)
+        elif form == "ply":
+            contents["points.ply"] = _ply(depth, camera, normals, shade, np.zeros((0, 3), np.int64))
+        else:
+            contents["mesh.ply"] = _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))
+    place = Path(folder)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            write_atomically(place / name, content)
+    except OSError as error:
+        raise CaptureError(f"{place}: can't be written ({error.strerror or error}); choose another folder") from error
+    return [place / name for name in contents]
+
+
+def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.float64]:
+    """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
+    the differences to the neighbours that belong to the same surface (``step_mm`` as in `export_capture`), and along
+    the ray where there are too few. Raises `CaptureError` as `export_capture`."""
+    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    points = rays * depth[..., None]
+    tangents = []
+    for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
+        joined = _joined(rays, depth, one, other, step_mm)
+        difference = np.where(joined[..., None], points[other] - points[one], 0.0)
+        tangent = np.zeros_like(points)
+        tangent[one] += difference
+        tangent[other] += difference
+        tangents.append(tangent)
+    normals = np.cross(tangents[0], tangents[1])
+    towards = (normals * rays).sum(axis=-1) < 0
+    normals = np.where(towards[..., None], normals, -rays)
+    length = np.sqrt((normals * normals).sum(axis=-1, keepdims=True))
+    return np.where(depth[..., None] > 0, normals / np.where(length > 0, length, 1.0), 0.0)
+
+
+def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.int64]:
+    """Triangles (M, 3) between neighbouring pixels of one surface (``step_mm`` as in `export_capture`), as indices of
+    pixels, row * W + column, in the order that makes their normals point at the camera. A square of four pixels is
+    divided along the diagonal that gives more triangles, or has the smaller step. Raises `CaptureError` as
+    `export_capture`."""
+    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    index = np.arange(depth.size).reshape(depth.shape)
+    sides = (_FIRST, _RIGHT), (_FIRST, _BELOW), (_RIGHT, _ACROSS), (_BELOW, _ACROSS)
+    top, left, right, bottom = (_joined(rays, depth, one, other, step_mm) for one, other in sides)
+    falling, rising = (
+        _joined(rays, depth, one, other, step_mm) for one, other in ((_FIRST, _ACROSS), (_RIGHT, _BELOW))
+    )
+    along_falling = falling & left & bottom, falling & right & top
+    along_rising = rising & left & top, rising & right & bottom
+    more = along_falling[0].astype(int) + along_falling[1] - along_rising[0] - along_rising[1]
+    flatter = np.abs(depth[_FIRST] - depth[_ACROSS]) <= np.abs(depth[_RIGHT] - depth[_BELOW])
+    chosen = (more > 0) | ((more == 0) & flatter)
+    parts = (
+        (chosen & along_falling[0], (_FIRST, _BELOW, _ACROSS)),
+        (chosen & along_falling[1], (_FIRST, _ACROSS, _RIGHT)),
+        (~chosen & along_rising[0], (_FIRST, _BELOW, _RIGHT)),
+        (~chosen & along_rising[1], (_RIGHT, _BELOW, _ACROSS)),
+    )
+    return np.concatenate([np.stack([index[corner][there] for corner in corners], -1) for there, corners in parts])
+
+
+def _checked(values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf) -> NDArray[np.float64]:
+    """``values`` as float64 (H, W) of the camera's size, from 0 to ``most``."""
+    array = np.asarray(values)
+    expected = (camera.height, camera.width)
+    if array.dtype.kind not in "iuf" or array.shape != expected:
+        raise CaptureError(
+            f"{name}: expected real numbers of shape (H, W) = {expected} of the camera, got {array.dtype} of shape "
+            f"{array.shape}; give the map and the calibration of the same images"
+        )
+    array = array.astype(np.float64)
+    bad = int((~((array >= 0) & (array <= min(most, np.finfo(np.float32).max)))).sum())  # NaN too
+    if bad:
+        limits = f"from 0 to {most:g}" if np.isfinite(most) else "from 0, which means none, up"
+        raise CaptureError(f"{name}: expected finite numbers {limits}, got {bad} others (of {array.size} pixels)")
+    return array
+
+
+def _rays_and_depth(depth_mm: NDArray[np.float64], camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays (H, W, 3) with z = 1 and depth in mm; both 0 where the lens has no ray."""
+    x, y = camera.rays()
+    seen = np.isfinite(x) & np.isfinite(y)
+    rays = np.where(seen[..., None], np.stack([x, y, np.ones_like(x)], axis=-1), 0.0)
+    return rays, np.where(seen, depth_mm, 0.0)
+
+
+def _joined(
+    rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part, step_mm: float | None
+) -> NDArray[np.bool_]:
+    """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
+    if step_mm is not None and not 0 < step_mm < np.inf:
+        raise CaptureError(f"step_mm: expected a positive number of mm, got {step_mm!r}; leave it out for the default")
+    near, far, difference = depth[one], depth[other], rays[one] - rays[other]
+    apart = (near + far) / 2 * np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2)
+    return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
+
+
+def _unit(largest_mm: float) -> float:
+    """mm per level."""
+    fitting = [unit for unit in MM_PER_LEVEL if largest_mm <= LARGEST_LEVEL * unit]
+    if not fitting:
+        limit = LARGEST_LEVEL * MM_PER_LEVEL[-1]
+        raise CaptureError(
+            f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; use npy"
+        )
+    return fitting[0]
+
+
+def _png(depth: NDArray[np.float32], unit: float) -> bytes:
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    levels = np.rint(depth.astype(np.float64) / unit)
+    levels = np.where(depth > 0, np.clip(levels, 1, LARGEST_LEVEL), 0).astype(np.uint16)
+    text, buffer = PngInfo(), io.BytesIO()
+    text.add_text("mm_per_level", f"{unit:g}")
+    Image.fromarray(levels).save(buffer, format="PNG", pnginfo=text)
+    return buffer.getvalue()
+
+
+def _ply(
+    depth: NDArray[np.float32], camera: Pinhole, normals: NDArray[np.float64], grey: NDArray[np.float64] | None,
+    faces: NDArray[np.int64],
+) -> bytes:  # fmt: skip
+    """The points with depth and the triangles between them."""
+    import trimesh
+
+    rays, z = _rays_and_depth(depth.astype(np.float64), camera)
+    there = z > 0
+    if not there.any():
+        raise CaptureError("depth_mm: the camera's lens has no ray where there is depth; check its calibration")
+    place = np.cumsum(there.ravel()) - 1
+    points = (rays * z[..., None])[there]
+    solid = trimesh.Trimesh(points, place[faces], vertex_normals=normals[there], process=False, validate=False)
+    if grey is not None:
+        solid.vertex_attributes["intensity"] = grey[there].astype(np.float32)
+        shade = np.rint(grey[there]).astype(np.uint8)
+        colours = np.stack([shade, shade, shade, np.full_like(shade, 255)], axis=-1)
+        solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=colours)
+    return trimesh.exchange.ply.export_ply(solid, vertex_normal=True)

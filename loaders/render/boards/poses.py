@@ -1,0 +1,161 @@
+"""Where a calibration board stands: poses spread over the range, the image, and directions of tilt.
+
+A pose takes points of the board (x to the right, y down, z away from the viewer, the first point at 0) to the camera's
+frame. Poses are computed with the same bits on every processor.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.calibration import Board
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+
+BOARD_POSES = 18
+"""As many as the paper takes (Section 2.3)."""
+PAPER_BOARD = Board("circles-asymmetric", 5, 9, 20.0, 5.0)
+"""The paper's (Section 2.3): 5 x 9 asymmetric circles of 10 mm, 20 mm apart. Its sheet takes 7% of the image at the
+standoff."""
+MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco": 1.5}
+"""From the outer points to the end of the sheet, in spacings."""
+COVERED = 0.65
+"""Share of the image at the standoff that the longer side of `fitting_board` takes."""
+LEAST_TILT = 0.4
+NICE = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+_STEPS = 20
+_MARGIN_PX = 2.0
+_GOLDEN, _PLASTIC = 0.6180339887498949, 0.7548776662466927
+"""Multiples of these, without their whole part, fill the interval from 0 to 1 evenly."""
+_PLACES = ((0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0))
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """``rotation`` (three rows) and ``translation_m``: X_camera = rotation X_board + translation_m."""
+
+    rotation: tuple[tuple[float, float, float], ...]
+    translation_m: tuple[float, float, float]
+
+    def points_m(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) of the board in the camera's frame, metres."""
+        x, y, z = points_m.T
+        rows = zip(self.rotation, self.translation_m, strict=True)
+        return np.column_stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows])
+
+
+def sheet_corners_mm(board: Board) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Upper left and lower right corner (x, y) of a board's sheet, in mm from its first point."""
+    points = board.points_mm()
+    margin = MARGIN[board.kind] * board.spacing_mm
+    right, bottom = (float(points[:, axis].max()) + margin for axis in (0, 1))
+    return (-margin, -margin), (right, bottom)
+
+
+def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int = 9) -> Board:
+    """A board for a rig: its longer side takes `COVERED` of the image's shorter side at the standoff, the spacing a
+    round number of mm. Circles have a radius of 0.3 spacings."""
+    unit = Board(kind, columns, rows, 1.0, 0.3 if kind.startswith("circles") else 0.0)
+    (left, top), (right, bottom) = sheet_corners_mm(unit)
+    camera = rig.camera
+    field_mm = min(camera.width / camera.fx, camera.height / camera.fy) * rig.standoff_m * MM_PER_M
+    most = COVERED * field_mm / max(right - left, bottom - top)
+    power = 10.0 ** np.floor(np.log10(most))
+    spacing = max(nice * power for nice in NICE if nice * power <= most * (1 + 1e-9))
+    return Board(kind, columns, rows, float(f"{spacing:g}"), float(f"{unit.detail_mm * spacing:g}"))
+
+
+def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES, tilt_deg: float = 30.0) -> tuple[BoardPose, ...]:
+    """``count`` poses at which the sheet is within the working range, the image and the pattern: towards the middle,
+    the corners and the sides of the image in turn, tilted by up to ``tilt_deg`` in directions all round, upright and
+    turned by a quarter, at distances over the whole range. Raises `CalibrationError` for a board that does not fit."""
+    if count < 1 or not 0 <= tilt_deg <= 60:
+        raise CalibrationError(f"expected 1 or more poses and a tilt of 0 to 60 degrees, got {count} and {tilt_deg:g}")
+    (left, top), (right, bottom) = (np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board))
+    corners = np.array([[x, y, 0.0] for y in (top, bottom) for x in (left, right)])
+    centre = np.array([(left + right) / 2, (top + bottom) / 2, 0.0])
+    middle, reach = _seen_by_both(rig)
+    poses = []
+    for index in range(count):
+        share = 1.0 if count == 1 else LEAST_TILT + (1 - LEAST_TILT) * (index * _PLASTIC % 1.0)
+        roll = 0.25 * (index % 2) + 0.03 * (index % 3 - 1)
+        rotation = _product(_tilt(tilt_deg / 360 * share, index * _GOLDEN % 1.0), _roll(roll))
+        place = np.array(_PLACES[index % len(_PLACES)]) * reach
+        about = BoardPose(rotation, (0.0, 0.0, 0.0)).points_m(corners - centre)
+        pose = _fitting_pose(rig, rotation, about, centre, middle, place, index * _GOLDEN % 1.0)
+        if pose is None:
+            size = f"{MM_PER_M * (right - left):g} x {MM_PER_M * (bottom - top):g} mm"
+            raise CalibrationError(
+                f"board {board}: its sheet of {size} does not fit the working range, the image and the pattern in pose "
+                f"{index}; {fitting_board(rig, board.kind, board.columns, board.rows)} would suit this rig"
+            )
+        poses.append(pose)
+    return tuple(poses)
+
+
+def _fitting_pose(
+    rig: Rig, rotation: tuple, about: NDArray, centre: NDArray, middle: NDArray, place: NDArray, distance_share: float
+) -> BoardPose | None:
+    """The pose farthest towards ``place`` (px from ``middle``) at the distance nearest to the share of the range."""
+    near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
+    near_m, far_m = near_m - float(about[:, 2].min()), far_m - float(about[:, 2].max())
+    if near_m > far_m:
+        return None
+    shares = sorted((step / _STEPS for step in range(_STEPS + 1)), key=lambda share: abs(share - distance_share))
+    for depth_m in (near_m + (far_m - near_m) * share for share in (distance_share, *shares)):
+        for step in range(_STEPS, -1, -1):
+            pixel = middle + place * (step / _STEPS)
+            x, y = (float(axis) for axis in rig.camera.normalised(*pixel))
+            at = np.array([x, y, 1.0]) * depth_m
+            if _visible(rig, about + at):
+                first = at - BoardPose(rotation, (0.0, 0.0, 0.0)).points_m(centre[None])[0]
+                return BoardPose(rotation, (float(first[0]), float(first[1]), float(first[2])))
+    return None
+
+
+def _visible(rig: Rig, points_m: NDArray[np.float64]) -> bool:
+    """Whether the image and the pattern hold all points (n, 3), with a margin."""
+    for device, (u, v) in ((rig.camera, rig.camera.project(points_m)), (rig.projector, rig.project(points_m))):
+        inside = (u >= _MARGIN_PX) & (u <= device.width - 1 - _MARGIN_PX)
+        inside &= (v >= _MARGIN_PX) & (v <= device.height - 1 - _MARGIN_PX)
+        if not inside.all():
+            return False
+    return True
+
+
+def _seen_by_both(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Middle of the image's part that the projector lights at the standoff, and half of its size, (2,) px each."""
+    camera, projector = rig.camera, rig.projector
+    column, row = (axis.ravel() for axis in np.meshgrid(np.arange(camera.width), np.arange(camera.height)))
+    x, y = (axis.ravel() for axis in camera.rays())
+    u, v = rig.project(np.column_stack([x, y, np.ones_like(x)]) * rig.standoff_m)
+    lit = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
+    if not lit.any():
+        raise CalibrationError(
+            f"the projector lights nothing that the camera sees at the standoff of {rig.standoff_m:g} m; check the rig"
+        )
+    low, high = (np.array([f(column[lit]), f(row[lit])], dtype=float) for f in (np.min, np.max))
+    return (low + high) / 2, (high - low) / 2
+
+
+def _tilt(turns: float, azimuth_turns: float) -> tuple:
+    """Rotation about an axis in the plane of the image, by Rodrigues' formula."""
+    a, b = float(cosine_of_turns(azimuth_turns)), float(sine_of_turns(azimuth_turns))
+    c, s = float(cosine_of_turns(turns)), float(sine_of_turns(turns))
+    return (
+        (c + a * a * (1 - c), a * b * (1 - c), b * s),
+        (a * b * (1 - c), c + b * b * (1 - c), -a * s),
+        (-b * s, a * s, c),
+    )
+
+
+def _roll(turns: float) -> tuple:
+    c, s = float(cosine_of_turns(turns)), float(sine_of_turns(turns))
+    return (c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)
+
+
+def _product(first: tuple, second: tuple) -> tuple:
+    return tuple(tuple(sum(row[k] * second[k][j] for k in range(3)) for j in range(3)) for row in first)

@@ -1,0 +1,221 @@
+"""Calibration of rigs that OpenCV projected: exact points, noise, circles, irregular boards, and what is refused."""
+
+import cv2
+import numpy as np
+import pytest
+from calibration import rigs
+
+from fpp_ml_bench.calibration import Lens, ProjectorPoints, calibrate, compare_lenses, draw_residuals, parse_board
+from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.optics import Rig
+
+BOARD = parse_board("checker:9x7:18")
+SIZES = (rigs.CAMERA_SIZE, rigs.PROJECTOR_SIZE)
+
+
+def _truth():
+    values = []
+    for matrix, terms in ((rigs.CAMERA, rigs.CAMERA_TERMS), (rigs.PROJECTOR, rigs.PROJECTOR_TERMS)):
+        values += [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *terms]
+    return np.array([*values, *rigs.TURN, *rigs.SHIFT_MM])
+
+
+def _values(calibration):
+    values, sigmas = [], []
+    for device in (calibration.camera, calibration.projector):
+        values += [device.fx, device.fy, device.cx, device.cy, *device.distortion]
+        sigmas += [*device.sigma, *device.distortion_sigma]
+    values += [*cv2.Rodrigues(np.array(calibration.rotation))[0].ravel(), *calibration.translation_mm]
+    return np.array(values), np.array([*sigmas, *calibration.rotation_sigma_rad, *calibration.translation_sigma_mm])
+
+
+def test_exact_points_give_the_exact_rig():
+    calibration = calibrate(rigs.poses(BOARD.points_mm()), BOARD, *SIZES)
+    assert calibration.stereo_rms_px < 1e-6 and calibration.held_out_rms_px < 1e-6
+    np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
+    assert calibration.camera.pinhole().fx == pytest.approx(1500, abs=1e-4)
+    camera, projector = calibration.camera.pinhole(), calibration.projector.pinhole()
+    rig = Rig(camera, projector, calibration.rotation, calibration.translation_m)
+    assert rig.baseline_m * 1000 == pytest.approx(calibration.baseline_mm)
+
+
+def test_noise_stays_within_the_stated_uncertainties():
+    scores = []
+    for seed in range(4):
+        poses = rigs.poses(BOARD.points_mm(), noise_px=0.05, seed=seed)
+        calibration = calibrate(poses, BOARD, *SIZES, hold_out=False)
+        values, sigmas = _values(calibration)
+        scores.append((values - _truth()) / sigmas)
+        assert calibration.noise_px == pytest.approx((0.05, 0.05), rel=0.12)
+        assert calibration.stereo_rms_px == pytest.approx(0.05 * 2**0.5, rel=0.1)
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4 and np.abs(scores).max() < 4
+
+
+def test_noisier_projector_coordinates_weigh_less():
+    poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
+    rng = np.random.default_rng(5)
+    noisy = []
+    for pose in poses:
+        points = pose.projector.points_px + rng.normal(0, 0.4, pose.corners_px.shape)
+        sigma = np.full_like(points, 0.4)
+        noisy.append(pose._replace(projector=pose.projector._replace(points_px=points, sigma_px=sigma)))
+    calibration = calibrate(noisy, BOARD, *SIZES, hold_out=False)
+    assert calibration.noise_px[0] == pytest.approx(0.05, rel=0.12) and calibration.noise_px[1] < 0.15
+    values, sigmas = _values(calibration)
+    assert np.abs((values - _truth()) / sigmas).max() < 4
+
+
+def test_the_start_is_opencvs_calibration_and_its_error_is_reported():
+    poses = rigs.poses(BOARD.points_mm(), noise_px=0.3)
+    lens = Lens("radial-1", square_pixels=True, centred=True)
+    calibration = calibrate(poses, BOARD, *SIZES, (lens, Lens("radial-1")), hold_out=False)
+    points = [BOARD.points_mm().astype(np.float32)] * len(poses)
+    images = [pose.corners_px.astype(np.float32) for pose in poses]
+    rms = cv2.calibrateCamera(points, images, rigs.CAMERA_SIZE, None, None, flags=lens.flags)[0]
+    assert calibration.alone_rms_px[0] == pytest.approx(rms, rel=1e-4)
+    assert calibration.camera.fx == calibration.camera.fy and calibration.camera.sigma[2:] == (0.0, 0.0)
+    assert (calibration.camera.cx, calibration.camera.cy) == (639.5, 479.5)
+    assert calibration.camera.distortion[1:] == (0.0,) * 4 and calibration.projector.fx != calibration.projector.fy
+
+
+def test_a_given_baseline_sets_the_scale():
+    poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
+    free = calibrate(poses, BOARD, *SIZES, hold_out=False)
+    scaled = calibrate(poses, BOARD, *SIZES, baseline_mm=200.0, hold_out=False)
+    factor = 200.0 / free.baseline_mm
+    assert scaled.baseline_mm == pytest.approx(200.0) and scaled.baseline_sigma_mm == 0 < free.baseline_sigma_mm
+    assert scaled.spacing_mm == pytest.approx(18 * factor) and "from the baseline of 200 mm" in scaled.scale
+    np.testing.assert_allclose(scaled.poses[2].translation_mm, factor * np.array(free.poses[2].translation_mm))
+    assert scaled.stereo_rms_px == pytest.approx(free.stereo_rms_px, rel=1e-9)
+
+
+@pytest.mark.parametrize("radius_known", [True, False])
+def test_the_bias_of_circles_is_taken_off(radius_known):
+    radius_mm = 7.0
+    board = parse_board("circles:8x6:22" + f":{radius_mm}" * radius_known)
+    points = board.points_mm()
+    angle = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+    outline = radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    poses, bias = [], []
+    for index in range(5):
+        edges = project_outlines(points, outline, index)
+        centres, shown = rigs.project(points, index)
+        step = edges - edges.mean(1, keepdims=True)
+        following = np.roll(step, -1, axis=1)
+        area = (step[..., 0] * following[..., 1] - step[..., 1] * following[..., 0]) / 2  # of triangles at the mean
+        centroids = edges.mean(1) + ((step + following) / 3 * area[..., None]).sum(1) / area.sum(1)[:, None]
+        bias.append(centroids - centres)
+        # What a fit round the centroid would read: the projector's coordinate moves along with the image position.
+        jacobian = projector_jacobian(points, index)
+        shown = shown + np.einsum("nij,nj->ni", jacobian, centroids - centres)
+        projector = ProjectorPoints(shown, np.zeros_like(shown), jacobian, {})
+        poses.append(rigs.pose(f"pose{index}", centroids, shown)._replace(projector=projector))
+    assert np.abs(bias).max() > 0.1
+    calibration = calibrate(poses, board, *SIZES, hold_out=False)
+    error = np.abs(_values(calibration)[0] - _truth())
+    if radius_known:
+        assert calibration.stereo_rms_px < 1e-4 and error[:2].max() < 0.01 and error[-3:].max() < 0.002
+    else:
+        assert error[:2].max() > 0.1  # which the residuals don't show
+
+
+def project_outlines(points, outline, index):
+    edges = (points[:, None] + outline).reshape(-1, 3)
+    return rigs.project(edges, index, middle=points)[0].reshape(len(points), -1, 2)
+
+
+def projector_jacobian(points, index, step_mm=0.01):
+    """Change of projector coordinates with the image position, through small steps on the board."""
+    slopes = []
+    for axis in range(2):
+        ends = [rigs.project(points + sign * step_mm * np.eye(3)[axis], index, middle=points) for sign in (1, -1)]
+        slopes.append([(ends[0][device] - ends[1][device]) / (2 * step_mm) for device in range(2)])
+    to_image = np.stack([slopes[0][0], slopes[1][0]], axis=-1)
+    to_projector = np.stack([slopes[0][1], slopes[1][1]], axis=-1)
+    return to_projector @ np.linalg.inv(to_image)
+
+
+def test_an_irregular_board_is_estimated_whatever_its_labels():
+    board = parse_board("checker:6x5:28")
+    irregular = board.points_mm() + np.random.default_rng(3).normal(0, 0.08, (30, 3))
+    poses = rigs.poses(irregular, noise_px=0.03)
+    for index in (1, 4):
+        points = poses[index].projector
+        turned = ProjectorPoints(points.points_px[::-1], points.sigma_px[::-1], points.jacobian[::-1], {})
+        poses[index] = poses[index]._replace(corners_px=poses[index].corners_px[::-1], projector=turned)
+    given = calibrate(poses, board, *SIZES, hold_out=False)
+    estimated = calibrate(poses, board, *SIZES, estimate_board=True, hold_out=False)
+    assert given.stereo_rms_px > 0.15 and estimated.stereo_rms_px < 0.045
+    errors = [
+        [np.sqrt(np.mean((points - irregular)[:, :2] ** 2)) for points in (found, np.flipud(_turned(found, board)))]
+        for found in (estimated.board_mm, given.board_mm)
+    ]
+    assert min(errors[0]) < 0.03 < min(errors[1])
+
+
+def _turned(points, board):
+    """The points turned by half a turn about the middle of the board."""
+    return np.array([1, 1, 0]) * (2 * board.points_mm().mean(0)) + np.array([-1, -1, 1]) * points
+
+
+def test_the_lens_that_was_there_predicts_best_and_a_bad_pose_is_named():
+    poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
+    found = compare_lenses(poses, BOARD, *SIZES, ("radial-1", "radial-3+tangential"))
+    assert found[0].camera.lens.model == "radial-3+tangential"
+    assert found[0].bic == min(calibration.bic for calibration in found) and found[0].spoilers == ()
+    corners = poses[3].corners_px + np.random.default_rng(1).normal(0, 0.6, poses[3].corners_px.shape)
+    poses[3] = poses[3]._replace(corners_px=corners)
+    assert calibrate(poses, BOARD, *SIZES).spoilers == ("pose3",)
+
+
+def test_missing_points_are_left_out():
+    poses = rigs.poses(BOARD.points_mm())
+    for pose in poses:
+        pose.corners_px[:5] = np.nan
+        pose.projector.points_px[3:9] = np.nan
+        pose.projector.sigma_px[3:9] = np.nan
+    calibration = calibrate(poses, BOARD, *SIZES, hold_out=False)
+    assert calibration.stereo_rms_px < 1e-6
+    np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
+
+
+def test_the_rational_lens_has_eight_terms():
+    calibration = calibrate(rigs.poses(BOARD.points_mm(), noise_px=0.02), BOARD, *SIZES, "rational", hold_out=False)
+    assert len(calibration.camera.distortion) == 8 and calibration.stereo_rms_px < 0.03
+
+
+def _refused(poses, message, **options):
+    with pytest.raises(CalibrationError, match=message):
+        calibrate(poses, BOARD, *SIZES, **options)
+
+
+def test_captures_that_give_no_rig_are_refused_by_name():
+    poses = rigs.poses(BOARD.points_mm(), count=4)
+    _refused(poses[:2], "at least 3 poses of the board, got 2")
+    _refused([poses[0]._replace(size=(640, 480)), *poses[1:]], "pose pose0: the image is 640 x 480 px")
+    _refused(poses, "expected one of none", lens="fisheye")
+    _refused(poses, "baseline_mm", baseline_mm=-1.0)
+    mirrored = poses[2]._replace(corners_px=poses[2].corners_px * [-1, 1] + [1279, 0])
+    _refused([*poses[:2], mirrored], "pose pose2: the camera sees the board mirrored")
+    swapped = poses[1].projector._replace(points_px=poses[1].projector.points_px[:, ::-1] + [500, 0])
+    _refused([poses[0], poses[1]._replace(projector=swapped), poses[2]], "pose pose1: the board lies at projector col")
+    dark = poses[1].projector._replace(points_px=np.full((63, 2), np.nan), reasons={0: "only 3 of 80 pixels"})
+    _refused([poses[0], poses[1]._replace(projector=dark), poses[2]], r"pose pose1: only 0 of 63.*point 0: only 3 of")
+
+
+def test_parallel_boards_are_refused():
+    poses = []
+    for index, distance in enumerate((450.0, 520.0, 600.0, 680.0)):
+        turn, shift = np.array([0.0, 0.1, 0.0]), np.array([-70.0, -60.0, distance])
+        composed = cv2.composeRT(turn, shift, rigs.TURN, rigs.SHIFT_MM)
+        points = BOARD.points_mm()
+        image = cv2.projectPoints(points, turn, shift, rigs.CAMERA, rigs.CAMERA_TERMS)[0].reshape(-1, 2)
+        shown = cv2.projectPoints(points, *composed[:2], rigs.PROJECTOR, rigs.PROJECTOR_TERMS)[0].reshape(-1, 2)
+        poses.append(rigs.pose(f"flat{index}", image, shown))
+    _refused(poses, "poses flat0, flat1, flat2, flat3: the board is parallel in all of them")
+
+
+def test_the_picture_is_a_png():
+    calibration = calibrate(rigs.poses(BOARD.points_mm(), noise_px=0.05), BOARD, *SIZES)
+    picture = cv2.imdecode(np.frombuffer(draw_residuals(calibration), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[0] > 600 and picture.std() > 10

@@ -1,0 +1,113 @@
+"""``fpp-bench calibrate`` from photographed boards, and the chain that it stands in: patterns, captures, rig, depth."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.optics import load_rig, paper_rig, read_opencv_calibration, save_rig
+
+SIZE = 240
+
+
+def calibrate(*words):
+    return main(["calibrate", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def virtual(tmp_path_factory):
+    """Five poses at 240 px with three steps and their Gray code; the rig found from them."""
+    folder = tmp_path_factory.mktemp("virtual")
+    data = {**paper_rig(SIZE).to_dict(), "sequence": {"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}}
+    (folder / "true.yaml").write_text(yaml.safe_dump(data))
+    words = ("--true-rig", folder / "true.yaml", "--poses", 5, "--out", folder / "found.yaml")
+    assert calibrate("--virtual", folder / "boards", *words, "--lens", "none", "--opencv", folder / "found.xml") == 0
+    return folder
+
+
+def test_the_paper_s_calibration_finds_the_rig_that_photographed(virtual, capsys):
+    found, true = load_rig(virtual / "found.yaml"), load_rig(virtual / "true.yaml")
+    assert (found.sequence, found.working_range_mm) == (true.sequence, true.working_range_mm)
+    assert found.camera.fx == pytest.approx(true.camera.fx, rel=5e-3)
+    assert found.baseline_m == pytest.approx(true.baseline_m, rel=5e-3)
+    assert read_opencv_calibration(virtual / "found.xml").camera == found.camera
+    assert (virtual / "found.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_second_run_photographs_nothing_and_says_how_far_it_is_from_the_truth(virtual, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
+    words = ("--true-rig", virtual / "true.yaml", "--poses", 5, "--out", virtual / "again.yaml", "--lens", "none")
+    assert calibrate("--virtual", virtual / "boards", *words) == 0
+    assert before == {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
+    assert "against truth" in capsys.readouterr().out
+    first, again = (load_rig(virtual / f"{name}.yaml") for name in ("found", "again"))
+    assert again.baseline_m == pytest.approx(first.baseline_m, rel=1e-9)
+
+
+def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
+    board = yaml.safe_load((virtual / "boards" / "board.yaml").read_text())["board"]
+    kind, grid, spacing, radius = board.split(":")
+    small = f"{kind}:{grid}:{0.95 * float(spacing)}:{0.95 * float(radius)}"
+    words = ("--sequence", virtual / "boards" / "rig.yaml", "--lens", "none", "--out", tmp_path / "rig.yaml")
+    assert calibrate(virtual / "boards", "--board", small, *words) == 0
+    found, right = load_rig(tmp_path / "rig.yaml"), load_rig(virtual / "found.yaml")
+    assert found.baseline_m / right.baseline_m == pytest.approx(0.95, abs=2e-3)
+    assert found.background_m is None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "expected one of CAPTURES"),
+        (("BOARDS", "--virtual", "x"), "expected one of CAPTURES"),
+        (("BOARDS",), "need --board"),
+        (("BOARDS", "--board", "circles:5x9:50:15"), "need --board"),
+        (("BOARDS", "--board", "square:5x9:50", "--sequence", "TRUE"), "kind: expected one of checker"),
+        (("BOARDS", "--board", "circles:7x9:50:15", "--sequence", "TRUE"), "was not found"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "none.yaml"), "none.yaml: can't be read"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "TRUE", "--lens", "fisheye"), "lens: expected one of none"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "TRUE", "--baseline", "-1"), "baseline_mm: expected a positive"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "ONE"), "codes vertical only"),
+        (("BOARDS", "--board", "BOARD", "--sequence", "OTHER"), "expected 52 frames, found 22"),
+        (("NOWHERE", "--board", "BOARD", "--sequence", "TRUE"), "no such folder"),
+        (("TWO", "--board", "BOARD", "--sequence", "TRUE"), "at least 3 poses of the board, found 2"),
+        (("SIZES", "--board", "BOARD", "--sequence", "TRUE"), "expected 240 x 240 px as in pose_00"),
+        (("MIRRORED", "--board", "BOARD", "--sequence", "TRUE"), "mirrored"),
+        (("--virtual", "boards", "--size", "20"), "--size 20: expected 64"),
+        (("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"), "does not fit"),
+    ],
+)
+def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.chdir(tmp_path)
+    save_rig(paper_rig(SIZE), tmp_path / "other.yaml")
+    vertical = {"scheme": "phase-shift", "pitches_px": [48, 912], "steps": 3}
+    one = {"projector": {"width": 912, "height": 1140}, "sequence": {"vertical": vertical}}
+    (tmp_path / "one.yaml").write_text(yaml.safe_dump(one))
+    boards = virtual / "boards"
+    changed = {
+        "TWO": lambda file, pose: pose < 2 and shutil.copy(boards / file, file),
+        "SIZES": lambda file, pose: write(file, boards, lambda image: image[:200] if pose == 2 else image),
+        "MIRRORED": lambda file, pose: write(file, boards, lambda image: np.ascontiguousarray(image[:, ::-1])),
+    }
+    places = {"BOARDS": boards, "TRUE": virtual / "true.yaml", "BOARD": "circles:5x9:50:15", "NOWHERE": "nowhere",
+              "ONE": "one.yaml", "OTHER": "other.yaml"}  # fmt: skip
+    for name, change in changed.items():
+        if name in words:
+            places[name] = tmp_path / name
+            for pose in range(3 if name != "TWO" else 2):
+                folder = tmp_path / name / f"pose_{pose:02d}"
+                folder.mkdir(parents=True)
+                for source in sorted((boards / folder.name).glob("*.png")):
+                    monkeypatch.chdir(tmp_path / name)
+                    change(source.relative_to(boards), pose)
+            monkeypatch.chdir(tmp_path)
+    assert calibrate(*(places.get(word, word) for word in words), "--out", tmp_path / "rig.yaml") == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error and not (tmp_path / "rig.yaml").exists()
+
+
+def write(file, boards, change):
+    cv2.imwrite(str(file), change(cv2.imread(str(boards / file), cv2.IMREAD_UNCHANGED)))

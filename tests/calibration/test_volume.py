@@ -1,0 +1,79 @@
+"""The depth error of a rig over another's range, against closed forms, and of rigs found from photographed boards."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.calibration import calibrate, measure_pose, volume_error_mm
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.loaders.captures import read_frames
+from fpp_ml_bench.loaders.render import board_poses, fitting_board, photograph_board
+from fpp_ml_bench.optics import CodedSequence, Sequence, paper_rig, rig_from_dict
+
+RIG = paper_rig(240)
+DEPTHS_MM = np.linspace(1500, 2100, 9)
+
+
+def test_a_rig_has_no_error_against_itself():
+    error = volume_error_mm(RIG, RIG)
+    assert error.worst_mm < 1e-9 and error.scale == pytest.approx(1, abs=1e-12)
+
+
+def test_a_longer_baseline_scales_depth():
+    longer = replace(RIG, translation_m=tuple(1.05 * t for t in RIG.translation_m))
+    error = volume_error_mm(longer, RIG)
+    assert error.scale == pytest.approx(1.05, abs=1e-12)
+    assert error.worst_mm == pytest.approx(0.05 * 2100) and 0.05 * 1500 < error.rms_mm < 0.05 * 2100
+
+
+def test_a_shifted_principal_point_of_one_direction_shifts_inverse_depth():
+    """u_p = f (x + b / Z) + c: c + 1 px seen as c gives 1 / Z + 1 / (f b)."""
+    content = RIG.to_dict()
+    del content["pitch_px"]
+    content["sequence"] = {"vertical": {"scheme": "phase-shift", "pitches_px": [18, 912], "steps": 3}}
+    true = rig_from_dict(content)
+    assert isinstance(true.sequence, CodedSequence)
+    other = replace(true, projector=replace(true.projector, cx=true.projector.cx - 1))
+    expected = 1 / (1 / DEPTHS_MM + 1 / (1824 * 125.0)) - DEPTHS_MM
+    assert volume_error_mm(other, true).worst_mm == pytest.approx(np.abs(expected).max(), rel=1e-9)
+
+
+def test_rigs_with_nothing_in_common_are_refused():
+    with pytest.raises(CalibrationError, match="camera: expected 240 x 240"):
+        volume_error_mm(paper_rig(480), RIG)
+    with pytest.raises(CalibrationError, match="no depth by the other rig"):
+        volume_error_mm(replace(RIG, translation_m=tuple(-t for t in RIG.translation_m)), RIG)
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """The true rig, the board, and its poses as measured on captures from disk."""
+    rig = replace(paper_rig(300), sequence=Sequence(steps=4))
+    board, folder = fitting_board(rig), tmp_path_factory.mktemp("boards") / "captures"
+    poses = []
+    for pose in photograph_board(folder, rig, board, board_poses(rig, board, 8)):
+        frames = read_frames(pose).frames
+        details = decode_stack(list(frames), rig, details=True).details
+        u, v = (details[direction].coordinate_px for direction in ("vertical", "horizontal"))
+        poses.append(measure_pose(pose.name, frames[rig.sequence.white], u, v, board))
+    return rig, board, poses
+
+
+@pytest.mark.parametrize("spacing_given", [1.0, 0.95])
+def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captured, spacing_given):
+    """The trap of a printed board whose spacing is not the one that was asked for: no reprojection error shows it."""
+    true, board, poses = captured
+    given = replace(board, spacing_mm=spacing_given * board.spacing_mm, detail_mm=spacing_given * board.detail_mm)
+    sizes = ((device.width, device.height) for device in (true.camera, true.projector))
+    found = calibrate(poses, given, *sizes, "none", hold_out=False)
+    assert found.camera_rms_px < 0.05 and found.projector_rms_px < 0.1  # an image px is 2.6 projector px
+    rig = replace(true, camera=found.camera.pinhole(), projector=found.projector.pinhole(), rotation=found.rotation,
+                  translation_m=found.translation_m)  # fmt: skip
+    error = volume_error_mm(rig, true)
+    assert error.scale == pytest.approx(spacing_given, abs=0.002)
+    if spacing_given == 1:
+        assert error.rms_mm < 3  # at 300 px; 0.3 mm at 960 px with 18 poses and steps
+    else:
+        assert error.rms_mm == pytest.approx(90, abs=4)

@@ -1,0 +1,191 @@
+"""Coding schemes: patterns in, coordinates out, against `fringes`-free closed forms, OpenCV, and themselves."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from fpp_ml_bench.coding import SCHEMES, GrayCells, GrayOnly, Limits, PhaseShift, Reason, code_from_dict
+from fpp_ml_bench.errors import DecodeError, RigError
+from fpp_ml_bench.optics import CodedSequence, Rig, load_rig, paper_rig, pattern_image, rig_from_dict, save_rig
+
+LENGTH = 912
+LIMITS = Limits()
+CODES = {
+    "unit cue": {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1},
+    "hierarchy": {"scheme": "phase-shift", "pitches_px": [1000, 200, 25], "steps": [4, 4, 6]},
+    "heterodyne": {"scheme": "phase-shift", "pitches_px": [42, 45, 48], "steps": 4},
+    "number-theoretical": {"scheme": "phase-shift", "pitches_px": [29, 33], "steps": 5},
+    "own shifts": {"scheme": "phase-shift", "pitch_px": 24, "shifts_deg": [0, 90, 200, 250], "gray": {}},
+    "whole-period cells": {"scheme": "phase-shift", "pitch_px": 24, "steps": 4, "gray": {"cell_px": 24}},
+    "inverse pairs": {"scheme": "phase-shift", "pitch_px": 36, "steps": 3, "gray": {"inverse": "after each"}},
+    "origin": {"scheme": "phase-shift", "pitches_px": [60, 920], "steps": 4, "origin_px": -3.5},
+    "gray alone": {"scheme": "gray", "cell_px": 2},
+    "gray with inverses": {"scheme": "gray", "inverse": "after all", "bits": 11},
+    "the paper's": {"scheme": "phase-shift", "pitch_px": 18, "steps": 18, "gray": {}},
+}
+
+
+def code_of(name):
+    return code_from_dict(CODES[name], LENGTH, "code")
+
+
+def seen(code, position_px, mean=120.0, amplitude=100.0, noise=0.0, seed=0):
+    """Grey levels at sub-pixel positions of the patterns, with black and white where the code needs them."""
+    levels = np.stack([np.interp(position_px, np.arange(LENGTH), row) for row in code.profiles(LENGTH).astype(float)])
+    if code.needs_flat:
+        levels = np.concatenate([levels, np.zeros((1, len(position_px))), np.full((1, len(position_px)), 255.0)])
+    grey = mean + amplitude * (levels / 127.5 - 1)
+    return (grey + np.random.default_rng(seed).normal(0, noise, grey.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_a_code_gives_its_own_pixels_back(name):
+    code, pixels = code_of(name), np.arange(LENGTH, dtype=float)
+    found = code.decode(code.profiles(LENGTH) if not code.needs_flat else np.concatenate(
+        [code.profiles(LENGTH), np.zeros((1, LENGTH), np.uint8), np.full((1, LENGTH), 255, np.uint8)]
+    ), LENGTH, Limits(max_clipped_steps=20))  # fmt: skip
+    assert (found.reason == Reason.DECODED).mean() > (0.9 if name == "whole-period cells" else 0.99)
+    good = found.reason == 0
+    # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
+    bound = code.cells.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
+    assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
+    assert len(code.shown) == len(code.profiles(LENGTH))
+
+
+@pytest.mark.parametrize("name", [name for name in CODES if not name.startswith("gray")])
+def test_noise_is_what_the_code_says_and_no_order_slips(name):
+    code, position = code_of(name), np.random.default_rng(3).uniform(5, LENGTH - 6, 20_000)
+    found = code.decode(seen(code, position, noise=1.0), LENGTH, LIMITS)
+    good = found.reason == 0
+    error = found.coordinate_px[good] - position[good]
+    assert good.mean() > 0.85 and np.abs(error).max() < 0.3 * code.pitch_px
+    stated = float(code.sigma_px(100.0, 1.0))
+    rounding = 0.29 * 100 / 127.5  # of the 8-bit patterns, in grey levels here
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(stated * math.hypot(1, rounding), rel=0.2)
+
+
+def test_the_papers_code_is_one_of_them_bit_for_bit(monkeypatch):
+    from fpp_ml_bench.decoding import decode_direction, plain_plan
+
+    rig = paper_rig(64)
+    code, plan = rig.code("vertical"), plain_plan(rig, "vertical", None, LIMITS)
+    assert isinstance(code, PhaseShift) and code.is_plain and code == code_of("the paper's")
+    levels = np.clip(np.rint(seen(code, np.random.default_rng(0).uniform(0, 911, 4000), noise=2)), 0, 255)
+    levels = levels.astype(np.uint8)
+    compiled, general = decode_direction(levels, plan, LIMITS), code.decode(levels, 912, LIMITS)
+    good = compiled.reason == 0
+    assert good.mean() > 0.98 and np.mean(general.reason == compiled.reason) > 0.999
+    np.testing.assert_allclose(general.coordinate_px[good], compiled.coordinate_px[good], atol=1e-11)
+
+
+def test_gray_frames_are_opencvs():
+    frames = GrayCells(1, 10, "after each").profiles(912)
+    generator = cv2.structured_light.GrayCodePattern.create(912, 4)
+    done, patterns = generator.generate()
+    assert done
+    columns = np.array([pattern[0] for pattern in patterns[:20]])
+    assert np.array_equal(frames, columns)
+
+
+def test_dark_saturated_and_contradicting_pixels_have_their_reason():
+    code = code_of("hierarchy")
+    position = np.full(4, 300.25)
+    levels = seen(code, position)
+    levels[:, 0] = 100.0
+    levels[:, 1] = 255.0
+    levels[4:8, 2] = levels[4:8, 2][::-1] + 40 * np.array([1, -1, -1, 1])
+    found = code.decode(levels, LENGTH, LIMITS)
+    assert found.reason.tolist()[:2] == [Reason.LOW_MODULATION, Reason.LOW_MODULATION]
+    assert found.reason[3] == Reason.DECODED and found.coordinate_px[3] == pytest.approx(300.25, abs=0.05)
+    bright = seen(code, position, mean=200, amplitude=100).clip(0, 255)
+    assert (code.decode(bright, LENGTH, LIMITS).reason == Reason.SATURATED).all()
+
+
+def test_a_single_period_shorter_than_the_pattern_has_no_order():
+    code = code_from_dict({"scheme": "phase-shift", "pitch_px": 57, "steps": 4}, LENGTH, "code")
+    assert (code.decode(seen(code, np.array([100.0, 500.0])), LENGTH, LIMITS).reason == Reason.INCONSISTENT_ORDER).all()
+    whole = code_from_dict({"scheme": "phase-shift", "pitch_px": 912, "steps": 4}, LENGTH, "code")
+    found = whole.decode(seen(whole, np.array([100.0, 500.0])), LENGTH, LIMITS)
+    np.testing.assert_allclose(found.coordinate_px, [100, 500], atol=0.6)
+
+
+def test_fewer_than_three_steps_are_no_phase():
+    code = code_from_dict({"scheme": "phase-shift", "pitch_px": 57, "steps": 1}, LENGTH, "code")
+    assert len(code.profiles(LENGTH)) == 1
+    with pytest.raises(DecodeError, match=r"1 step\(s\); a phase needs at least 3"):
+        code.decode(np.zeros((1, 5), np.uint8), LENGTH, LIMITS)
+
+
+def coded_rig(**sequence) -> dict:
+    data = paper_rig(64).to_dict()
+    del data["pitch_px"], data["background_m"], data["standoff_m"]
+    return {**data, "sequence": sequence}
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_a_rig_file_holds_every_code(name, tmp_path):
+    order = ["white", "vertical", "black"]
+    rig = rig_from_dict(coded_rig(order=order, vertical=CODES[name]))
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert load_rig(tmp_path / "rig.yaml") == rig
+    assert isinstance(rig.sequence, CodedSequence) and rig.directions == ("vertical",) and rig.background_m is None
+    assert len(rig.sequence) == len(rig.code("vertical").shown) + 2 and rig.sequence.white == 0
+    assert np.array_equal(pattern_image(rig, 1)[0], rig.code("vertical").profiles(912)[0])
+    assert rig.code("vertical").scheme in SCHEMES
+
+
+def test_a_direction_that_is_not_projected_is_named():
+    rig: Rig = rig_from_dict(coded_rig(vertical=CODES["unit cue"]))
+    assert rig.pitch("vertical") == 57 and rig.standoff_m == 1.8
+    with pytest.raises(RigError, match="vertical fringes, and no horizontal ones"):
+        rig.pitch("horizontal")
+    with pytest.raises(RigError, match="background_m: missing"):
+        _ = rig.background
+
+
+def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
+    wave = {"scheme": "phase-shift", "pitch_px": 18, "steps": 1}
+    rig = rig_from_dict(coded_rig(order=["crossed"], vertical=wave, horizontal={**wave, "pitch_px": 14}))
+    y, x = np.mgrid[:1140, :912]
+    expected = 127.5 + 63.75 * (np.cos(2 * np.pi * x / 18) + np.cos(2 * np.pi * y / 14))
+    assert np.abs(pattern_image(rig, 0) - expected).max() <= 1.01
+    assert len(rig.sequence) == 1 and rig.sequence.sinusoids("vertical") == rig.sequence.sinusoids("horizontal") == (0,)
+    rig = rig_from_dict(coded_rig(vertical={"scheme": "composite", "pitches_px": [18, 22]}))
+    expected = 127.5 + 63.75 * (np.cos(2 * np.pi * x[0] / 18) + np.cos(2 * np.pi * x[0] / 22))
+    assert np.abs(pattern_image(rig, 0)[0] - expected).max() <= 0.51 and rig.pitch("vertical") == 18
+    with pytest.raises(DecodeError, match="pixel by pixel"):
+        rig.code("vertical").decode(np.zeros((1, 4), np.uint8), LENGTH, LIMITS)
+
+
+@pytest.mark.parametrize(
+    "sequence, said",
+    [
+        ({}, "pitch_px"),
+        ({"order": ["vertical"]}, "no direction is coded"),
+        ({"vertical": {"scheme": "magic"}}, "vertical.scheme: expected phase-shift, gray"),
+        ({"vertical": 3}, "vertical: expected a mapping"),
+        ({"vertical": {"scheme": "phase-shift", "steps": 3}}, "pitches_px: expected a list"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18}}, "steps: missing"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "sign": 0}}, "sign: expected 1"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 2, "steps": 3}}, "expected 4 px and more"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "colour": 1}}, "colour: unknown key"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "shifts_deg": [0], "steps": 3}}, "not both"),
+        ({"vertical": {"scheme": "phase-shift", "pitches_px": [18, 36], "steps": [3]}}, "each of 2 periods"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "gray": {"bits": 2}}}, "need 7 bits"),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "gray": {"cell_px": 20}}}, "exceed"),
+        ({"vertical": {"scheme": "gray", "inverse": "yes"}, "order": ["vertical"]}, "inverse: expected none"),
+        ({"vertical": {"scheme": "gray"}, "order": ["vertical"]}, "black, white missing"),
+        ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
+        ({"vertical": CODES["unit cue"], "order": "vertical"}, "expected a list of names"),
+        ({"vertical": CODES["unit cue"], "order": ["horizontal"]}, "expected each of vertical, black, white"),
+        ({"vertical": CODES["unit cue"], "diagonal": {}}, "unknown key diagonal"),
+        ({"vertical": CODES["unit cue"], "order": ["crossed"]}, "crossed needs a code of a single frame"),
+        ({"vertical": {"scheme": "composite", "pitches_px": [18]}}, "two periods and more"),
+        ({"vertical": {"scheme": "composite", "pitches_px": [18, 2]}}, "4 px and more"),
+    ],
+)
+def test_a_sequence_that_is_none_is_refused(sequence, said):
+    with pytest.raises(RigError, match=said):
+        rig_from_dict(coded_rig(**sequence))

@@ -1,0 +1,203 @@
+"""The commands patterns and decode, on captures that the renderer makes of a rig with vertical codes alone."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.coding import Reason
+from fpp_ml_bench.decoding import coordinate_slope_px_per_mm, decode_stack, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
+
+SIZE = 120
+
+
+def vertical_rig(scheme: dict):
+    data = paper_rig(SIZE).to_dict()
+    del data["pitch_px"]
+    return rig_from_dict({**data, "sequence": {"vertical": scheme, "order": ["vertical", "white", "black"]}})
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A mug seen by a rig with two periods of four steps: folder, rig file, exact depth."""
+    folder = tmp_path_factory.mktemp("capture")
+    rig = vertical_rig({"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8], "sign": -1})
+    save_rig(rig, folder / "rig.yaml")
+    studio = Studio(BuildSettings(rig, ("mug",)))
+    row = studio.photograph(solid_mesh("mug"), "A60")
+    (folder / "scan").mkdir()
+    for index, frame in row.frames.items():
+        cv2.imwrite(str(folder / "scan" / f"frame_{index}.png"), frame)
+    return folder, row
+
+
+def decode(folder, scan, out, *words):
+    return main(["decode", str(folder / "rig.yaml"), str(scan), "--out", str(out), *words])
+
+
+def test_decoded_capture_is_the_scene(capture, tmp_path, capsys):
+    folder, row = capture
+    assert decode(folder, folder / "scan", tmp_path / "out") == 0
+    depth_mm, exact_mm = np.load(tmp_path / "out" / "depth.npy"), row.depth_exact_mm
+    np.testing.assert_array_equal(
+        depth_mm, decode_stack(list(row.frames.values()), load_rig(folder / "rig.yaml")).depth_mm
+    )
+    both = (depth_mm > 0) & (exact_mm > 0)
+    assert both.sum() > 0.9 * (exact_mm > 0).sum()
+    assert np.median(np.abs(depth_mm - exact_mm)[both]) < 2
+    report = json.loads((tmp_path / "out" / "decode.json").read_text())
+    assert report["noise_measured"] and report["pixels"]["decoded"] == (depth_mm > 0).sum()
+    assert len(report["frames"]) == 14
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"depth.mat", "points.ply", "mesh.ply", "picture.png", "sigma_mm.npy", "reason.npy"} <= names
+    assert "uncertainty" in capsys.readouterr().out
+
+
+def test_the_stated_uncertainty_is_that_of_noise():
+    rig = vertical_rig({"scheme": "phase-shift", "pitches_px": [48, 912], "steps": [4, 8]})
+    x, y = (axis.ravel() for axis in rig.camera.rays())
+    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * 1.8)
+    profiles = rig.code("vertical").profiles(912).astype(float)
+    random, depths = np.random.default_rng(5), []
+    for _ in range(30):
+        frames = [np.interp(u_px, np.arange(912), row) * 0.7 + 20 + random.normal(0, 2, len(x)) for row in profiles]
+        frames = [*frames, np.full(len(x), 200.0), np.full(len(x), 20.0)]
+        images = np.clip(frames, 0, 255).astype(np.float32).reshape(14, SIZE, SIZE)
+        decoded = decode_stack(images, rig, details=True)
+        depths.append(np.where(decoded.depth_mm > 0, decoded.depth_mm, np.nan))
+    noise = noise_of_frames(list(images), rig)
+    assert noise == pytest.approx(2, rel=0.03)
+    sigma_mm = depth_sigma_mm(decoded, rig, noise)
+    good = np.isfinite(depths).all(axis=0) & (sigma_mm > 0)
+    seen = np.where(good, np.std(np.nan_to_num(depths), axis=0, ddof=1), np.nan)
+    assert np.sqrt(np.mean(seen[good] ** 2 / sigma_mm[good] ** 2)) == pytest.approx(1, rel=0.05)
+
+
+def test_slope_is_the_difference_of_projections():
+    rig = paper_rig(64)
+    rays = tuple(axis[3:6, 7] for axis in rig.camera.rays())
+    for direction, axis in (("vertical", 0), ("horizontal", 1)):
+        ends = [rig.project(np.stack([*rays, np.ones(3)], axis=-1) * z)[axis] for z in (1.7999, 1.8001)]
+        slope = coordinate_slope_px_per_mm(rig, 1800.0, direction, rays)
+        np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 0.2, rtol=1e-6)
+
+
+def written(folder, frames, tmp_path):
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    for index, frame in enumerate(frames):
+        cv2.imwrite(str(scan / f"frame_{index}.png"), frame)
+    return scan
+
+
+@pytest.mark.parametrize("pair", [(0, 2), (4, 7), (1, 5)])
+def test_frames_that_changed_places_are_named(capture, tmp_path, capsys, pair):
+    folder, row = capture
+    frames = list(row.frames.values())
+    frames[pair[0]], frames[pair[1]] = frames[pair[1]], frames[pair[0]]
+    assert decode(folder, written(folder, frames, tmp_path), tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert f"frame_{pair[0]}.png and frame_{pair[1]}.png seem to have changed places" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_saturated_frames_are_named(capture, tmp_path, capsys):
+    folder, row = capture
+    bright = [np.clip(frame.astype(float) * 2.5, 0, 255).astype(np.uint8) for frame in row.frames.values()]
+    assert decode(folder, written(folder, bright, tmp_path), tmp_path / "out") == 0
+    assert "saturated on lit pixels: frame_" in capsys.readouterr().err
+    assert (np.load(tmp_path / "out" / "reason.npy") == Reason.SATURATED).any()
+
+
+def test_twelve_bits_decode_more_finely(capture, tmp_path):
+    folder, row = capture
+    deep = [(frame.astype(np.uint16) * 257 >> 4) for frame in row.frames.values()]
+    assert decode(folder, written(folder, deep, tmp_path), tmp_path / "out", "--bits", "12", "--forms", "npy") == 0
+    depth_mm = np.load(tmp_path / "out" / "depth.npy")
+    expected = decode_stack(list(row.frames.values()), load_rig(folder / "rig.yaml")).depth_mm
+    both = (depth_mm > 0) & (expected > 0)
+    assert both.sum() > 0.98 * (expected > 0).sum() and np.abs(depth_mm - expected)[both].max() < 1
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--range", "1,2"], "outside the range: --range"),
+        (["--min-modulation", "200"], "too faint"),
+        (["--min-modulation", "0"], "min_modulation: expected a positive"),
+        (["--direction", "horizontal"], "no horizontal"),
+        (["--forms", "obj"], "expected some of npy, mat"),
+        (["--threads", "0"], "--threads 0"),
+        (["--mask", "none.npy"], "none.npy"),
+        (["--noise", "-1"], "noise_grey: expected grey levels above 0"),
+        (["--bits", "12"], "expected levels of 12 bits"),
+    ],
+)
+def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, capsys, words, said):
+    folder, _ = capture
+    assert decode(folder, folder / "scan", tmp_path / "out", *words) == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change, said", [
+    (lambda frames: frames[:-1], "expected 14 frames, found 13"),
+    (lambda frames: [frame[:, :100] for frame in frames], "camera of 120 x 120"),
+    (lambda frames: [frames[0][:50], *frames[1:]], "120 x 50"),
+    (lambda frames: [], "expected a folder with images"),
+    (lambda frames: [np.zeros_like(frame) for frame in frames], "too faint"),
+])  # fmt: skip
+def test_a_bad_capture_is_a_sentence(capture, tmp_path, capsys, change, said):
+    folder, row = capture
+    scan = written(folder, change(list(row.frames.values())), tmp_path)
+    assert decode(folder, scan, tmp_path / "out") == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_patterns_come_with_a_manifest(tmp_path, capsys):
+    file = tmp_path / "projector.yaml"
+    file.write_text(
+        "projector: {width: 200, height: 100}\n"
+        "sequence: {order: [white, vertical, black], vertical: {scheme: gray, cell_px: 2}}\n"
+    )
+    assert main(["patterns", str(file), str(tmp_path / "images")]) == 0
+    manifest = json.loads((tmp_path / "images" / "patterns.json").read_text())
+    assert manifest["projector_px"] == [200, 100] and len(manifest["frames"]) == 9
+    assert manifest["frames"][1]["shows"] == "vertical Gray bit 0"
+    white = cv2.imread(str(tmp_path / "images" / "A_0.png"), cv2.IMREAD_UNCHANGED)
+    assert white.shape == (100, 200) and (white == 255).all()
+    assert main(["patterns", str(file), str(tmp_path / "images")]) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text, said", [
+    ("", "empty"),
+    ("sequence: {}", "projector: expected a mapping"),
+    ("projector: {width: 20}", "projector.height: missing"),
+    ("projector: {width: 20, height: 20}", "missing key pitch_px"),
+    ("projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, order: [vertical]}", "need"),
+])  # fmt: skip
+def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text, said):
+    (tmp_path / "projector.yaml").write_text(text)
+    assert main(["patterns", str(tmp_path / "projector.yaml"), str(tmp_path / "images")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "images").exists()
+
+
+def test_a_rig_file_may_name_a_calibration_by_opencv(tmp_path):
+    from fpp_ml_bench.optics import read_opencv_calibration, write_opencv_calibration
+    from fpp_ml_bench.optics.opencv_files import OpenCvCalibration
+
+    rig = vertical_rig({"scheme": "gray", "cell_px": 2})
+    write_opencv_calibration(
+        OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), tmp_path / "c.yml"
+    )
+    assert read_opencv_calibration(tmp_path / "c.yml").camera == rig.camera
+    (tmp_path / "rig.yaml").write_text(
+        "calibration: c.yml\nworking_range_mm: [1500, 2100]\nbackground_m: 3.2\nstandoff_m: 1.8\n"
+        "sequence: {order: [vertical, white, black], vertical: {scheme: gray, cell_px: 2}}\n"
+    )
+    assert load_rig(tmp_path / "rig.yaml") == rig

@@ -1,0 +1,200 @@
+"""Depth of a capture as files: read back by other programs' readers, and compared with a plane and a sphere."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+import trimesh
+from PIL import Image
+
+from fpp_ml_bench.errors import CaptureError
+from fpp_ml_bench.loaders.captures import export_capture, pixel_normals, triangles
+from fpp_ml_bench.optics import Pinhole
+
+CAMERA = Pinhole(64, 48, 90.0, 92.0, 30.3, 24.1, (-0.05, 0.01, 0.001, -0.001, 0.0))
+X, Y = CAMERA.rays()
+PLANE = np.array([0.3, -0.4, -np.sqrt(0.75)])  # its unit normal, towards the camera
+PLANE_MM = -600.0 * PLANE[2] / -(PLANE[0] * X + PLANE[1] * Y + PLANE[2])  # 600 mm on the axis
+CENTRE, RADIUS = np.array([10.0, -5.0, 700.0]), 150.0
+
+
+def _sphere():
+    """Depth float64 of a sphere, 0 beside it, and its normals."""
+    rays = np.stack([X, Y, np.ones_like(X)], axis=-1)
+    square, along = (rays * rays).sum(-1), rays @ CENTRE
+    root = along**2 - square * (CENTRE @ CENTRE - RADIUS**2)
+    depth = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / square, 0.0)
+    return depth, (rays * depth[..., None] - CENTRE) / RADIUS
+
+
+def _degrees(normals, expected):
+    return np.degrees(np.arccos(np.clip((normals * expected).sum(-1), -1, 1)))
+
+
+def test_normals_of_a_plane():
+    normals = pixel_normals(PLANE_MM, CAMERA)
+    np.testing.assert_allclose(normals, np.broadcast_to(PLANE, normals.shape), atol=1e-12)
+    rounded = pixel_normals(PLANE_MM.astype(np.float32), CAMERA)
+    np.testing.assert_allclose(rounded, normals, atol=1e-4)
+
+
+def test_normals_of_a_sphere():
+    depth, expected = _sphere()
+    normals = pixel_normals(depth.astype(np.float32), CAMERA)
+    there = depth > 0
+    assert np.isfinite(normals).all() and (normals[~there] == 0).all()
+    np.testing.assert_allclose((normals[there] ** 2).sum(-1), 1, rtol=1e-12)
+    inclined = -(expected * np.stack([X, Y, np.ones_like(X)], -1)).sum(-1) / np.sqrt(X**2 + Y**2 + 1)
+    inside = cv2.erode(there.astype(np.uint8), np.ones((3, 3))) > 0
+    assert _degrees(normals, expected)[inside & (inclined > 0.6)].max() < 1.0
+    assert there.sum() > 1000
+
+
+def test_a_pixel_alone_faces_the_camera_and_steps_are_not_joined():
+    depth = np.zeros((48, 64))
+    depth[5, 7] = 500.0
+    ray = np.array([X[5, 7], Y[5, 7], 1.0])
+    np.testing.assert_allclose(pixel_normals(depth, CAMERA)[5, 7], -ray / np.sqrt(ray @ ray), rtol=1e-12)
+    depth[:] = 500.0
+    depth[:, 32:] = 600.0
+    flat = pixel_normals(depth, CAMERA)
+    np.testing.assert_allclose(flat, np.broadcast_to([0.0, 0.0, -1.0], flat.shape), atol=1e-12)
+    assert np.abs(pixel_normals(depth, CAMERA, step_mm=200.0)[:, 31:33, 0]).min() > 0.5
+    joined = triangles(depth, CAMERA, step_mm=200.0)
+    assert len(joined) == 2 * 47 * 63 and len(triangles(depth, CAMERA)) == 2 * 47 * 62
+
+
+def test_triangles_of_a_plane_are_its_normal_and_cover_it():
+    faces = triangles(PLANE_MM, CAMERA)
+    assert len(faces) == 2 * 47 * 63 and np.unique(faces).size == 48 * 64
+    points = (np.stack([X, Y, np.ones_like(X)], -1) * PLANE_MM[..., None]).reshape(-1, 3)
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    across = np.cross(b - a, c - a)
+    np.testing.assert_allclose(across / np.sqrt((across**2).sum(-1, keepdims=True)), [PLANE] * len(faces), atol=1e-9)
+
+
+@pytest.mark.parametrize("missing", [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_three_pixels_of_a_square_make_a_triangle(missing):
+    camera = Pinhole(2, 2, 90.0, 90.0, 0.5, 0.5)
+    depth = np.full((2, 2), 500.0)
+    depth[missing] = 0
+    (face,) = triangles(depth, camera)
+    assert sorted(face) == sorted({0, 1, 2, 3} - {missing[0] * 2 + missing[1]})
+    depth[missing] = 500.0
+    assert len(triangles(depth, camera)) == 2
+    depth[0, 0], depth[0, 1] = 510.0, 0.0
+    assert triangles(depth, camera).tolist() == [[0, 2, 3]]
+
+
+@pytest.fixture
+def written(tmp_path):
+    depth, _ = _sphere()
+    grey = np.add.outer(np.arange(48.0), np.arange(64)) * 2.25
+    files = export_capture(tmp_path / "out", depth, CAMERA, grey)
+    return depth.astype(np.float32), grey, {file.name: file for file in files}
+
+
+def test_arrays_come_back_in_other_readers(written):
+    depth, _, files = written
+    assert sorted(files) == ["depth.mat", "depth.npy", "depth_0.1mm.png", "mesh.ply", "points.ply"]
+    for read in (np.load(files["depth.npy"]), scipy.io.loadmat(files["depth.mat"])["depthMap"]):
+        assert read.dtype == np.float32 and np.array_equal(read, depth)
+    levels = cv2.imread(str(files["depth_0.1mm.png"]), cv2.IMREAD_UNCHANGED)
+    assert levels.dtype == np.uint16 and np.array_equal(levels > 0, depth > 0)
+    np.testing.assert_allclose(levels * 0.1, depth, atol=0.05 + 1e-4)
+    assert Image.open(files["depth_0.1mm.png"]).text == {"mm_per_level": "0.1"}
+
+
+def test_points_and_mesh_lie_on_the_sphere(written):
+    depth, grey, files = written
+    header = files["points.ply"].read_bytes().partition(b"end_header")[0].decode()
+    assert "binary_little_endian" in header
+    assert re.findall(r"property \w+ (\w+)\n", header)[:10] == (
+        ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"]
+    )
+    cloud, mesh = trimesh.load(files["points.ply"]), trimesh.load(files["mesh.ply"], process=False)
+    there = depth > 0
+    for points in (cloud.vertices, mesh.vertices):
+        assert len(points) == there.sum()
+        np.testing.assert_allclose(np.sqrt(((points - CENTRE) ** 2).sum(-1)), RADIUS, atol=1e-3)
+    u, v = CAMERA.project(mesh.vertices)
+    row, column = np.nonzero(there)
+    np.testing.assert_allclose((u, v), (column, row), atol=1e-4)
+    normals = pixel_normals(depth, CAMERA)[there]
+    np.testing.assert_allclose(mesh.vertex_normals, normals, atol=1e-6)
+    assert (((mesh.vertices - CENTRE) * mesh.vertex_normals).sum(-1) > 0).all()
+    assert (np.asarray(mesh.face_normals) @ [0, 0, 1] < 0.3).all()
+    assert np.array_equal(mesh.visual.vertex_colors[:, 0], np.rint(grey[there]))
+
+
+def test_the_grey_image_is_stored_unrounded(written):
+    _, grey, files = written
+    depth, _, _ = written
+    content = files["points.ply"].read_bytes()
+    fields = np.dtype([("geometry", "<f4", 6), ("colour", "u1", 4), ("intensity", "<f4")])
+    start = content.index(b"end_header\n") + len(b"end_header\n")
+    values = np.frombuffer(content, fields, int((depth > 0).sum()), start)
+    assert np.array_equal(values["intensity"], grey[depth > 0].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("largest_mm", "name"),
+    [(60.0, "depth_0.001mm.png"), (600.0, "depth_0.01mm.png"), (2100.0, "depth_0.1mm.png"), (65534.0, "depth_1mm.png"),
+     (65535.0, "depth_10mm.png")],
+)  # fmt: skip
+def test_the_png_takes_the_finest_unit_that_fits(tmp_path, largest_mm, name):
+    depth = np.full((48, 64), largest_mm / 7)
+    depth[0, 0], depth[0, 1] = largest_mm, 0
+    (file,) = export_capture(tmp_path, depth, CAMERA, forms=["png"])
+    assert file.name == name
+    levels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    unit = float(name.removeprefix("depth_").removesuffix("mm.png"))
+    np.testing.assert_allclose(levels * unit, depth, atol=unit / 2 * 1.001)
+
+
+def test_the_same_depth_gives_the_same_bytes(tmp_path):
+    first, second = (export_capture(tmp_path / name, PLANE_MM, CAMERA) for name in "ab")
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+
+
+NAN = np.where(np.arange(64) == 3, np.nan, PLANE_MM)
+
+
+@pytest.mark.parametrize(
+    ("depth", "options", "message"),
+    [
+        (PLANE_MM[:-1], {}, r"depth_mm: expected real numbers of shape \(H, W\) = \(48, 64\).*\(47, 64\)"),
+        (PLANE_MM * 1j, {}, "depth_mm: expected real numbers.*complex"),
+        (NAN, {}, "depth_mm: expected finite numbers from 0, which means none, up, got 48 others"),
+        (-PLANE_MM, {}, "depth_mm: expected finite numbers.*got 3072 others"),
+        (PLANE_MM * 1e300, {}, "depth_mm: expected finite numbers.*got 3072 others"),
+        (PLANE_MM * 0, {}, "depth_mm: no pixel has a depth"),
+        (PLANE_MM * 1e4, {}, "do not fit in a 16-bit PNG"),
+        (PLANE_MM, {"grey": np.zeros((3, 3))}, "grey: expected real numbers of shape"),
+        (PLANE_MM, {"grey": np.full((48, 64), 256.0)}, "grey: expected finite numbers from 0 to 255, got 3072"),
+        (PLANE_MM, {"forms": ["obj"]}, "forms: expected some of npy, mat, png, ply, mesh, got obj"),
+        (PLANE_MM, {"forms": []}, "forms: expected some of .*got none"),
+        (PLANE_MM, {"step_mm": float("nan")}, "step_mm: expected a positive number"),
+        (PLANE_MM, {"step_mm": 0.0}, "step_mm: expected a positive number"),
+    ],
+)
+def test_what_can_not_be_written_is_refused_and_nothing_is_left(tmp_path, depth, options, message):
+    with pytest.raises(CaptureError, match=message):
+        export_capture(tmp_path / "out", depth, CAMERA, **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_can_not_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CaptureError, match="can't be written"):
+        export_capture(tmp_path / "file", PLANE_MM, CAMERA)
+
+
+def test_pixels_without_a_ray_have_no_point(tmp_path):
+    camera = Pinhole(101, 5, 50.0, 50.0, 50.0, 2.0, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    (file,) = export_capture(tmp_path, np.full((5, 101), 500.0), camera, forms=["ply"])
+    count = np.isfinite(camera.rays()[0]).sum()
+    assert 0 < count < 505 and len(trimesh.load(file).vertices) == count

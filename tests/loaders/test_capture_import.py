@@ -1,0 +1,373 @@
+"""A dataset from captures: a plane whose depth is known in closed form, photographed through OpenCV's remap, in folders
+as a scanner leaves them; then every command on it."""
+
+import json
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from captures import capture
+from conftest import file_bytes
+
+from fpp_ml_bench import load_dataset
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.captures import Splits, import_captures, plan_captures
+from fpp_ml_bench.loaders.captures.importing import CaptureReader
+from fpp_ml_bench.loaders.storage import DatasetFolder, plan_rows, verify
+from fpp_ml_bench.optics import paper_rig, rig_from_dict, save_rig
+
+UNIT_CUE = {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1}
+
+
+def coded_rig(width=90, height=70, **sequence):
+    data = paper_rig(90).to_dict()
+    del data["pitch_px"], data["background_m"], data["standoff_m"]
+    data["camera"] |= {"width": width, "height": height, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    return rig_from_dict({**data, "sequence": sequence or {"order": ["white", "vertical"], "vertical": UNIT_CUE}})
+
+
+RIG = coded_rig()
+
+
+def depth_m(rig, number):
+    """A tilted plane, another for every number, that ends a third before the left edge: nothing is seen there."""
+    x, y = rig.camera.rays()
+    return (1.75 + 0.03 * number) / (1.0 - 0.4 * x + 0.25 * y)
+
+
+def frames_of(rig, number):
+    frames = capture(rig, depth_m(rig, number), seed=number)
+    for frame in frames:
+        frame[:, : frame.shape[1] // 3] = 3
+    return frames
+
+
+def write(folder, frames, bits=8):
+    folder.mkdir(parents=True)
+    for index, frame in enumerate(frames):
+        assert cv2.imwrite(str(folder / f"frame_{index}.png"), frame.astype(np.uint8 if bits == 8 else np.uint16))
+
+
+def scans(root, rig=RIG):
+    """Two views of one object and the single view of another."""
+    write(root / "gear_wheel" / "front", frames_of(rig, 0))
+    write(root / "gear_wheel" / "back-2", frames_of(rig, 1))
+    write(root / "bolt", frames_of(rig, 2))
+    (root / "notes.txt").write_text("of the scanner")
+    return root
+
+
+@pytest.fixture
+def scanned(tmp_path):
+    save_rig(RIG, tmp_path / "rig.yaml")
+    scans(tmp_path / "scans")
+    return tmp_path
+
+
+def run(*words, command=main):
+    return command([str(word) for word in words])
+
+
+def importing(folder, *more):
+    return run("import", "--captures", folder / "scans", folder / "set", "--rig", folder / "rig.yaml", *more)
+
+
+def test_captures_become_a_dataset_like_any_other(scanned, capsys):
+    (scanned / "splits.yaml").write_text("train: [gear_wheel]\ntest: [bolt]\n")
+    assert importing(scanned, "--splits", scanned / "splits.yaml", "--workers", 1) == 0
+    said = capsys.readouterr().out
+    assert "train 2, test 1 samples, 21 images" in said and "bolt_single" in said and "low modulation" in said
+
+    folder = scanned / "set"
+    opened = DatasetFolder(folder)
+    assert opened.splits == {"train": ["gear_wheel_back-2", "gear_wheel_front"], "test": ["bolt_single"]}
+    assert opened.size == (70, 90) and opened.configs == ("single_shot", "vertical", "sinusoidal", "all")
+    assert opened.rig == RIG and not opened.has_exact and opened.manifest.origin == "captured"
+    for sample, number in (("gear_wheel_front", 0), ("gear_wheel_back-2", 1), ("bolt_single", 2)):
+        depth_mm, true_mm = opened.depth_mm(sample), 1000 * depth_m(RIG, number)
+        seen = depth_mm > 0
+        assert seen[:, 31:].mean() > 0.9 and not seen[:, :29].any()
+        assert np.median(np.abs(depth_mm - true_mm)[seen]) < 2.0  # noise of 1 grey level, three steps of 57 px
+        for index, frame in enumerate(frames_of(RIG, number)):
+            np.testing.assert_array_equal(opened.frame(sample, index), frame)
+        measured = opened.measured(sample)
+        assert measured["decoded_share"] == pytest.approx(seen.mean())
+        assert measured["median_modulation"] == pytest.approx(0.45 * 127.5, rel=0.1)
+        refused = sum(measured["refused_share"].values())
+        assert refused == pytest.approx(1 - seen.mean()) and measured["refused_share"]["low_modulation"] > 0.3
+
+    row = load_dataset(folder, "all", split="test").with_format("numpy")[0]
+    assert [name for name in row if name.startswith("frame_")] == [f"frame_{i:02d}" for i in range(7)]
+    np.testing.assert_array_equal(row["depth"], opened.depth_mm("bolt_single"))
+    assert list(load_dataset(folder, split="train")["view"]) == ["back-2", "front"]
+
+    assert verify(folder) == []
+    assert run("verify", folder) == 0 and run("info", folder) == 0
+    assert "vertical phase-shift 57 + 912 px" in capsys.readouterr().out
+    assert run("show", folder, "bolt_single", "--out", scanned / "a.png") == 0
+    assert run("show", folder, "--sheet", "--out", scanned / "b.png") == 0
+    assert cv2.imread(str(scanned / "b.png")).shape[:2] == (93 + 18, 2 * 2 * 120 + 8)
+    assert "license: unknown" in (folder / "README.md").read_text()
+    assert run("export", folder, scanned / "tree", "--mat") == 2
+
+    assert run("predict", "classical", folder, "--out", scanned / "predictions") == 0
+    submission = yaml.safe_load((scanned / "predictions" / "submission.yaml").read_text())
+    assert submission["name"] == "Classical, vertical phase-shift 57 + 912 px"
+    assert submission["frames_used"] == [1, 2, 3, 4, 5, 6]
+    result = scanned / "result.json"
+    assert run(scanned / "predictions", "--dataset", folder, "--json", result, command=evaluate) == 0
+    assert json.loads(result.read_text())["metrics"]["object_mae_mm"] == 0.0  # the process that made the ground truth
+    assert importing(scanned, "--splits", scanned / "splits.yaml") == 0  # finished: nothing is done again
+
+
+def test_a_generated_set_exported_as_frames_is_imported_to_its_own_ground_truth(tmp_path):
+    """The builder's frames of a rig with one direction, as PNG files: the same depth where it was decoded there."""
+    rig = rig_from_dict({**coded_rig(96, 96, vertical=UNIT_CUE).to_dict(), "background_m": 3.2})
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert run("build", tmp_path / "made", "--rig", tmp_path / "rig.yaml", "--objects", "mug", "--workers", 1) == 0
+    made = DatasetFolder(tmp_path / "made")
+    for sample in made.samples("all"):
+        view = made.measured(sample)["view"]
+        write(tmp_path / "scans" / "mug" / view, made.frames(sample, range(6)))
+    assert importing(tmp_path, "--workers", 2) == 0
+    opened = DatasetFolder(tmp_path / "set")
+    assert opened.samples("test") == made.samples("all")  # A60 before A120
+    for sample in opened.samples("test"):
+        there = made.depth_mm(sample) > 0
+        np.testing.assert_array_equal(opened.depth_mm(sample)[there], made.depth_mm(sample)[there])
+
+
+def test_deeper_images_are_decoded_as_captured_and_stored_in_eight_bits(scanned, capsys):
+    shutil.rmtree(scanned / "scans")
+    deep = [np.rint(frame * 16 + 7.0) for frame in frames_of(RIG, 0)]
+    write(scanned / "scans" / "part", deep, bits=12)
+    assert importing(scanned, "--bits", 12) == 0
+    said = capsys.readouterr().out
+    assert "stored rounded to 8 bits" in said and "all objects are in split test" in said
+    opened = DatasetFolder(scanned / "set")
+    full = [(frame * (255 / 4095)).astype(np.float32) for frame in deep]
+    np.testing.assert_array_equal(opened.depth_mm("part_single"), decode_stack(full, RIG).depth_mm)
+    np.testing.assert_array_equal(opened.frame("part_single", 2), np.rint(full[2]).astype(np.uint8))
+    assert opened.measured("part_single")["full_scale"] == 4095
+
+
+@pytest.mark.parametrize(
+    ("sequence", "used"),
+    [
+        ({"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 2}}, 11),
+        ({"horizontal": UNIT_CUE | {"pitches_px": [57, 1140]}, "vertical": UNIT_CUE}, 12),
+        ({"vertical": {"scheme": "phase-shift", "pitch_px": 57, "steps": 4, "gray": {}}}, 9),
+        ({"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}, 20),
+    ],
+)
+def test_any_sequence_and_limits(tmp_path, sequence, used):
+    rig = coded_rig(**sequence) if "steps" not in sequence else None
+    if rig is None:  # the paper's kind: both directions, black and white
+        rig = rig_from_dict({**paper_rig(90).to_dict(), "sequence": sequence})
+    write(tmp_path / "scans" / "part", frames_of(rig, 0))
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert importing(tmp_path, "--min-modulation", 8, "--max-clipped-steps", 0) == 0
+    opened = DatasetFolder(tmp_path / "set")
+    depth_mm = opened.depth_mm("part_single")
+    seen = depth_mm > 0
+    assert seen.mean() > 0.5 and opened.manifest.settings["min_modulation"] == 8
+    assert np.median(np.abs(depth_mm - 1000 * depth_m(rig, 0))[seen]) < 10  # cells of two pixels are the coarsest
+    assert run("predict", "classical", tmp_path / "set", "--out", tmp_path / "p") == 0
+    assert len(yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())["frames_used"]) == used
+    assert run("info", tmp_path / "set") == 0
+    assert run("show", tmp_path / "set", "part_single", "--out", tmp_path / "a.png") == 0
+
+
+def test_an_interrupted_import_goes_on_and_gives_the_same_bytes(scanned, monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.loaders.storage.shards.ROWS_PER_SHARD", 1)
+    plan = plan_captures(scanned / "scans", RIG)
+    import_captures(scanned / "whole", plan, 1)
+    read, done = CaptureReader.read, []
+
+    def stop_at_third(self, taken):
+        done.append(taken.sample)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        return read(self, taken)
+
+    monkeypatch.setattr(CaptureReader, "read", stop_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        import_captures(scanned / "set", plan, 1)
+    # A frame of a finished shard changes: that shard is read again, the other is not.
+    frame = scanned / "scans" / "bolt" / "frame_0.png"
+    frame.write_bytes(frame.read_bytes())
+    steps = []
+    import_captures(scanned / "set", plan, 1, steps.append)
+    assert done[3:] == ["bolt_single", "gear_wheel_front"] and steps == [1, 1, 1]
+    assert file_bytes(scanned / "set") == file_bytes(scanned / "whole")
+    assert not (scanned / "set" / ".build").exists()
+    with pytest.raises(BuildError, match="other settings: objects"):
+        given = Splits(train=["bolt"], test=["gear_wheel"])
+        import_captures(scanned / "set", plan_captures(scanned / "scans", RIG, given), 1)
+    frame.write_bytes(frame.read_bytes())
+    with pytest.raises(BuildError, match=r"holds a finished import, and .*frame_0\.png changed"):
+        import_captures(scanned / "set", plan, 1)
+
+
+def test_shards_hold_few_large_images():
+    samples = [(f"part_{i}", "part", str(i)) for i in range(60)]
+    assert [len(plan.samples) for plan in plan_rows("test", samples, 90 * 70)] == [20, 20, 20]
+    large = plan_rows("test", samples, 1 << 25)
+    assert len(large) == 30 and large[7].first_row == 14 and large[7].of == 30
+    assert [sample for plan in large for sample in plan.samples] == samples
+    assert len(plan_rows("test", samples, 1 << 28)) == 60
+
+
+def test_a_depth_by_chance_is_warned_of(scanned, capsys):
+    """The frames in the opposite order: some pixels get a depth all the same."""
+    files = sorted((scanned / "scans" / "bolt").iterdir())
+    contents = [file.read_bytes() for file in files]
+    for file, content in zip(files, reversed(contents), strict=True):
+        file.write_bytes(content)
+    assert importing(scanned) == 0
+    warnings = [line for line in capsys.readouterr().out.splitlines() if "warning" in line]
+    assert len(warnings) == 1 and "bolt_single: more pixels contradict the rig" in warnings[0]
+
+
+def of_many(folder):
+    """Every capture is wrong in its own way: all are named."""
+    (folder / "scans" / "bolt" / "frame_3.png").write_bytes(b"no image")
+    frame = folder / "scans" / "gear_wheel" / "front" / "frame_2.png"
+    frame.write_bytes(frame.read_bytes()[:300])
+    return ()
+
+
+def splits(text):
+    def given(folder):
+        (folder / "splits.yaml").write_text(text)
+        return "--splits", folder / "splits.yaml"
+
+    return given
+
+
+def changed(change, *options):
+    def prepared(folder):
+        change(folder)
+        return options
+
+    return prepared
+
+
+def of_frames(change):
+    """Change every frame of the single view."""
+
+    def prepared(folder):
+        for file in sorted((folder / "scans" / "bolt").iterdir()):
+            image = change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+            assert cv2.imwrite(str(file), image)
+        return ()
+
+    return prepared
+
+
+def of_rig(**changes):
+    def prepared(folder):
+        save_rig(rig_from_dict({**RIG.to_dict(), **changes}), folder / "rig.yaml")
+        return ()
+
+    return prepared
+
+
+def in_scans(name):
+    return lambda folder: (folder / "scans" / name).mkdir()
+
+
+def copy_frame(to):
+    return lambda folder: shutil.copy(folder / "scans" / "bolt" / "frame_0.png", folder / "scans" / to)
+
+
+def other_size(folder):
+    cv2.imwrite(str(folder / "scans" / "bolt" / "frame_6.png"), np.zeros((70, 91)))
+
+
+def rename(old, new):
+    return lambda folder: (folder / "scans" / old).rename(folder / "scans" / new)
+
+
+def jpeg(folder):
+    frame = folder / "scans" / "bolt" / "frame_3.png"
+    cv2.imwrite(str(frame.with_suffix(".jpg")), cv2.imread(str(frame)))
+    frame.unlink()
+
+
+SEVEN = {"order": ["white", "vertical"], "vertical": UNIT_CUE | {"steps": [3, 4]}}
+BAD = {
+    "missing frame": (changed(lambda f: (f / "scans/bolt/frame_6.png").unlink()), "expected the 7 frames.*found 6"),
+    "one frame more": (changed(copy_frame("bolt/x.png")), "found 8"),
+    "another sequence": (of_rig(sequence=SEVEN), "expected the 8 frames.*found 7"),
+    "unreadable image": (of_many, r"(?s)bolt/frame_3\.png.*\n.*front/frame_2\.png"),
+    "lossy image": (changed(jpeg), r"frame_3\.jpg.*JPEG"),
+    "frames of two sizes": (changed(other_size), "91 x 70 px"),
+    "another size": (of_frames(lambda image: image[:60]), "bolt: frames of 90 x 60 px, .*has 90 x 70 px"),
+    "colour": (of_frames(lambda image: np.stack([image, image // 2, image], -1)), "colour channels differ"),
+    "empty object": (changed(in_scans("empty")), "empty: expected a folder with images"),
+    "empty view": (changed(in_scans("gear_wheel/top")), "top: expected a folder with images"),
+    "nothing": (changed(lambda f: [shutil.rmtree(f / "scans"), (f / "scans").mkdir()]), "holds no folder of an object"),
+    "no folder": (changed(lambda f: shutil.rmtree(f / "scans")), "expected a folder with a folder of frames for each"),
+    "frames beside objects": (changed(copy_frame(".")), "holds frames itself"),
+    "frames beside views": (changed(copy_frame("gear_wheel")), "frames and folders"),
+    "underscore in a view": (changed(rename("gear_wheel/front", "gear_wheel/front_1")), r"no _\), such as front-1"),
+    "dot in an object": (changed(rename("bolt", "bolt.v2")), "expected an object name of letters"),
+    "object in two splits": (splits("{train: [bolt], test: [bolt, gear_wheel]}"), "under train and test"),
+    "object twice": (splits("{test: [bolt, bolt, gear_wheel]}"), "'bolt' is listed under test and test"),
+    "object in no split": (splits("{test: [bolt]}"), "'gear_wheel' is in no split"),
+    "unknown object": (splits("{test: [bolt, gear_wheel, nut]}"), "'nut' has no captures"),
+    "unknown split": (splits("{tests: [bolt, gear_wheel]}"), "tests: is not a key"),
+    "splits that are no list": (splits("{test: bolt}"), "test: .*list"),
+    "malformed splits": (splits("{test: ["), "can't be read as YAML"),
+    "no splits file": (lambda f: ("--splits", f / "none.yaml"), "none.yaml: can't be read"),
+    "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the frames are too dark"),
+    "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),
+    "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "probably working_range_mm"),
+    "impossible bits": (lambda f: ("--bits", 20), "bits: expected a whole number from 8 to 16"),
+    "bits of deeper images": (lambda f: ("--bits", 12), "found images of 8 bits"),
+    "unknown colour": (lambda f: ("--colour", "cyan"), "colour: expected luminance"),
+    "impossible limit": (lambda f: ("--min-modulation", -1), "min_modulation: expected a positive"),
+    "frame order": (lambda f: ("--frame-order", "paper"), "belongs to published trees"),
+    "no workers": (lambda f: ("--workers", 0), "expected 1 or more"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_capture_is_refused(scanned, name, capsys):
+    prepare, said = BAD[name]
+    assert importing(scanned, *prepare(scanned), *([] if name == "no workers" else ["--workers", 1])) == 2
+    error = capsys.readouterr().err
+    assert re.search(said, error), error
+    assert "Traceback" not in error and not (scanned / "set" / "manifest.json").exists()
+
+
+def test_options_belong_to_one_kind_of_import(scanned, capsys):
+    assert run("import", "--captures", scanned / "scans", scanned / "set") == 2
+    assert "give its file with --rig" in capsys.readouterr().err
+    assert run("import", scanned / "scans", scanned / "set", "--bits", 12) == 2
+    assert "--bits belongs to captures" in capsys.readouterr().err
+    assert run("import", scanned / "scans", scanned / "set") == 2  # the published layout stays as strict as it is
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        (["classical", "--steps", "3"], "leave steps out"),
+        (["classical", "--direction", "horizontal"], "no horizontal fringes or codes, only vertical"),
+        (["classical", "--fewest"], "leave fewest out"),
+        (["phase", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
+        (["unet-individual-rmse"], "was trained at 224x224 px"),
+        (["phase-net", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
+    ],
+)
+def test_methods_that_can_not_run_say_what_they_need(scanned, method, said, capsys):
+    assert importing(scanned, "--workers", 1) == 0
+    assert run("predict", *method, scanned / "set", "--out", scanned / "p") == 2
+    assert re.search(said, capsys.readouterr().err)

@@ -1,0 +1,105 @@
+"""The rig of a published tree, found from its raw scans and depth alone, against the hidden rig that rendered it."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from published_trees import command, make_tree
+
+from fpp_ml_bench.calibration import fit_projector
+from fpp_ml_bench.errors import CalibrationError, LayoutError
+from fpp_ml_bench.loaders.published import depth_difference_mm, export, plan_import, tree_views
+from fpp_ml_bench.loaders.render import BuildSettings, build
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Pinhole, load_rig, paper_rig, rotation_matrix, save_rig
+
+SIZE = 128
+HIDDEN = replace(
+    paper_rig(SIZE), projector=Pinhole(912, 1140, 1650.0, 1650.0, 455.5, 569.5), translation_m=(0.19, -0.08, 0.03),
+    rotation=tuple(map(tuple, rotation_matrix((0.04, -0.07, 0.015)).tolist())),
+    pitch_vertical_px=30.0, pitch_horizontal_px=26.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    """Six views of one object by the hidden rig; nothing in the tree names the rig."""
+    folder = tmp_path_factory.mktemp("hidden")
+    build(folder / "data", BuildSettings(HIDDEN, ("power_drill",)), workers=1)
+    export(DatasetFolder(folder / "data"), folder / "tree", ["mat"], ["test"])
+    return folder / "tree"
+
+
+def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(tree, tmp_path, capsys):
+    assert command("calibrate", "--from-depth", tree, "--out", tmp_path / "rig.yaml") == 0
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)
+    np.testing.assert_allclose(rig.t, HIDDEN.t, atol=0.002)
+    np.testing.assert_allclose(rig.R, HIDDEN.R, atol=0.001)
+    assert rig.projector.fx == pytest.approx(1650, rel=0.003)
+    printed = capsys.readouterr().out
+    assert "power_drill_A240" in printed and "whole px" in printed and "wrote" in printed
+
+    reader = plan_import(tree).reader
+    read: list[int] = []
+    found, fit = fit_projector(tree_views(reader, 2, read.append), reader.rig)
+    assert found == rig
+    assert len(read) == len(fit.views) == 6
+    assert fit.total.rms_mm < 0.05  # against the exported depth, which the hidden rig decoded
+    assert depth_difference_mm(replace(reader, rig=rig)) < 0.05
+    assert depth_difference_mm(reader) > 1  # the paper's rig
+
+
+def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, capsys):
+    assert command("import", tree, tmp_path / "assumed", "--workers", 1) == 0
+    message = capsys.readouterr().err
+    assert "warning: the paper's rig did not take" in message and "calibrate --from-depth" in message
+    assert command("import", tree, tmp_path / "fitted", "--workers", 1, "--fit-rig") == 0
+    assert "warning" not in capsys.readouterr().err
+    rig = DatasetFolder(tmp_path / "fitted").rig
+    assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)
+
+
+def test_what_is_known_is_used(tree):
+    reader = plan_import(tree).reader
+    views = tree_views(reader)
+    rig, fit = fit_projector(views, reader.rig, pitch_px=(30.0, 26.0))
+    assert fit.pitch_from == "given" and rig.projector.focal == pytest.approx((1650, 1650), rel=0.003)
+    with pytest.raises(CalibrationError, match="not be square"):
+        fit_projector(views, reader.rig, (1280, 800))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--from-depth", "nowhere"), "no such folder"),
+        (("--from-depth", "flat"), "no raw scans"),
+        (("--from-depth", "tree", "--out", "nowhere/rig.yaml"), "does not exist"),
+        (("--from-depth", "tree", "--out", "rig.txt"), "ending in"),
+        (("--from-depth", "tree", "--workers", "0"), "expected 1 or more"),
+        (("--from-depth", "tree", "--camera", "wide.yaml"), "its camera has"),
+    ],
+    ids=["no tree", "no raw scans", "no folder", "suffix", "workers", "camera"],
+)
+def test_bad_input_is_a_message_status_2_and_no_file(tree, tmp_path, monkeypatch, capsys, options, message):
+    make_tree(tmp_path / "flat")
+    (tmp_path / "tree").symlink_to(tree)
+    save_rig(paper_rig(240), tmp_path / "wide.yaml")
+    monkeypatch.chdir(tmp_path)
+    assert command("calibrate", "--out", "rig.yaml", *options) == 2
+    error = capsys.readouterr().err
+    assert "error:" in error and message in error and "Traceback" not in error
+    assert not (tmp_path / "rig.yaml").exists() and not (tmp_path / "rig.txt").exists()
+
+
+def test_a_missing_frame_and_frames_of_another_depth_are_refused(tree, tmp_path):
+    broken = shutil.copytree(tree, tmp_path / "broken")
+    scans = broken / "fpp_synthetic_dataset" / "power_drill"
+    for number in range(52):
+        shutil.copyfile(scans / "A0" / f"A_{number}.png", scans / "A60" / f"A_{number}.png")
+    with pytest.raises(LayoutError, match="differs from the single-shot input"):
+        tree_views(plan_import(broken).reader)
+    (scans / "A120" / "A_7.png").unlink()
+    with pytest.raises(LayoutError, match=r"A_7\.png: is missing"):
+        plan_import(broken)
