@@ -39,6 +39,7 @@ METHODS: dict[str, tuple[object, ...]] = {
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
     },
     **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
+    **{f"constant-{depth}": ("constant", "--at", depth) for depth in ("standoff", "training-mean")},
     "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
 """File name of a row: method and options."""

@@ -35,15 +35,15 @@ def export_capture(
     folder: str | Path, depth_mm: ArrayLike, camera: Pinhole, grey: ArrayLike | None = None,
     forms: Sequence[str] = FORMS, step_mm: float | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``:
+    """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``::
 
-    npy    depth.npy: float32 mm
-    mat    depth.mat: float32 mm, variable depthMap
-    png    depth_0.1mm.png: 16-bit levels of a unit from 0.001 to 10 mm, the finest that fits; the unit is in the name
-           and in the text chunk mm_per_level
-    ply    points.ply: binary, a point per pixel with depth: position in mm, normal, and ``grey`` (H, W), grey levels of
-           0 to 255, as intensity and colour
-    mesh   mesh.ply: the same points, neighbours joined by triangles
+        npy    depth.npy: float32 mm
+        mat    depth.mat: float32 mm, variable depthMap
+        png    depth_0.1mm.png: 16-bit levels of a unit from 0.001 to 10 mm, the finest that fits; the unit is in the
+               name and in the text chunk mm_per_level
+        ply    points.ply: binary, a point per pixel with depth: position in mm, normal, and ``grey`` (H, W), grey
+               levels of 0 to 255, as intensity and colour
+        mesh   mesh.ply: the same points, neighbours joined by triangles
 
     ``step_mm``: the largest step in depth between neighbours of one surface, by default `STEEPEST` times their
     distance. Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the camera's,
