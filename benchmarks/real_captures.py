@@ -72,10 +72,13 @@ def calibrate(
     sequence.write_text(BOARD + "order: [vertical, horizontal]}\n", encoding="utf-8")
     board = calibration.Board("checker", 9, 13, SPACING_MM)
     started = perf_counter()
-    poses, stand_in = captures.board_poses(poses_folder, board, sequence)
+    poses, stand_in, response = captures.board_poses(poses_folder, board, sequence)
     found_in = perf_counter() - started
     sizes = (theirs.camera.width, theirs.camera.height), (theirs.projector.width, theirs.projector.height)
     print(f"six poses, {sum(len(pose.corners_px) for pose in poses)} corners, found in {found_in:.0f} s")
+    if response is not None:
+        print(f"response: gamma {response.gamma:.3f} +- {response.sigma:.3f}, misfit {response.misfit_grey:.2f} grey "
+              f"levels, white on the board {response.white_grey:.0f} of 255")  # fmt: skip
     print("calibration, RMS in px                            camera  alone  projector  alone  stereo  left out")
     errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")

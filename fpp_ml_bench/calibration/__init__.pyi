@@ -15,6 +15,10 @@ from .projector_points import ProjectorPoints as ProjectorPoints
 from .projector_points import measure_pose as measure_pose
 from .projector_points import projector_points as projector_points
 from .report import draw_residuals as draw_residuals
+from .response import Levels as Levels
+from .response import Response as Response
+from .response import fit_response as fit_response
+from .response import levels_of as levels_of
 from .result import Calibration as Calibration
 from .result import Device as Device
 from .result import FittedPose as FittedPose

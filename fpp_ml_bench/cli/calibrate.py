@@ -175,7 +175,7 @@ def _from_board(
     """Calibrate, print and write; the rig, with standoff and background of ``like``."""
     lenses = _lenses(args)
     with progress_bar("finding the board", len(captures.pose_folders(folder)), "poses") as advance:
-        poses, rig = captures.board_poses(folder, board, sequence, args.bits, args.colour, advance)
+        poses, rig, response = captures.board_poses(folder, board, sequence, args.bits, args.colour, advance)
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
     options = {"estimate_board": args.estimate_board, "baseline_mm": args.baseline}
@@ -196,6 +196,9 @@ def _from_board(
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     print_calibration(best)
+    if response is not None:
+        print(f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
+              f"white on the board: {response.white_grey:.0f} of 255 grey levels")  # fmt: skip
     optics.save_rig(rig, args.out)
     written = [args.out]
     if find_spec("matplotlib"):  # of the extra page

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fpp_ml_bench.calibration import Board, Calibration, Pose, measure_pose
+from fpp_ml_bench.calibration import Board, Calibration, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import CalibrationError
@@ -33,10 +33,11 @@ def pose_folders(captures: Path) -> list[Path]:
 def board_poses(
     captures: Path, board: Board, sequence: Path, bits: int | None = None, colour: str | None = None,
     progress: Callable[[int], None] = lambda poses: None,
-) -> tuple[list[Pose], Rig]:  # fmt: skip
-    """The board's points in every pose folder of ``captures``, in camera and projector px, and a rig with the sequence
-    of the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`). ``bits`` and ``colour``
-    as in `read_frames`. Raises FppBenchError naming the pose or file."""
+) -> tuple[list[Pose], Rig, Response | None]:  # fmt: skip
+    """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
+    the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
+    projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. Raises FppBenchError
+    naming the pose or file."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
         raise CalibrationError(
@@ -44,6 +45,7 @@ def board_poses(
             "project both directions on the board"
         )
     poses: list[Pose] = []
+    levels = []
     for folder in pose_folders(captures):
         frames = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour).frames
         height, width = frames.shape[1:]
@@ -57,8 +59,10 @@ def board_poses(
         lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
         u_px, v_px = (details[direction].coordinate_px for direction in AXES)
         poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
+        measured = levels_of(list(frames), (u_px, v_px), poses[-1], rig)
+        levels += [] if measured is None else [measured]
         progress(1)
-    return poses, rig
+    return poses, rig, fit_response(levels)
 
 
 def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:

@@ -1,0 +1,28 @@
+"""The response of projector and camera from photographed boards, against the light that photographed."""
+
+import pytest
+
+from fpp_ml_bench.calibration import fit_response
+from fpp_ml_bench.loaders.captures import board_poses
+from fpp_ml_bench.loaders.render import board_poses as poses_of
+from fpp_ml_bench.loaders.render import fitting_board, named_light, photograph_board
+from fpp_ml_bench.optics import paper_rig, rig_from_dict
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.6])
+def test_gamma_is_that_of_the_light(tmp_path, gamma):
+    data = paper_rig(480).to_dict()
+    del data["pitch_px"]
+    codes = {"vertical": {"scheme": "phase-shift", "pitches_px": [24, 912], "steps": [4, 8]},
+             "horizontal": {"scheme": "phase-shift", "pitches_px": [24, 1140], "steps": [4, 8]}}  # fmt: skip
+    rig = rig_from_dict({**data, "sequence": {"order": ["vertical", "horizontal", "white"], **codes}})
+    board = fitting_board(rig)
+    light = named_light("paper").changed("projector", response=gamma)
+    photograph_board(tmp_path / "boards", rig, board, poses_of(rig, board, 3), light)
+    *_, response = board_poses(tmp_path / "boards", board, tmp_path / "boards" / "rig.yaml")
+    assert response.gamma == pytest.approx(gamma, abs=0.03)
+    assert 0 < response.sigma < 0.01 and response.misfit_grey < 3 and 50 < response.white_grey < 255
+
+
+def test_no_captures_have_no_response():
+    assert fit_response([]) is None
