@@ -29,7 +29,7 @@ BRIGHT_SHARE = 0.5
 
 
 class Response(NamedTuple):
-    """``gamma`` of projector and camera together, with its standard ``sigma``; the ``misfit_grey`` that is left, RMS grey
+    """``gamma`` of projector and camera together, and its standard ``sigma``; ``misfit_grey``: what is left, RMS grey
     levels; ``white_grey``: the grey level of a white pattern at the board's brightest, of 255."""
 
     gamma: float
