@@ -217,7 +217,9 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     (group,) = (group for group in rank(shipped) if any(row.entry.path.stem == "phase-vertical" for row in group.rows))
     pages = page_files([group], [])
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
-    assert own and all("a lit background" in text for text in own)
+    assuming = [row for row in group.rows if assumption(row.entry.result)]
+    assert assuming and sum("a lit background" in text for text in own) == len(assuming)
+    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {"constant"}
     assert "phase and phase-net assume one albedo, a lit background." in readme_block([group])
 
 
