@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.loaders.captures import read_mask
 from fpp_ml_bench.optics import Rig
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
@@ -28,26 +28,10 @@ ORDER_SHARE = (0.16, 0.10, 0.05)
 that it is wrong; these factors correct that."""
 
 
-def read_mask(file: str | Path, rig: Rig) -> NDArray[np.bool_]:
-    """Object mask bool (H, W) of ``rig``'s camera from an image file, its pixels above 0. Raises `PredictionError` for
-    a file that is no image, has another size, or shows no object."""
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if Path(file).is_file() else None
-    shape = rig.camera.height, rig.camera.width
-    if image is None:
-        raise PredictionError(f"mask {file}: expected an image file (PNG) whose pixels above 0 are object")
-    if image.shape != shape:
-        raise PredictionError(
-            f"mask {file}: expected the size of the captured images, {shape} (H, W), got {image.shape}"
-        )
-    if not image.any():
-        raise PredictionError(f"mask {file}: shows no object: all pixels are 0")
-    return image > 0  # type: ignore[no-any-return]
-
-
 class PhaseMethod(Method):
-    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: an image file of
-    the camera's size whose pixels above 0 are object in every sample, instead of the route's own mask. Raises
-    `PredictionError` for an unknown option, an invalid value, and a mask that can't be used."""
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: a file
+    (`captures.read_mask`) that says where the object is in every sample, instead of the route's own mask. Raises
+    `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
 
     name = "phase"
 
@@ -63,7 +47,8 @@ class PhaseMethod(Method):
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
         cues = ["range"] + ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
         self.title = f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
-        self.mask = None if mask is None else read_mask(mask, rig)
+        shape = rig.camera.height, rig.camera.width
+        self.mask = None if mask is None else read_mask(Path(mask), shape)
         self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
 
     def measure(self, frames: Frames) -> Measurement:

@@ -102,7 +102,8 @@ def _clipped(frames: NDArray, names: Sequence[str], lit: NDArray[np.bool_]) -> l
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where an image or .npy file is not 0, bool (H, W). Raises `CaptureError` for another file or ``shape``."""
+    """Where an image or .npy file is not 0, bool (H, W). Raises `CaptureError` for another file or ``shape``, and where
+    all of it is 0."""
     if file.suffix.lower() == ".npy":
         try:
             values = np.load(file, allow_pickle=False)
@@ -113,6 +114,8 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     if values.shape != shape:
         raise CaptureError(f"{file}: expected a mask of (H, W) = {shape} like the frames, got {values.shape}")
     mask: NDArray[np.bool_] = np.nan_to_num(values) != 0
+    if not mask.any():
+        raise CaptureError(f"{file}: shows no object: all pixels are 0")
     return mask
 
 

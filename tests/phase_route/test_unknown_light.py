@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_route import Periods, PhaseMethod, PhaseRoute, Reason, Settings
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.loaders.render import BuildSettings, build
 from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
@@ -140,14 +140,14 @@ def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     depth_mm = method.predict([None] * 18 + [image])
     assert not depth_mm[~disk].any() and (depth_mm[disk] > 0).mean() > 0.9
     for name, content, message in (
-        ("absent.png", None, "expected an image file"),
-        ("text.png", b"no image", "expected an image file"),
+        ("absent.png", None, "found nothing there"),
+        ("text.png", b"no image", "text.png: .*capture or copy it again"),
         ("small.png", cv2.imencode(".png", np.ones((3, 4), np.uint8))[1].tobytes(), r"got \(3, 4\)"),
         ("empty.png", cv2.imencode(".png", np.zeros((240, 240), np.uint8))[1].tobytes(), "shows no object"),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
-        with pytest.raises(PredictionError, match=message):
+        with pytest.raises(CaptureError, match=message):
             load_method("phase", NARROW, mask=tmp_path / name)
     dataset = str(tmp_path / "set")
     build(Path(dataset), BuildSettings(SMALL, ("cork",), stored="single_shot"), workers=1)
