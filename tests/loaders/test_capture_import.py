@@ -19,6 +19,7 @@ from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.captures import Splits, import_captures, plan_captures
 from fpp_ml_bench.loaders.captures.importing import CaptureReader
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
 from fpp_ml_bench.loaders.storage import DatasetFolder, plan_rows, verify
 from fpp_ml_bench.optics import paper_rig, rig_from_dict, save_rig
 
@@ -371,3 +372,15 @@ def test_methods_that_can_not_run_say_what_they_need(scanned, method, said, caps
     assert importing(scanned, "--workers", 1) == 0
     assert run("predict", *method, scanned / "set", "--out", scanned / "p") == 2
     assert re.search(said, capsys.readouterr().err)
+
+
+def test_ground_truth_by_gray_code_needs_black_and_white_stored_or_not():
+    """The renderer exposes the frames that the decoder reads, whatever is stored."""
+    gray = {"order": ["black", "white", "vertical"], "vertical": {"scheme": "gray", "cell_px": 4}}
+    rig = rig_from_dict({**coded_rig(96, 96, **gray).to_dict(), "background_m": 3.2})
+    whole, first = (
+        Studio(BuildSettings(rig, ("mug",), stored=stored)).photograph(solid_mesh("mug"), "A0").depth_mm
+        for stored in ("all", "single_shot")
+    )
+    assert (whole > 0).sum() > 100
+    np.testing.assert_array_equal(whole, first)
