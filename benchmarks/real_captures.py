@@ -22,6 +22,7 @@ from PIL import Image
 from fpp_ml_bench import calibration, decoding, optics
 from fpp_ml_bench.baselines import robustness
 from fpp_ml_bench.baselines.phase_route import PhaseMethod
+from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.loaders import captures, render
 
 SPACING_MM = 10.0
@@ -34,7 +35,6 @@ SEQUENCES = {
     "skull_gray": "{order: [white, black, vertical], vertical: {scheme: gray, cell_px: 2, bits: 10}}",
 }
 RANGE_MM = (300.0, 500.0)
-ROBUST = 1.4826
 
 
 def main() -> int:
@@ -83,7 +83,7 @@ def calibrate(
     errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
     own = (calibration.Lens("radial-1", True, True), calibration.Lens("radial-1", True))
-    best = None
+    results = []
     for title, lens, free in (
         ("their model, perfect board", own, False),
         ("their model, board estimated", own, True),
@@ -94,9 +94,8 @@ def calibrate(
         alone = found.alone_rms_px
         print(f"{title:<50}{found.camera_rms_px:6.3f} {alone[0]:6.3f}  {found.projector_rms_px:8.3f} {alone[1]:6.3f}"
               f"{found.stereo_rms_px:8.3f}{found.held_out_rms_px:10.3f}")  # fmt: skip
-        if best is None or found.held_out_rms_px < best.held_out_rms_px:
-            best = found
-    assert best is not None
+        results.append(found)
+    best = min(results, key=lambda found: found.held_out_rms_px)
     rig = captures.calibrated_rig(best, stand_in)
     for name in ("camera", "projector"):
         for who, device in (("authors", getattr(theirs, name)), ("ours", getattr(rig, name))):
@@ -134,7 +133,7 @@ def decode(folder: Path, rig: "optics.Rig", camera: "optics.Pinhole", cloud: NDA
     both = depth_mm > 0
     difference = depth_mm[both] - theirs[both][:, 2]
     median = float(np.median(difference))
-    sigma = ROBUST * float(np.median(np.abs(difference - median)))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(difference - median)))
     within = float((np.abs(difference) < 2).mean())
     x, y = (axis[rows, columns][both] for axis in rig.camera.rays())
     apart, scale = after_motion(np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[both, None], theirs[both])
@@ -152,7 +151,7 @@ def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tu
         left, _, right = np.linalg.svd((points[kept] - a).T @ (target[kept] - b))
         turn = right.T @ np.diag([1.0, 1.0, np.linalg.det(right.T @ left.T)]) @ left.T
         apart = np.linalg.norm((points - a) @ turn.T + b - target, axis=1)
-        kept = apart < 3 * ROBUST * np.median(apart)
+        kept = apart < 3 * MAD_TO_SIGMA * np.median(apart)
     scale = np.sqrt(((target[kept] - b) ** 2).sum() / ((points[kept] - a) ** 2).sum())
     return float(np.median(apart)), float(scale)
 
@@ -175,7 +174,7 @@ def twin(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
         depth_mm = np.where(found, decoded.depth_mm.astype(np.float64), np.nan)
         bends = depth_mm[:, 2:] - 2 * depth_mm[:, 1:-1] + depth_mm[:, :-2]
         bends = bends[np.isfinite(bends) & (np.abs(bends) < 3)]
-        noise_mm = ROBUST * float(np.median(np.abs(bends - np.median(bends)))) / np.sqrt(6)
+        noise_mm = MAD_TO_SIGMA * float(np.median(np.abs(bends - np.median(bends)))) / np.sqrt(6)
         modulation = float(np.median(decoded.details["vertical"].modulation[found]))
         print(
             f"{title:<20} {found.sum():,} px: modulation {modulation:.1f} grey levels, noise of depth {noise_mm:.3f} mm"
@@ -189,7 +188,7 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
     on_object = decoded.depth_mm > 0
     single: list[NDArray | None] = [frames[0], *[None] * (len(rig.sequence) - 1)]
     for near, far in ((350.0, 450.0), (360.0, 430.0)):
-        ranged = replace(rig, working_range_mm=(near, far), standoff_m=(near + far) / 2000)
+        ranged = rig.with_range((near, far))
         in_range = on_object & (decoded.depth_mm >= near) & (decoded.depth_mm <= far)
         half_mm = 0.5 / float(np.median(np.abs(decoding.coordinate_slope_px_per_mm(
             rig, decoded.depth_mm[in_range], "vertical", tuple(axis[in_range] for axis in rig.camera.rays())

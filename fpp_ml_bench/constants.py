@@ -73,3 +73,7 @@ def split_sample_name(sample: str) -> tuple[str, str]:
     if not name or not view:
         raise ValueError(f"expected a sample name like 'power_drill_A60', got {sample!r}")
     return name, view
+
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""

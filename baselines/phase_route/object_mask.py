@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Image, Mask
 from fpp_ml_bench.coding import MIN_MODULATION
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.optics import Rig
 
 Crop = tuple[slice, slice]
@@ -119,7 +119,7 @@ class EmptyScene:
         terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
         solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
         misfit = sampled - terms @ solution
-        noise = max(1.4826 * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
+        noise = max(MAD_TO_SIGMA * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
         for weight, term in zip(weights, self._terms, strict=True):
@@ -173,7 +173,7 @@ def image_noise_grey(image: NDArray) -> float:
     grey = image.astype(np.float32)
     across = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
     mask = across[:-2] - 2 * across[1:-1] + across[2:]
-    return 1.4826 * float(np.median(np.abs(mask))) / 6.0
+    return MAD_TO_SIGMA * float(np.median(np.abs(mask))) / 6.0
 
 
 def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.depth_views import MOST_PX, DepthView
-from fpp_ml_bench.calibration.projection import ROBUST, Projection, projection_from
+from fpp_ml_bench.calibration.projection import Projection, projection_from
 from fpp_ml_bench.calibration.refinement import CENTRE, NAMES, PITCH, POSE, Measured, Projector, measured_in, refined
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.decoding import depth_from_both
 from fpp_ml_bench.errors import CalibrationError, RigError
 from fpp_ml_bench.optics import AXES, Pinhole, Rig
@@ -237,6 +237,6 @@ def _residual(name: str, differences: NDArray[np.float64]) -> Residual:
     if not len(depth_mm):
         return Residual(name, 0, missing, *[math.nan] * 4)
     median = float(np.median(depth_mm))
-    sigma = ROBUST * float(np.median(np.abs(depth_mm - median)))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(depth_mm - median)))
     rms_mm, rms_px = (math.sqrt(float(np.mean(squares))) for squares in (depth_mm**2, u_px**2 + v_px**2))
     return Residual(name, len(depth_mm), missing, median, sigma, rms_mm, rms_px)

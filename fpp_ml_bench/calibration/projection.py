@@ -23,8 +23,6 @@ MOST_SKEW = 0.05
 _MOST_TRIMMINGS = 30
 _KEPT_MEDIANS = 5.0
 _SMALLEST_PERIODS = 1e-9
-ROBUST = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 class Projection(NamedTuple):

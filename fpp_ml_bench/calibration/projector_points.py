@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board, nearest_px
+from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.errors import CalibrationError
 
 WINDOW_SHARE = 0.5
@@ -128,7 +129,7 @@ def _fit(position: NDArray[np.float64], coordinates: NDArray[np.float64]) -> tup
         denominator = 1 + position @ solution[6:]
         residual = (target - design @ solution).reshape(2, -1) / denominator
         distance = np.hypot(*residual)
-        sigma = max(1.4826 * float(np.median(distance)), 1e-12)
+        sigma = max(MAD_TO_SIGMA * float(np.median(distance)), 1e-12)
         if step < 8:
             new_weight = 1 / np.maximum(distance / sigma, 0.1)
         else:

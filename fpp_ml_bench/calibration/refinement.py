@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.depth_views import DepthView
-from fpp_ml_bench.calibration.projection import ROBUST
+from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.optics import distortion_polynomial, rotation_matrix
 
@@ -127,4 +127,4 @@ def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Proje
 
 
 def _sigma(values: NDArray[np.float64]) -> float:
-    return ROBUST * float(np.median(np.abs(values)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(values)))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.lens import Lens
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.optics import Pinhole
 
 SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
@@ -106,6 +106,6 @@ class Calibration:
         held_out = np.array([pose.held_out_rms_px for pose in self.poses])
         errors = fitted if np.isnan(held_out).any() else held_out
         middle = np.median(errors)
-        limit = middle + max(SPOILER_SIGMAS * 1.4826 * np.median(np.abs(errors - middle)), 0.5 * middle)
+        limit = middle + max(SPOILER_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(errors - middle)), 0.5 * middle)
         bad = (errors > limit) & (fitted > SPOILER_SHARE * np.median(fitted))
         return tuple(pose.name for pose, named in zip(self.poses, bad, strict=True) if named)

@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -56,8 +55,7 @@ def run(args: argparse.Namespace) -> int:
         raise CaptureError(f"{args.out}: not empty, and no earlier decoding; give a new folder")
     rig = optics.load_rig(args.rig)
     if args.range is not None:
-        near, far = args.range
-        rig = replace(rig, working_range_mm=args.range, standoff_m=(near + far) / 2000, background_m=None)
+        rig = rig.with_range(args.range)
     started = perf_counter()
     with progress_bar("decoding", 4, "steps") as advance:
         capture = captures.read_frames(args.frames, count=len(rig.sequence), bits=args.bits, colour=args.colour)

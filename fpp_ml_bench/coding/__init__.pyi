@@ -2,7 +2,6 @@ from .code import SMALLEST_PITCH_PX as SMALLEST_PITCH_PX
 from .code import Code as Code
 from .code import Kind as Kind
 from .code import Shown as Shown
-from .code import code_from_dict as code_from_dict
 from .composite import Composite as Composite
 from .coordinates import CLIPPED_STEPS_DIVISOR as CLIPPED_STEPS_DIVISOR
 from .coordinates import MAX_DISAGREEMENT_PX as MAX_DISAGREEMENT_PX
@@ -33,3 +32,4 @@ from .phase_shift import Fringes as Fringes
 from .phase_shift import PhaseShift as PhaseShift
 from .phase_shift import equal_shifts as equal_shifts
 from .schemes import SCHEMES as SCHEMES
+from .schemes import code_from_dict as code_from_dict

@@ -80,24 +80,6 @@ class Code(ABC):
         """The entries of a rig file; `code_from_dict` gives an equal code back."""
 
 
-def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Code:
-    """The code that a rig file's entry describes, on a pattern ``length_px`` long. Raises `RigError` naming the key."""
-    from fpp_ml_bench.coding.schemes import SCHEMES
-
-    if not isinstance(entries, Mapping):
-        raise RigError(f"{where}: expected a mapping with the key scheme, got {entries!r}")
-    scheme = entries.get("scheme")
-    if scheme not in SCHEMES:
-        raise RigError(f"{where}.scheme: expected {', '.join(SCHEMES)}, got {scheme!r}")
-    rest = {key: value for key, value in entries.items() if key != "scheme"}
-    try:
-        code: Code = SCHEMES[scheme].from_entries(rest, length_px)
-        code.check(length_px)
-    except RigError as error:
-        raise RigError(f"{where}.{error}") from error
-    return code
-
-
 def entry(entries: Mapping[str, Any], key: str, default: Any = None) -> Any:
     """An entry of a rig file; raises `RigError` where it is missing and has no ``default``."""
     if key not in entries and default is None:

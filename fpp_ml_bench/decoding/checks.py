@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import Limits
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.blocks import DirectionPlan
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
@@ -60,7 +61,9 @@ def flat_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...
             )
         if flat and image.dtype != next(iter(flat.values())).dtype:
             raise DecodeError(f"{title}: expected the dtype of the other frames, got {image.dtype}")
-        if image.dtype == np.float32 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 255):
+        if image.dtype == np.float32 and not (
+            np.isfinite(image).all() and image.min() >= 0 and image.max() <= GREY_LEVELS
+        ):
             raise DecodeError(f"{title}: expected float32 grey levels of 0 to 255; scale them by 255 / full scale")
         if image.shape != expected:
             raise DecodeError(

@@ -15,13 +15,15 @@ POOR, GOOD, FEWER = 0.8, 0.9, 3.0
 two thirds still fit some order), above the second it is right, if so many times fewer pixels are left without one."""
 LARGEST_MISFIT = 0.2
 """Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and more tell."""
+_LOOKED_AT_PX = 200_000
 _SAMPLED_PX, _LEAST_PX, _LEAST_LIT_GREY = 4000, 200, 4 * MIN_MODULATION
 
 
 def exchanged_frames(frames: Sequence[NDArray], rig: Rig) -> tuple[int, int] | None:
     """Indices of two frames that seem to have changed places: as they are, fewer than `POOR` of the lit pixels fit the
     code, and exchanged more than `GOOD` do. None where the frames fit, or where no exchange of two makes them."""
-    levels = np.stack([np.asarray(frame).reshape(-1) for frame in frames])
+    flat = [np.asarray(frame).reshape(-1) for frame in frames]
+    levels = np.stack([frame[:: max(frame.size // _LOOKED_AT_PX, 1)] for frame in flat])
     lit = np.flatnonzero(np.ptp(levels, axis=0) >= _LEAST_LIT_GREY)
     if len(lit) < _LEAST_PX:
         return None

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import MIN_MODULATION, PhaseShift, phase_weights, weighted_sums
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.decode import Decoded
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
 from fpp_ml_bench.errors import DecodeError
@@ -55,7 +56,7 @@ def noise_of_frames(frames: Sequence[NDArray], rig: Rig) -> float | None:
             levels = np.stack([frame[:: max(frame.size // _SAMPLED_PX, 1)] for frame in flat]).astype(np.float64)
             weights = phase_weights(2 * np.pi * fringe.turns)
             mean, cosine, sine = weighted_sums(levels, weights)
-            lit = (cosine**2 + sine**2 >= MIN_MODULATION**2) & ((levels > 0) & (levels < 255)).all(axis=0)
+            lit = (cosine**2 + sine**2 >= MIN_MODULATION**2) & ((levels > 0) & (levels < GREY_LEVELS)).all(axis=0)
             if lit.sum() < _LEAST_PX:
                 continue
             angles = 2 * np.pi * fringe.turns[:, None]

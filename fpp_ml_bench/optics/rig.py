@@ -186,6 +186,10 @@ class Rig:
         """Distance of the two centres of projection."""
         return math.sqrt(sum(t * t for t in self.translation_m))
 
+    def with_range(self, range_mm: tuple[float, float]) -> "Rig":
+        """The rig with another working range, its standoff in the range's middle, and no known background."""
+        return replace(self, working_range_mm=range_mm, standoff_m=middle_m(range_mm), background_m=None)
+
     def scaled(self, size: int) -> "Rig":
         """The rig with a camera image ``size`` px wide; the projector, and with it the ambiguity, stays as it is."""
         return replace(self, camera=self.camera.scaled(size))
@@ -263,6 +267,12 @@ def paper_rig(size: int = FULL_SIZE) -> Rig:
     projector = Pinhole(912, 1140, 1824.0, 1824.0, 911 / 2, 1139 / 2)
     rig = Rig(camera, projector, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.125, -0.1, 0.0))
     return rig if size == FULL_SIZE else rig.scaled(size)
+
+
+def middle_m(range_mm: tuple[float, ...]) -> float:
+    """Middle of a range: the standoff of a rig that names none."""
+    near, far = range_mm
+    return (near + far) / 2 / MM_PER_M
 
 
 def rotation_matrix(vector: tuple[float, ...]) -> NDArray[np.float64]:

@@ -37,12 +37,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
-from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, sequence_from_dict
 
 _RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
@@ -87,8 +86,7 @@ def rig_from_dict(data: object) -> Rig:
     entries["sequence"] = sequence_from_dict(entries["sequence"], lengths)
     entries.setdefault("background_m", None)
     if "standoff_m" not in entries:
-        near, far = numbers(entries["working_range_mm"], 2, "working_range_mm")
-        entries["standoff_m"] = (near + far) / 2 / MM_PER_M
+        entries["standoff_m"] = middle_m(numbers(entries["working_range_mm"], 2, "working_range_mm"))
     return Rig(**entries)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from fpp_ml_bench.calibration import Board, Calibration, Pose, Response, fit_response, levels_of, measure_pose
-from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.captures.images import read_frames
@@ -75,5 +74,5 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
         stand_in, camera=found.camera.pinhole(), projector=found.projector.pinhole(), rotation=found.rotation,
-        translation_m=found.translation_m, working_range_mm=(near, far), standoff_m=(near + far) / 2 / MM_PER_M,
-    )  # fmt: skip
+        translation_m=found.translation_m,
+    ).with_range((near, far))  # fmt: skip

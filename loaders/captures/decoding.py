@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import MIN_MODULATION, Limits, Reason
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import (
     ASSUMED_NOISE_GREY,
     Decoded,
@@ -92,7 +93,7 @@ def decode_capture(
 
 
 def _clipped(frames: NDArray, names: Sequence[str], lit: NDArray[np.bool_]) -> list[str]:
-    shares = [float((frame[lit] >= 255).mean()) if lit.any() else 0.0 for frame in frames]
+    shares = [float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0 for frame in frames]
     high = [(name, share) for name, share in zip(names, shares, strict=True) if share > CLIPPED_SHARE]
     if not high:
         return []
