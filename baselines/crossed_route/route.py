@@ -1,0 +1,227 @@
+"""The route: frame -> both carriers -> mask -> candidates -> order -> fit of the nearness -> depth and its reasons."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
+from fpp_ml_bench.baselines.crossed_route.demodulation import Demodulated, Demodulator
+from fpp_ml_bench.baselines.crossed_route.empty_scene import EmptySceneFit
+from fpp_ml_bench.baselines.crossed_route.observation import (
+    CrossedMeasurement,
+    CrossedObservation,
+    CrossedReason,
+    Settings,
+)
+from fpp_ml_bench.baselines.crossed_route.orders import Candidates, candidates, chosen, neighbours, rival
+from fpp_ml_bench.baselines.crossed_route.refinement import WINDOW_PERIODS, refined
+from fpp_ml_bench.baselines.phase_route import (
+    Background,
+    Crop,
+    Image,
+    Mask,
+    Watch,
+    Window,
+    modulated_region,
+    object_region,
+    of_choice,
+    repeated,
+    stride_of,
+    unlit,
+    wrapped,
+)
+from fpp_ml_bench.coding import MIN_MODULATION, Crossed
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.optics import Rig
+
+MARGIN_PERIODS = 0.5  # of the crop around the object, which the windows and the mask's rim need
+LEAST_CONTRAST = 0.08
+CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
+WELL_LIT = 8.0  # modulation over noise from which on a window's phase counts fully
+LEAST_TRUST = 0.05
+EVIDENCE_SCALE, MARGIN_SCALE = 1.0, 4.0
+"""By how much evidence and margin of energy the odds of two orders grow e-fold."""
+HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
+SATURATED_SHARE = 0.02
+LOST_SHARE = 0.2  # of a carrier's contrast: below, it counts as not seen
+TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
+AMBIGUOUS_CHANCE = 0.3  # of a wrong order
+
+
+class CrossedRoute:
+    """The route for one rig and one family of crossed frames (default: the rig's own)."""
+
+    def __init__(self, rig: Rig, settings: Settings | None = None, family: Crossed | None = None) -> None:
+        self.rig, self.settings = rig, settings or Settings()
+        self.family = family or rig.crossed or Crossed.of_pair(rig)
+        rig.check_sampling()
+        self.carriers = Carriers.of(rig, self.family)
+        self.stride = stride_of(self.carriers.period_px)
+        self.demodulator = Demodulator(self.carriers, self.stride)
+        self._scene = EmptySceneFit(self.carriers, self.stride)
+
+    def measure(self, image: NDArray[np.uint8], mask: Mask | None = None) -> CrossedMeasurement:
+        """Depth and the maps behind it from one crossed frame uint8 (H, W), or float32 grey levels of the same range.
+        ``mask`` bool (H, W) replaces the route's own object mask. Raises `DecodeError` for another dtype or shape."""
+        return self.conclude(self.observe(image, mask))
+
+    def observe(self, image: NDArray, mask: Mask | None = None) -> CrossedObservation:
+        """Mask, order and fit of a crossed frame; arguments as of `measure`."""
+        grey, watch = self._checked(image), Watch()
+        seen = self.demodulator(grey)
+        watch.done("phase")
+        background = self._scene(grey, seen)
+        watch.done("background")
+        period_px = self.carriers.period_px
+        if mask is not None:
+            region = mask
+        elif background.shown:
+            region = object_region(background, period_px)
+        else:
+            modulation = repeated(seen.modulation.max(axis=0), self.stride, grey.shape)
+            region = modulated_region(grey, modulation, background, period_px)
+        crop = self._crop(region)
+        watch.done("mask")
+        return self._observed(grey, seen, background, region, crop, mask is not None, watch)
+
+    def _observed(
+        self, image: Image, seen: Demodulated, plane: Background, region: Mask, crop: Crop, given: bool, watch: Watch
+    ) -> CrossedObservation:
+        grid = tuple(slice(part.start // self.stride, -(-part.stop // self.stride)) for part in crop)
+        carriers, grey = self.carriers.at(crop), image[crop]
+        coarse = self.carriers.at(tuple(slice(part.start, part.stop, self.stride) for part in crop))  # type: ignore[arg-type]
+        background, inside = replace(plane, residual=plane.residual[crop]), region[crop]
+        period_px = self.carriers.period_px
+        dark = unlit(grey, background, period_px)
+        if not given:
+            inside = inside & ~dark
+        points = inside[:: self.stride, :: self.stride]
+        phases, modulation = seen.phase_rad[:, *grid], seen.modulation[:, *grid]
+        contrast = self._contrast(modulation, seen.mean_grey[grid] - background.ambient_grey, points)
+        found = candidates(coarse, phases, self.settings.slack_mm)
+        trust = np.clip(modulation.min(axis=0) / np.float32(WELL_LIT * background.noise_grey), LEAST_TRUST, 1)
+        index, margin, evidence = chosen(coarse, found, trust, points)
+        beside = neighbours(found, index)
+        watch.done("order")
+
+        def spread(values: NDArray) -> Image:
+            """Values of the grid at all pixels, each that of its grid point or of the nearest one inside."""
+            return repeated(values[..., *nearest], self.stride, (*values.shape[:-2], *grey.shape))
+
+        nearest: tuple[NDArray, ...] = tuple(np.indices(points.shape))
+        if points.any() and not points.all():
+            nearest = tuple(distance_transform_edt(~points, return_distances=False, return_indices=True))
+        phase_rad = self.demodulator.phases_at(seen, carriers)
+        start = _lifted(carriers, phase_rad, spread(of_choice(found.nearness, index)))
+        light = grey - np.float32(background.ambient_grey)
+        fit = refined(carriers, light, inside, start, contrast, background.noise_grey)
+        watch.done("fit")
+        if not given and not background.shown:
+            inside = inside & (fit.brightness > MIN_MODULATION)
+        clipped = ((grey >= GREY_LEVELS) & inside).astype(np.float32)
+        clipped_share = Window(WINDOW_PERIODS * period_px).moment(clipped) / np.maximum(fit.weight, 1e-3)
+        return CrossedObservation(
+            carriers=carriers, shape=image.shape, grey=grey, background=background, inside=inside, fit=fit,
+            phase_rad=phase_rad, modulation=spread(modulation), contrast=contrast, margin=spread(margin),
+            evidence=spread(evidence), rival=spread(rival(found, index)),
+            candidates=Candidates(*(spread(values) for values in vars(beside).values())),
+            clipped_share=clipped_share, watch=watch,
+        )  # fmt: skip
+
+    def conclude(self, seen: CrossedObservation) -> CrossedMeasurement:
+        """The measurement that follows from an observation."""
+        carriers, fit, watch, inside = seen.carriers, seen.fit, seen.watch, seen.inside
+        depth_mm = carriers.depth_mm(fit.nearness)
+        near_mm, far_mm = self.rig.working_range_mm
+        slack_mm = 4 * self.settings.slack_mm  # a fit may move a pixel out of the range that its order was chosen in
+        inside = inside & np.isfinite(depth_mm) & (depth_mm > near_mm - slack_mm) & (depth_mm < far_mm + slack_mm)
+        depth_mm = np.where(inside, depth_mm, 0.0)
+        odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE
+        wrong_chance = (1 / (1 + np.exp(np.clip(odds, 0, 50)))).astype(np.float32)
+        mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
+        apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
+        variance = fit.uncertainty_rad**2 + wrong_chance * apart_rad**2
+        sigma_mm = np.where(inside, mm_per_rad * np.sqrt(variance), 0.0)
+        confidence = np.where(inside, 1 / (1 + sigma_mm / HALF_CONFIDENCE_MM), 0.0)
+        reason = self._reasons(seen, inside, wrong_chance, confidence)
+
+        def paste(part: NDArray, dtype: type = np.float32, outside: float = 0) -> NDArray:
+            whole: NDArray = np.full(seen.shape, outside, dtype=dtype)
+            whole[carriers.crop] = np.where(inside, part, outside)
+            return whole
+
+        kept = depth_mm * (confidence >= self.settings.min_confidence)
+        reasons = paste(reason, np.uint8, CrossedReason.BACKGROUND)
+        counts = np.bincount(reasons.ravel(), minlength=len(CrossedReason))
+        watch.done("confidence")
+        return CrossedMeasurement(
+            depth_mm=paste(kept), sigma_mm=paste(sigma_mm * (kept > 0)), confidence=paste(confidence),
+            wrong_chance=paste(wrong_chance), brightness_grey=paste(fit.brightness), reason=reasons,
+            counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
+            background_share=seen.background.share, seconds=watch.seconds,
+        )  # fmt: skip
+
+    def _reasons(
+        self, seen: CrossedObservation, inside: Mask, wrong_chance: Image, confidence: NDArray
+    ) -> NDArray[np.uint8]:
+        fit = seen.fit
+        bright = np.maximum(fit.brightness, 0.5)
+        window = Window(WINDOW_PERIODS * self.carriers.period_px)
+        misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
+        weakest = min(seen.contrast)
+        by_reason = {
+            CrossedReason.BACKGROUND: ~inside,
+            CrossedReason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
+            CrossedReason.SATURATED: seen.clipped_share > SATURATED_SHARE,
+            CrossedReason.ONE_DIRECTION: seen.modulation.min(axis=0) < LOST_SHARE * weakest * bright,
+            CrossedReason.TEXTURE: np.sqrt(misfit) > TEXTURE_SHARE * bright,
+            CrossedReason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
+            CrossedReason.UNSURE: confidence < self.settings.min_confidence,
+        }
+        codes = [np.uint8(reason) for reason in by_reason]
+        return np.select(list(by_reason.values()), codes, np.uint8(CrossedReason.MEASURED))
+
+    def _contrast(self, modulation: Image, mean_grey: Image, points: Mask) -> tuple[float, float]:
+        """Modulation over mean of both carriers on the object; as projected where too little of it is seen."""
+        reach = 2 * max(1, round(CONTRAST_RIM_PERIODS * self.carriers.period_px / self.stride)) + 1
+        inner = cv2.erode(points.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0  # type: ignore[call-overload]
+        inner &= mean_grey > MIN_MODULATION
+        if not inner.any():
+            return self.carriers.weights
+        shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
+        first, second = (
+            float(np.clip(share, LEAST_CONTRAST, weight))
+            for share, weight in zip(shares, self.carriers.weights, strict=True)
+        )
+        return first, second
+
+    def _checked(self, image: NDArray) -> Image:
+        camera = self.rig.camera
+        shape = camera.height, camera.width
+        given = np.asarray(image)
+        if given.dtype not in (np.uint8, np.float32) or given.shape != shape:
+            raise DecodeError(
+                f"expected a crossed frame of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
+                f"{given.dtype} {given.shape}; use rig.scaled(width) for a resized image"
+            )
+        return given.astype(np.float32)
+
+    def _crop(self, region: Mask) -> Crop:
+        """The part around ``region``, from a grid point on; a single point where there is no object."""
+        left, top, width, height = cv2.boundingRect(region.astype(np.uint8))
+        if not width:
+            return slice(0, 1), slice(0, 1)
+        pad = int(np.ceil(MARGIN_PERIODS * self.carriers.period_px))
+        starts = [max(edge - pad, 0) // self.stride * self.stride for edge in (top, left)]
+        stops = [min(edge + pad, size) for edge, size in zip((top + height, left + width), region.shape, strict=True)]
+        return slice(starts[0], stops[0]), slice(starts[1], stops[1])
+
+
+def _lifted(carriers: Carriers, phase_rad: Image, nearness: NDArray) -> NDArray:
+    """Nearness (h, w) of wrapped phases (2, h, w), both in the turns that are nearest to ``nearness``."""
+    beside = wrapped(phase_rad - carriers.phases(nearness))
+    return nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2  # type: ignore[no-any-return]
