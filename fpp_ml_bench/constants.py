@@ -19,8 +19,9 @@ PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"
 
 VIEW_DEGREES = (0, 60, 120, 180, 240, 300)
 VIEWS = tuple(f"A{degrees}" for degrees in VIEW_DEGREES)
-CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
-"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4)."""
+CONFIGS = ("single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all")
+"""Configurations of a dataset: which frames of a sample are read (paper Section 5.4; ``crossed`` is ours, and only of
+sets with such frames)."""
 
 OBJECTS = (
     "master_chef_can", "cracker_box", "sugar_box", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "pudding_box",

@@ -6,11 +6,13 @@ configuration opens only the files it needs:
 
     data        sample, object, view, split, frame_00, depth, depth_exact, flags, cover, depth_min, depth_max
                                                                                                   <split>/data-*.arrow
+    crossed     the other crossed frames, of sets that have them                      frames/<split>/crossed-*.arrow
     horizontal  the other horizontal sinusoids                                     frames/<split>/horizontal-*.arrow
     vertical    the vertical sinusoids                                             frames/<split>/vertical-*.arrow
     codes       Gray code, black, white                                            frames/<split>/codes-*.arrow
 
-With a sequence of another kind than the paper's, the first of its finest fringes takes the place of frame_00. The
+With a sequence of another kind than the paper's, its crossed frame if that comes first, or else the first of its finest
+fringes, takes the place of frame_00. The
 ``data`` group alone is the `single_shot` configuration, which plain ``datasets`` can open without this package.
 """
 
@@ -71,7 +73,7 @@ class Row:
 def stored_groups(sequence: AnySequence, stored: str) -> dict[str, tuple[int, ...]]:
     """Column groups of a dataset that stores configuration ``stored``: group name -> frame indices, in file order."""
     indices, first = set(sequence.config(stored)), sequence.config("single_shot")
-    groups = {DATA_GROUP: first}
+    groups = {DATA_GROUP: first, "crossed": tuple(i for i in sequence.crossed_frames if i not in first)}
     for direction in DIRECTIONS:
         groups[direction] = tuple(i for i in sequence.sinusoids(direction) if i not in first)
     placed = {i for frames in groups.values() for i in frames}

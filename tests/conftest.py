@@ -21,6 +21,8 @@ TINY_SIZE = 176
 """The smallest size at pitch 18 is about 170 px."""
 TINY_OBJECTS = ("bowl", "cork", "mug", "power_drill")
 """Two objects of the training split, so that a shard holds two, and one object of each other split."""
+TINY_CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
+"""Configurations of the paper's sequence: all but crossed."""
 
 
 def tiny_settings(**changes):

@@ -201,14 +201,7 @@ class SceneRenderer:
 
     @cached_property
     def _uniform(self) -> render.Exposure:
-        """The mean light of each frame over the projector's pixels, which end where the pattern is carried on."""
-        pattern = self.exposure.pattern
-        table = np.empty_like(pattern.table)
-        for frame, vertical in enumerate(pattern.vertical):
-            length = self.rig.projector.width if vertical else self.rig.projector.height
-            known = pattern.table[frame, :, : (length - 1) * pattern.per_px + 1]
-            table[frame] = known.mean(axis=1, keepdims=True)
-        return replace(self.exposure, pattern=replace(pattern, table=table))
+        return replace(self.exposure, pattern=self.exposure.pattern.uniform(self.rig))
 
     @cached_property
     def _other_pitch(self) -> render.Exposure:

@@ -72,12 +72,11 @@ def levels_of(frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], po
     if len(used) < LEAST_LEVELS or len(picked) < LEAST_PIXELS:
         return None
     picked = picked[:: max(len(picked) // MOST_PIXELS, 1)]
-    profiles = pattern_profiles(rig)
     levels = []
-    for index in used:
+    for index, profile in zip(used, pattern_profiles(rig, used), strict=True):
         frame = rig.sequence.frames[index]
         at = smooth[0 if frame.direction == "vertical" else 1].ravel()[picked]
-        levels.append(np.interp(at, np.arange(profiles.shape[1]), profiles[index]) / GREY_LEVELS)
+        levels.append(np.interp(at, np.arange(profile.size), profile) / GREY_LEVELS)
     return Levels(np.array(levels), grey.reshape(len(used), -1)[:, picked])
 
 

@@ -18,6 +18,7 @@ EXAMPLES = (
     "fpp-bench build data/mini --preset mini                      6 objects at 480 px, all 52 frames",
     "fpp-bench build data/full --preset full                      the whole set: 50 objects, 960 px, 15,600 images",
     "fpp-bench build data/unseen --preset unseen                  20 other objects at 960 px, all in split test",
+    "fpp-bench build data/crossed --preset full --rig crossed     the same views in 3 frames of crossed fringes",
     "fpp-bench build data/train --preset full --frames single_shot    frame 0 and depth only",
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
@@ -34,10 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
     parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
-    parser.add_argument("--frames", choices=CONFIGS, default="all", help="frames to store (default: all)")
+    parser.add_argument("--frames", choices=CONFIGS, help="frames to store (default: all; with --rig crossed: crossed)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig as YAML or JSON (default: the paper's)")
+    parser.add_argument("--rig", default="paper", metavar="paper|crossed|FILE",
+                        help="the paper's, the same with crossed fringes, or a rig file (default: paper)")  # fmt: skip
     parser.add_argument("--decode-with", type=Path, metavar="FILE",
                         help="rig that a calibration found: it decodes the ground truth and is the dataset's; "
                              "--rig photographs")  # fmt: skip
@@ -60,9 +62,11 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     objects, size = PRESETS[args.preset]
     if args.size is not None and not 1 <= args.size <= 8192:
         raise BuildError(f"--size {args.size}: expected 1 to 8192 px")
-    rig = optics.paper_rig(args.size or size) if args.rig is None else optics.load_rig(args.rig)
-    if args.rig is not None and args.size is not None:
-        rig = rig.scaled(args.size)
+    if args.rig in optics.NAMED_RIGS:
+        rig = optics.NAMED_RIGS[args.rig](args.size or size)
+    else:
+        rig = optics.load_rig(args.rig)
+        rig = rig if args.size is None else rig.scaled(args.size)
     if args.pitch is not None:
         sequence = rig.paper_sequence
         if args.pitch >= 4:  # below that the rig itself refuses, with its own words
@@ -85,7 +89,8 @@ def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     if args.shadows:
         light = light.changed("bounces", shadows=True)
     found = None if args.decode_with is None else optics.load_rig(args.decode_with)
-    return render.BuildSettings(rig, names, args.placement, args.frames, args.seed, light, own, found)
+    stored = args.frames or render.default_frames(args.rig)
+    return render.BuildSettings(rig, names, args.placement, stored, args.seed, light, own, found)
 
 
 def run(args: argparse.Namespace) -> int:

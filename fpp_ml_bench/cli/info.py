@@ -95,7 +95,8 @@ def _fringe_lines(rig: "optics.Rig") -> list[str]:
     if isinstance(rig.sequence, optics.Sequence):
         coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
     else:
-        coded = "; ".join(f"{way} {rig.code(way).title}" for way in rig.directions)
+        crossed = [rig.crossed.title] if rig.crossed else []
+        coded = "; ".join([*crossed, *(f"{way} {rig.code(way).title}" for way in rig.directions)])
     if not ways:
         return [f"code            {coded}"]
     periods = " / ".join(f"{rig.periods_in_range(way):.2f} {way}" for way in ways)

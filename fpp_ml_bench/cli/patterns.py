@@ -13,6 +13,7 @@ SUMMARY = "Write the images that a rig's projector shows, in order, and a manife
 EXAMPLES = (
     "fpp-bench patterns rig.yaml patterns                 patterns/A_0.png, A_1.png, ... and patterns.json",
     "fpp-bench patterns paper patterns                    the paper's 52 frames",
+    "fpp-bench patterns crossed patterns                  the same after three crossed frames",
     "",
     "RIG may be a whole rig file, or one with the entries projector: {width: ..., height: ...} and sequence alone,",
     "since patterns come before the calibration. Project them without scaling; capture an image each, in this order.",
@@ -20,13 +21,13 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", metavar="RIG", help="rig file (.yaml, .json), or paper")
+    parser.add_argument("rig", metavar="RIG", help="rig file (.yaml, .json), or paper or crossed")
     parser.add_argument("out", type=Path, metavar="OUT", help="folder for the images")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write images and manifest. Raises FppBenchError for an unusable rig file or folder."""
-    rig = optics.paper_rig() if args.rig == "paper" else optics.load_projection(args.rig)
+    rig = optics.NAMED_RIGS[args.rig]() if args.rig in optics.NAMED_RIGS else optics.load_projection(args.rig)
     if args.out.is_dir() and any(args.out.iterdir()):
         raise CaptureError(f"{args.out}: not empty; give a new folder, so that no old pattern is projected by mistake")
     paths = optics.export_patterns(rig, args.out)

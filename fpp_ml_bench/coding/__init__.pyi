@@ -10,6 +10,8 @@ from .coordinates import STAGE_REASONS as STAGE_REASONS
 from .coordinates import Coordinates as Coordinates
 from .coordinates import Limits as Limits
 from .coordinates import Reason as Reason
+from .crossed import Crossed as Crossed
+from .crossed import crossed_from_pair as crossed_from_pair
 from .gray_code import AMBIGUOUS_FRACTION as AMBIGUOUS_FRACTION
 from .gray_code import INCONSISTENT_RAD as INCONSISTENT_RAD
 from .gray_code import absolute_phase as absolute_phase

@@ -203,6 +203,11 @@ def decode_stack(
         raise DecodeError(f"threads: expected a whole number from 1, got {threads!r}")
     check_limits(limits := limits or Limits())
     directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
+    if not directions:
+        raise DecodeError(
+            "crossed fringes alone can't be decoded pixel by pixel; project the horizontal or vertical code too, or "
+            "use a method for crossed fringes"
+        )
     plans, joint = [blocks.plan_direction(rig, name, steps, limits) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)

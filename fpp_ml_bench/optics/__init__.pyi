@@ -1,8 +1,13 @@
+from .named_rigs import CROSSED as CROSSED
+from .named_rigs import NAMED_RIGS as NAMED_RIGS
+from .named_rigs import crossed_rig as crossed_rig
+from .named_rigs import paper_rig as paper_rig
 from .opencv_files import OpenCvCalibration as OpenCvCalibration
 from .opencv_files import read_opencv_calibration as read_opencv_calibration
 from .opencv_files import write_opencv_calibration as write_opencv_calibration
 from .patterns import export_patterns as export_patterns
 from .patterns import pattern_image as pattern_image
+from .patterns import pattern_profile as pattern_profile
 from .patterns import pattern_profiles as pattern_profiles
 from .pinhole import Coefficients as Coefficients
 from .pinhole import Maps as Maps
@@ -13,7 +18,6 @@ from .pinhole import fold_radius_squared as fold_radius_squared
 from .pinhole import is_distorted as is_distorted
 from .pinhole import undistort as undistort
 from .rig import Rig as Rig
-from .rig import paper_rig as paper_rig
 from .rig import rotation_matrix as rotation_matrix
 from .rig_file import load_projection as load_projection
 from .rig_file import load_rig as load_rig

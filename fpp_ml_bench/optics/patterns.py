@@ -5,6 +5,7 @@ coordinate w (paper Eq. 1), and the Gray code counts HALF periods: cell j holds 
 in reflected binary code, most significant bit first, 0 or 255.
 """
 
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from fpp_ml_bench.coding import Code
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 
 def pattern_profile(rig: Rig, index: int) -> NDArray[np.uint8]:
@@ -44,22 +44,22 @@ def _profiles(code: Code, length_px: int) -> NDArray[np.uint8]:
     return profiles
 
 
-def pattern_profiles(rig: Rig) -> NDArray[np.uint8]:
-    """All F profiles in one table, uint8 (F, max(W, H)): row i is `pattern_profile` i, its last value repeated."""
+def pattern_profiles(rig: Rig, indices: Iterable[int] | None = None) -> NDArray[np.uint8]:
+    """All F profiles, or those of ``indices``, in one table, uint8 (F, max(W, H)): row i is a `pattern_profile`, its
+    last value repeated. Raises `RigError` for crossed fringes, which have none."""
     length = max(rig.projector.width, rig.projector.height)
-    profiles = (pattern_profile(rig, i) for i in range(len(rig.sequence)))
+    profiles = [pattern_profile(rig, i) for i in (range(len(rig.sequence)) if indices is None else indices)]
     return np.stack([np.pad(p, (0, length - len(p)), mode="edge") for p in profiles])
 
 
 def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
     """Frame ``index`` as the projector shows it, uint8 (h_p, w_p); read-only where it varies along one coordinate."""
     _check(rig, index)
-    if rig.sequence.frames[index].kind == "crossed":
-        rows, columns = (_profiles(rig.code(way), rig.pattern_length(way))[0] * 1.0 for way in DIRECTIONS)
-        return np.rint((rows[:, None] + columns) / 2).astype(np.uint8)
+    frame, (width, height) = rig.sequence.frames[index], (rig.projector.width, rig.projector.height)
+    if rig.crossed is not None and frame.kind == "crossed":
+        return rig.crossed.image(width, height, frame.step)
     profile = pattern_profile(rig, index)
-    column = rig.sequence.frames[index].direction == "horizontal"
-    return np.broadcast_to(profile[:, None] if column else profile, (rig.projector.height, rig.projector.width))
+    return np.broadcast_to(profile[:, None] if frame.direction == "horizontal" else profile, (height, width))
 
 
 def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, PhaseShift, bits_needed, cell_count
-from fpp_ml_bench.constants import BACKGROUND_M, FULL_SIZE, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
+from fpp_ml_bench.coding import SMALLEST_PITCH_PX, Code, Crossed, PhaseShift, bits_needed, cell_count
+from fpp_ml_bench.constants import BACKGROUND_M, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
 from fpp_ml_bench.optics.sequence import (
@@ -82,6 +82,11 @@ class Rig:
         self._check_pose_and_range()
         for direction in self.directions:
             self._check_code(direction)
+        if self.crossed is not None:
+            try:
+                self.crossed.check(self.projector.width, self.projector.height)
+            except RigError as error:
+                raise RigError(f"sequence.crossed.{error}") from error
 
     def _check_pose_and_range(self) -> None:
         error = float(np.abs(self.R @ self.R.T - np.eye(3)).max())
@@ -123,6 +128,11 @@ class Rig:
         return self.sequence.directions
 
     @property
+    def crossed(self) -> Crossed | None:
+        """The family of the sequence's crossed frames; None where it has none."""
+        return self.sequence.crossed if isinstance(self.sequence, CodedSequence) else None
+
+    @property
     def fringe_directions(self) -> tuple[Direction, ...]:
         """Those of `directions` that have sinusoids."""
         return tuple(direction for direction in self.directions if self._pitch(direction) is not None)
@@ -132,7 +142,8 @@ class Rig:
         pitch = self._pitch(direction)
         if pitch is None:
             listed = " and ".join(self.fringe_directions)
-            projected = f"{listed} fringes, and no {direction} ones" if listed else "Gray code alone, and no fringes"
+            alone = "crossed fringes alone" if not self.directions else "Gray code alone, and no fringes"
+            projected = f"{listed} fringes, and no {direction} ones" if listed else alone
             raise RigError(f"this rig projects {projected}")
         return pitch
 
@@ -246,8 +257,27 @@ class Rig:
         left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
         return projector_px / change if (change := abs(float(right - left))) > 0 else math.inf
 
+    def image_px_of_carrier(self, cycles_per_px: tuple[float, float]) -> float:
+        """Image px that a period of crossed fringes covers, across them, as `image_px_per_period` for their frequency
+        (f_u, f_v) in cycles per projector px: of the pattern on a plane, whichever way the image turns it."""
+        shifts = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+        beside = np.array([self.camera.width - 1, self.camera.height - 1]) / 2 + shifts
+        x, y = self.camera.normalised(beside[:, 0], beside[:, 1])
+        u, v = self.project(self.standoff_m * np.column_stack([x, y, np.ones(4)]))
+        turns = cycles_per_px[0] * u + cycles_per_px[1] * v
+        cycles = math.hypot(float(turns[1] - turns[0]), float(turns[3] - turns[2]))
+        return 1 / cycles if cycles > 0 else math.inf
+
     def check_sampling(self) -> None:
         """Raise `RigError` where a fringe period covers fewer than 4 image px, naming the pitch that would do."""
+        for carrier, cycles_per_px in enumerate(self.crossed.cycles_per_px if self.crossed else ()):
+            seen = self.image_px_of_carrier(cycles_per_px)
+            if seen < LEAST_IMAGE_PX_PER_PERIOD:
+                raise RigError(
+                    f"crossed fringes: a period of carrier {carrier + 1} covers only {seen:.2f} px of a "
+                    f"{self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger size, or "
+                    "a larger pitch"
+                )
         for direction in self.fringe_directions:
             seen = self.image_px_per_period(direction)
             if seen < LEAST_IMAGE_PX_PER_PERIOD:
@@ -257,16 +287,6 @@ class Rig:
                     f"px of a {self.camera.width} px image and {LEAST_IMAGE_PX_PER_PERIOD:g} are needed: use a larger "
                     f"size, or a pitch of at least {math.ceil(needed * 100) / 100:g} px"
                 )
-
-
-def paper_rig(size: int = FULL_SIZE) -> Rig:
-    """The paper's rig (Table 1 and the public simulator's coordinates), its camera image ``size`` px square."""
-    focal = FULL_SIZE * 50 / 20.9995  # 50 cm focal length, 20.9995 cm horizontal aperture, square pixels
-    centre = (FULL_SIZE - 1) / 2
-    camera = Pinhole(FULL_SIZE, FULL_SIZE, focal, focal, centre, centre)
-    projector = Pinhole(912, 1140, 1824.0, 1824.0, 911 / 2, 1139 / 2)
-    rig = Rig(camera, projector, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.125, -0.1, 0.0))
-    return rig if size == FULL_SIZE else rig.scaled(size)
 
 
 def middle_m(range_mm: tuple[float, ...]) -> float:

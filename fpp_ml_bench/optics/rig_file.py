@@ -18,8 +18,13 @@ The sequence above is the paper's. Any other is a code for one direction or both
       vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
       # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
       # or      {scheme: gray, cell_px: 2, inverse: after each}
-      # or      {scheme: composite, pitches_px: [18, 22]}: one frame, the sum; with both directions of steps: 1,
-      #         order: [crossed] is one frame, the mean of theirs
+      # or      {scheme: composite, pitches_px: [18, 22]}: one frame, the sum
+
+Crossed fringes are two carriers in a frame (`fpp_ml_bench.coding.Crossed`), beside codes or alone::
+
+    sequence:
+      order: [crossed, horizontal, vertical, black, white]
+      crossed: {pitches_px: [18, 14], angles_deg: [0, 90], weights: [0.5, 0.5], shifts_deg: [[0, 0], [120, 0]]}
 
 Camera, projector and pose may be those of a calibration by OpenCV (`opencv_files`), in place of these four entries::
 
@@ -42,7 +47,7 @@ from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
 from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
-from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, sequence_from_dict
+from fpp_ml_bench.optics.sequence import CODED_KEYS, DIRECTIONS, Direction, sequence_from_dict
 
 _RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
 _OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
@@ -63,7 +68,7 @@ def rig_from_dict(data: object) -> Rig:
     """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
     anything unknown, missing, of the wrong type, or impossible as a rig."""
     sequence = data.get("sequence") if isinstance(data, Mapping) else None
-    coded = isinstance(sequence, Mapping) and any(key in sequence for key in ("order", *DIRECTIONS))
+    coded = isinstance(sequence, Mapping) and any(key in sequence for key in CODED_KEYS)
     keys = tuple(key for key in _RIG_KEYS if not (coded and key == "pitch_px"))
     entries = _mapping(data, keys, "", _OPTIONAL_RIG_KEYS)
     if not coded:

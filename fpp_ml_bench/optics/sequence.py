@@ -3,7 +3,8 @@
 *Horizontal* fringes have horizontal stripes: they vary along the projector's rows and measure its coordinate ``v``.
 *Vertical* fringes vary along its columns, measure ``u``. The paper's order (Section 3.2) is `Sequence`: N horizontal
 sinusoids, N vertical sinusoids, horizontal Gray code, vertical Gray code, black, white; 18 + 18 + 7 + 7 + 1 + 1 = 52
-frames. Any other sequence is a `CodedSequence`: a code of `fpp_ml_bench.coding` for one direction or both.
+frames. Any other sequence is a `CodedSequence`: a code of `fpp_ml_bench.coding` for one direction or both, crossed
+fringes, or all of them.
 """
 
 from abc import ABC, abstractmethod
@@ -15,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Code, Fringes, GrayCells, Kind, PhaseShift, equal_shifts
+from fpp_ml_bench.coding import Code, Crossed, Fringes, GrayCells, Kind, PhaseShift, equal_shifts
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import RigError
 
@@ -24,12 +25,14 @@ Direction = Literal["horizontal", "vertical"]
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
 """The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
+CODED_KEYS = ("order", "crossed", *DIRECTIONS)
+"""Entries of a rig file's sequence that is not of the paper's kind."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A projected frame: ``step`` is n of a sinusoid or the Gray bit, 0 = most significant, ``inverse`` or not;
-    ``fringe`` numbers the periods of a code with several."""
+    """A projected frame: ``step`` is n of a sinusoid or a crossed frame, or the Gray bit, 0 = most significant,
+    ``inverse`` or not; ``fringe`` numbers the periods of a code with several."""
 
     index: int
     kind: Kind
@@ -47,7 +50,8 @@ class Frame:
         period = f" of period {self.fringe}" if self.fringe else ""
         inverse = ", inverse" if self.inverse else ""
         part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}{period}",
-                "gray": f"{self.direction} Gray bit {self.step}{inverse}"}.get(self.kind, self.kind)  # fmt: skip
+                "gray": f"{self.direction} Gray bit {self.step}{inverse}",
+                "crossed": f"crossed fringes, step {self.step}"}.get(self.kind, self.kind)  # fmt: skip
         return f"{self.index}: {part}"
 
 
@@ -101,6 +105,11 @@ class AnySequence(ABC):
         """Frame indices of a direction's Gray code, most significant bit first; none where it has none."""
         return tuple(f.index for f in self.frames if f.kind == "gray" and f.direction == direction)
 
+    @property
+    def crossed_frames(self) -> tuple[int, ...]:
+        """Frame indices of crossed fringes, in the order of their steps; none where the sequence has none."""
+        return tuple(frame.index for frame in self.frames if frame.kind == "crossed")
+
     def bits(self, direction: Direction) -> int:
         """Gray bits of a direction."""
         return sum(not self.frames[index].inverse for index in self.gray(direction))
@@ -120,8 +129,9 @@ class AnySequence(ABC):
         """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty where the sequence has
         none."""
         horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
-        single = (horizontal or vertical or (0,))[:1]
-        frames = (single, horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
+        crossed = self.crossed_frames
+        single = ((0,) if 0 in crossed else horizontal or vertical or crossed or (0,))[:1]
+        frames = (single, crossed, horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
         if name not in CONFIGS:
             raise ValueError(f"unknown configuration {name!r}; there are {', '.join(CONFIGS)}")
         return frames[CONFIGS.index(name)]
@@ -196,26 +206,27 @@ def _paper_code(steps: int, bits: int, pitch_px: float) -> PhaseShift:
 
 @dataclass(frozen=True)
 class CodedSequence(AnySequence):
-    """A ``horizontal`` or ``vertical`` code, or both, and the ``order`` of what is projected: directions, black and
-    white; or ``crossed`` in place of both directions, a single frame that is the mean of their single frames."""
+    """A ``horizontal`` or ``vertical`` code, or both, or ``crossed`` fringes, and the ``order`` of what is projected:
+    these, black and white."""
 
     horizontal: Code | None
     vertical: Code | None
     order: tuple[str, ...]
+    crossed: Crossed | None = None
 
     def __post_init__(self) -> None:
-        if not self.directions:
-            raise RigError("sequence: no direction is coded; describe horizontal, vertical or both")
-        crossed = "crossed" in self.order
-        if crossed and (len(self.directions) < 2 or any(len(self.code(d).shown) != 1 for d in self.directions)):
-            raise RigError("sequence.order: crossed needs a code of a single frame for both directions (steps: 1)")
-        known = ("crossed", "black", "white") if crossed else (*self.directions, "black", "white")
+        described = (*(["crossed"] if self.crossed else []), *self.directions)
+        if not described:
+            raise RigError("sequence: no direction is coded; describe horizontal, vertical, crossed or some of them")
+        known = (*described, "black", "white")
         for name in self.order:
             if name not in known or self.order.count(name) > 1:
                 raise RigError(f"sequence.order: expected each of {', '.join(known)} at most once, got {self.order}")
+        if self.crossed and "crossed" not in self.order:
+            raise RigError("sequence.order: crossed missing, whose fringes are described")
         for direction in self.directions:
             code = self.code(direction)
-            needed = ("crossed" if crossed else direction, *(("black", "white") if code.needs_flat else ()))
+            needed = (direction, *(("black", "white") if code.needs_flat else ()))
             missing = [name for name in needed if name not in self.order]
             if missing:
                 raise RigError(f"sequence.order: {', '.join(missing)} missing, which the {direction} code needs")
@@ -228,12 +239,13 @@ class CodedSequence(AnySequence):
         """The code of a direction. Raises `RigError` where it has none."""
         code: Code | None = getattr(self, direction)
         if code is None:
-            raise RigError(f"this rig projects no {direction} fringes or codes, only {self.directions[0]} ones")
+            others = (*self.directions, "crossed")[0]
+            raise RigError(f"this rig projects no {direction} fringes or codes, only {others} ones")
         return code
 
     @property
     def steps(self) -> int:
-        return min(len(self.sinusoids(direction)) for direction in self.directions)
+        return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
 
     def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
         found = []
@@ -257,29 +269,21 @@ class CodedSequence(AnySequence):
                 frames.append(Frame(len(frames), "black" if name == "black" else "white"))
                 continue
             if name == "crossed":
-                frames.append(Frame(len(frames), "crossed"))
+                frames += [Frame(len(frames) + n, "crossed", step=n) for n in range(len(self.crossed or ()))]
                 continue
             direction: Direction = "horizontal" if name == "horizontal" else "vertical"
             frames += [Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
                        for i, shown in enumerate(self.code(direction).shown)]  # fmt: skip
         return tuple(frames)
 
-    def coded(self, direction: Direction) -> tuple[int, ...]:
-        return self._crossed() or super().coded(direction)
-
-    def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
-        return self._crossed() if direction in self.directions and self._crossed() else super().sinusoids(direction)
-
-    def _crossed(self) -> tuple[int, ...]:
-        return tuple(frame.index for frame in self.frames if frame.kind == "crossed")
-
     def _finest(self, direction: Direction) -> int:
         code = getattr(self, direction)
         return code.finest if isinstance(code, PhaseShift) else 0
 
     def to_dict(self) -> dict[str, Any]:
-        codes = {direction: self.code(direction).to_dict() for direction in self.directions}
-        return {"order": list(self.order)} | {str(direction): code for direction, code in codes.items()}
+        crossed = {"crossed": self.crossed.to_dict()} if self.crossed else {}
+        codes = {str(direction): self.code(direction).to_dict() for direction in self.directions}
+        return {"order": list(self.order), **crossed, **codes}
 
 
 def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
@@ -289,19 +293,29 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
     if not isinstance(entries, Mapping):
         raise RigError(f"sequence: expected a mapping, got {entries!r}")
     paper = ("steps", "bits_horizontal", "bits_vertical")
-    coded = ("order", *DIRECTIONS)
-    if any(key in entries for key in coded):
-        unknown = [key for key in entries if key not in coded]
+    if any(key in entries for key in CODED_KEYS):
+        unknown = [key for key in entries if key not in CODED_KEYS]
         if unknown:
-            raise RigError(f"sequence: unknown key {unknown[0]}; expected {', '.join(coded)}")
+            raise RigError(f"sequence: unknown key {unknown[0]}; expected {', '.join(CODED_KEYS)}")
         codes = {
             direction: code_from_dict(entries[direction], lengths_px[direction], f"sequence.{direction}")
             for direction in DIRECTIONS if direction in entries
         }  # fmt: skip
-        order = entries.get("order", list(codes))
+        crossed = None
+        if "crossed" in entries:
+            if not isinstance(entries["crossed"], Mapping):
+                raise RigError(
+                    f"sequence.crossed: expected a mapping with the key pitches_px, got {entries['crossed']!r}"
+                )
+            try:
+                crossed = Crossed.from_entries(entries["crossed"])
+                crossed.check(lengths_px["vertical"], lengths_px["horizontal"])
+            except RigError as error:
+                raise RigError(f"sequence.crossed.{error}") from error
+        order = entries.get("order", [*(["crossed"] if crossed else []), *codes])
         if not isinstance(order, list) or not all(isinstance(name, str) for name in order):
             raise RigError(f"sequence.order: expected a list of names, got {order!r}")
-        return CodedSequence(codes.get("horizontal"), codes.get("vertical"), tuple(order))
+        return CodedSequence(codes.get("horizontal"), codes.get("vertical"), tuple(order), crossed)
     problems = [f"unknown key {key}" for key in entries if key not in paper]
     problems += [f"missing key {key}" for key in paper if key not in entries]
     if problems:

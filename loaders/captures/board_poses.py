@@ -39,8 +39,9 @@ def board_poses(
     naming the pose or file."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
+        coded = " and ".join(rig.directions) or "crossed fringes"
         raise CalibrationError(
-            f"{sequence}: codes {rig.directions[0]} only; a calibration needs the projector's columns and rows, so "
+            f"{sequence}: codes {coded} only; a calibration needs the projector's columns and rows, so "
             "project both directions on the board"
         )
     poses: list[Pose] = []

@@ -29,6 +29,7 @@ from .scene import PHOTOGRAPHED_BY as PHOTOGRAPHED_BY
 from .scene import BuildSettings as BuildSettings
 from .scene import SolidMesh as SolidMesh
 from .scene import UserMesh as UserMesh
+from .scene import default_frames as default_frames
 from .scene import modulation_at as modulation_at
 from .scene import place as place
 from .scene import preset_settings as preset_settings

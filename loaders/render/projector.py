@@ -3,7 +3,8 @@
 Light is a fraction of the brightest pixel's. A pattern varies along one coordinate, so blur acts along it alone. Its
 variances add: of the transfer function in focus, of the camera pixel's footprint, and of the defocus, whose sigma grows
 with the distance from the focus in dioptres, as a thin lens's blur circle does. A Gaussian of variance q px^2 takes
-exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
+exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft. Crossed fringes
+vary along both coordinates and have a table of their own (`crossed_light`).
 """
 
 from dataclasses import dataclass, replace
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.render.crossed_light import carrier_waves, fill_crossed, phase_table
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import AnySequence, Rig, pattern_profiles
+from fpp_ml_bench.optics import AXES, DIRECTIONS, AnySequence, Frame, Rig, pattern_profile
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 
 FINE = 4
@@ -23,6 +25,8 @@ FINE = 4
 18 px 0.06% of its modulation. Without such blur a sample a pixel, which is what the pixels say."""
 MOST_DEFOCUS_PX = 100.0
 """Largest sigma within the range and on the background plane."""
+ALONG_V, ALONG_U, ALONG_BOTH = 0, 1, 2
+"""The projector coordinate that a frame varies along; crossed fringes vary along both."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +48,17 @@ class PatternLight:
     """Linear light of every frame along the coordinate it varies with.
 
     ``table`` float32 (F, S, L + 1) in [0, 1]: per frame and blur level, ``per_px`` samples a projector pixel, the last
-    one repeated. ``variance_px2`` float64 (S,), ascending: the blur of each level. ``vertical`` bool (F,): whether the
-    coordinate is the projector's u, else v; black and white vary with neither.
+    one repeated; crossed frames read ``crossed`` instead, a `phase_table` with S levels, at the turns of their
+    ``waves`` float64 (F, 2, 3). ``variance_px2`` float64 (S,), ascending: the blur of each level. ``along`` uint8 (F,):
+    `ALONG_V` and so on; black and white vary along neither.
     """
 
     table: NDArray[np.float32]
-    vertical: NDArray[np.bool_]
+    along: NDArray[np.uint8]
     variance_px2: NDArray[np.float64]
     per_px: int
+    crossed: NDArray[np.float32]
+    waves: NDArray[np.float64]
 
     @classmethod
     def of(cls, rig: Rig, light: ProjectorLight, pixel_area: bool = True) -> "PatternLight":
@@ -60,49 +67,67 @@ class PatternLight:
         levels, per_px = np.array([0.0]), 1
         if light.defocus_px > 0:
             levels, per_px = _levels(defocus_variance_px2(rig, light, _distances(rig)).max()), FINE
-        if any(frame.kind == "crossed" for frame in rig.sequence):
-            raise BuildError("crossed fringes can't be rendered yet: project the two directions as frames of their own")
         response = response_table(light.response)
-        vertical = np.array([frame.direction == "vertical" for frame in rig.sequence])
         length = max(rig.projector.width, rig.projector.height)
         fine = np.arange((length - 1) * per_px + 1) / per_px
-        rows = []
-        footprint = {direction: rig.projector_px_per_image_px(direction) for direction in rig.directions}
-        for frame, profile in zip(rig.sequence, pattern_profiles(rig), strict=True):
-            known = rig.pattern_length(frame.direction) if frame.direction else 1
-            linear = response[profile[:known]]
-            whole = np.interp(fine, np.arange(known), linear)
-            area = footprint[frame.direction] ** 2 / 12 if frame.direction and pixel_area else 0.0
-            rows.append([blurred(whole, (level + still + area) * per_px**2) for level in levels])
-        table = np.pad(np.array(rows, dtype=np.float32), ((0, 0), (0, 0), (0, 1)), mode="edge")
-        return cls(table, vertical, levels, per_px)
+        footprint = {direction: rig.projector_px_per_image_px(direction) ** 2 / 12 for direction in DIRECTIONS}
+        table = np.zeros((len(rig.sequence), len(levels), len(fine)), dtype=np.float32)
+        for frame, rows in zip(rig.sequence, table, strict=True):
+            if frame.kind == "crossed":
+                continue
+            linear = response[pattern_profile(rig, frame.index)]
+            whole = np.interp(fine, np.arange(len(linear)), linear)
+            area = footprint[frame.direction] if frame.direction and pixel_area else 0.0
+            for row, level in zip(rows, levels, strict=True):
+                row[:] = blurred(whole, (level + still + area) * per_px**2)
+        table = np.pad(table, ((0, 0), (0, 0), (0, 1)), mode="edge")
+        along = np.array([_along(frame) for frame in rig.sequence], dtype=np.uint8)
+        waves, crossed = np.zeros((len(along), 2, 3)), np.zeros((0, 2, 2), dtype=np.float32)
+        if rig.crossed is not None:
+            area_px2 = np.array([footprint[direction] if pixel_area else 0.0 for direction in AXES])
+            blur = (levels + still)[:, None] + area_px2
+            crossed = phase_table(rig.crossed, lambda level: respond(light.response, level), blur)
+            for step, index in enumerate(rig.sequence.crossed_frames):
+                waves[index] = carrier_waves(rig.crossed, step)
+        return cls(table, along, levels, per_px, crossed, waves)
 
     def modes(self, sequence: AnySequence) -> tuple["PatternLight", NDArray[np.float32]]:
         """Fewer patterns that stand for all in diffuse light: black is left out, and the steps of a direction's
         sinusoids are their mean and first harmonic. Higher harmonics, of a response that is no line, do not survive the
         way over another surface. Returns them and the weights ``mix`` float32 (F, J) that give every frame again."""
         count = len(self.table)
-        taken, given, vertical = [], [], []  # per mode: the weight of each frame in it, and its weight in each frame
+        taken, given, like = [], [], []  # per mode: the weight of each frame in it, in each frame, a frame of its kind
         sets = sequence.equal_steps()
-        for direction, indices, turns in sets:
+        for _, indices, turns in sets:
             frames = list(indices)
             cosine, sine = cosine_of_turns(turns), sine_of_turns(turns)
             for weights, scale in ((np.ones(len(frames)), 1.0), (cosine, 2.0), (sine, 2.0)):
                 taken.append(np.zeros(count))
                 given.append(np.zeros(count))
                 taken[-1][frames], given[-1][frames] = scale / len(frames) * weights, weights
-                vertical.append(direction == "vertical")
+                like.append(frames[0])
         sinusoids = {index for _, indices, _ in sets for index in indices}
         for frame in (frame for frame in range(count) if frame not in sinusoids and frame != sequence.black):
             taken.append(np.eye(count)[frame])
             given.append(np.eye(count)[frame])
-            vertical.append(bool(self.vertical[frame]))
+            like.append(frame)
         table = np.zeros((len(taken), *self.table.shape[1:]))
         for row, weights in zip(table, taken, strict=True):
             for place in np.flatnonzero(weights):  # in order, on every processor
                 row += weights[place] * self.table[place]
         mix = np.stack(given, axis=1).astype(np.float32)
-        return replace(self, table=table.astype(np.float32), vertical=np.array(vertical)), mix
+        return replace(self, table=table.astype(np.float32), along=self.along[like], waves=self.waves[like]), mix
+
+    def uniform(self, rig: Rig) -> "PatternLight":
+        """The mean light of each frame over the projector's pixels, which end where the pattern is carried on."""
+        table = np.empty_like(self.table)
+        for frame, along in enumerate(self.along):
+            length = rig.projector.width if along == ALONG_U else rig.projector.height
+            known = self.table[frame, :, : (length - 1) * self.per_px + 1]
+            table[frame] = known.mean(axis=1, keepdims=True)
+        crossed = np.empty_like(self.crossed)
+        crossed[:] = self.crossed[:, :-1, :-1].mean(axis=(1, 2), keepdims=True)
+        return replace(self, table=table, crossed=crossed)
 
     def place(
         self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,
@@ -125,8 +150,8 @@ class PatternLight:
         float64 (F, n)."""
         p = place
         read_kernel(
-            out, irradiance, self.table, self.vertical, p.u_index, p.u_weight, p.v_index, p.v_weight, p.level,
-            p.level_weight,
+            out, irradiance, self.table, self.along, self.crossed, self.waves, self.per_px, p.u_index, p.u_weight,
+            p.v_index, p.v_weight, p.level, p.level_weight,
         )  # fmt: skip
 
     def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
@@ -187,6 +212,12 @@ def _distances(rig: Rig) -> NDArray[np.float64]:
     return np.array([near_m, far_m, rig.background])
 
 
+def _along(frame: Frame) -> int:
+    if frame.kind == "crossed":
+        return ALONG_BOTH
+    return ALONG_U if frame.direction == "vertical" else ALONG_V
+
+
 def _levels(most: float) -> NDArray[np.float64]:
     """Variances from 0 to ``most`` px^2, so close that between them light is linear to 1e-4 at a pitch of 18 px."""
     levels = [0.0, 1.0 / FINE**2]
@@ -212,11 +243,26 @@ def fill_pattern(light, profiles, index, weight, level, level_weight):  # type: 
 
 
 @njit
+def fill_frame(  # type: ignore[no-untyped-def]
+    light, frame, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight
+):
+    """Pattern light of n points in ``frame``: fills ``light`` (n,)."""
+    if along[frame] == ALONG_U:
+        fill_pattern(light, table[frame], u_index, u_weight, level, level_weight)
+    elif along[frame] == ALONG_V:
+        fill_pattern(light, table[frame], v_index, v_weight, level, level_weight)
+    else:
+        fill_crossed(light, crossed, waves[frame], per_px, u_index, u_weight, v_index, v_weight, level, level_weight)
+
+
+@njit
 def read_kernel(  # type: ignore[no-untyped-def]
-    out, irradiance, table, vertical, u_index, u_weight, v_index, v_weight, level, level_weight
+    out, irradiance, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight
 ):
     for frame in range(table.shape[0]):
-        index, weight = (u_index, u_weight) if vertical[frame] else (v_index, v_weight)
-        fill_pattern(out[frame], table[frame], index, weight, level, level_weight)
+        fill_frame(
+            out[frame], frame, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level,
+            level_weight,
+        )  # fmt: skip
         for k in range(irradiance.size):
             out[frame, k] *= irradiance[k]

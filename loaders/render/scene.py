@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import CONFIGS, MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics import NAMED_RIGS, Rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:  # the name of a benchmark needs settings alone
@@ -89,6 +89,13 @@ class BuildSettings:
         if not 0 <= self.seed < 2**63:
             raise BuildError(f"seed {self.seed}: expected a whole number from 0 to 2^63 - 1")
         self.rig.check_sampling()
+        if not self.rig.directions:
+            raise BuildError(
+                "this rig projects crossed fringes alone, from which no ground truth can be decoded; add the "
+                "horizontal or vertical code to its sequence (it need not be stored: --frames crossed)"
+            )
+        if not self.rig.sequence.config(self.stored):
+            raise BuildError(f"frames {self.stored!r}: this rig's sequence has none of them")
         if self.decode_with is not None:
             _check_same_devices(self.rig, self.decode_with)
         if self.light.projector.defocus_px > 0:
@@ -133,10 +140,18 @@ def _check_same_devices(rig: Rig, other: Rig) -> None:
         )
 
 
-def preset_settings(preset: str, size: int | None = None, light: str = "paper") -> BuildSettings:
-    """The settings of ``fpp-bench build --preset PRESET [--size SIZE] [--light LIGHT]``, all else at its default."""
+def preset_settings(preset: str, size: int | None = None, light: str = "paper", rig: str = "paper") -> BuildSettings:
+    """The settings of ``fpp-bench build --preset PRESET [--size SIZE] [--light LIGHT] [--rig RIG]``, all else at its
+    default."""
     objects, preset_size = PRESETS[preset]
-    return BuildSettings(rig=paper_rig(size or preset_size), objects=objects, light=named_light(light))
+    named = NAMED_RIGS[rig](size or preset_size)
+    return BuildSettings(named, objects, stored=default_frames(rig), light=named_light(light))
+
+
+def default_frames(rig: str) -> str:
+    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--frames`` says otherwise: of the crossed
+    rig its crossed frames, of any other all frames."""
+    return "crossed" if rig == "crossed" else "all"
 
 
 def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:

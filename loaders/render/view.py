@@ -60,7 +60,8 @@ class Studio:
         self.stored = stored_frames(rig.sequence, settings.stored)
         # Frames that the ground truth is decoded from and that are not stored: all others, mostly but black and white.
         flat = any(rig.code(direction).needs_flat for direction in rig.directions)
-        unneeded = {*self.stored, *(() if flat else (rig.sequence.black, rig.sequence.white))}
+        black_and_white = () if flat else (rig.sequence.black, rig.sequence.white)
+        unneeded = {*self.stored, *rig.sequence.crossed_frames, *black_and_white}
         self.unstored = tuple(i for i in range(len(rig.sequence)) if i not in unneeded)
         self._frames = np.zeros((len(rig.sequence), camera.height, camera.width), dtype=np.uint8)
 

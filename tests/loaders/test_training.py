@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import tiny_settings
+from conftest import TINY_CONFIGS, tiny_settings
 from torch.utils.data import DataLoader
 
-from fpp_ml_bench.constants import CONFIGS, FULL_SIZE, OBJECTS
+from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.render import BuildSettings, build, plan_build
 from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
@@ -42,7 +42,7 @@ def test_full_set_has_the_papers_training_pairs(tiny, config, pairs):
     assert dataset.pair(pairs - 1) == (239, PAPER_SEQUENCE.config(config)[-1])
 
 
-@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("config", TINY_CONFIGS)
 def test_pairs_are_all_frames_of_a_row_then_the_next(tiny, config):
     dataset = FringeDepthDataset(tiny, "train", config)
     frames = PAPER_SEQUENCE.config(config)

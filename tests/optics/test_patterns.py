@@ -6,8 +6,8 @@ import pytest
 
 from fpp_ml_bench.coding.gray_code import cell_count
 from fpp_ml_bench.errors import FppBenchError, RigError
+from fpp_ml_bench.optics import Pinhole, Rig, paper_rig
 from fpp_ml_bench.optics.patterns import export_patterns, pattern_image, pattern_profile, pattern_profiles
-from fpp_ml_bench.optics.rig import Pinhole, Rig, paper_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 SMALL = Rig(

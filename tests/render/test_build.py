@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
+from conftest import TINY_CONFIGS, TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.constants import (
-    CONFIGS,
     MINI_OBJECTS,
     OBJECTS,
     PRESETS,
@@ -75,7 +74,7 @@ def test_what_is_in_the_folder(tiny, opened):
         "validation": [f"mug_{view}" for view in VIEWS],
         "test": [f"power_drill_{view}" for view in VIEWS],
     }
-    assert opened.size == (TINY_SIZE, TINY_SIZE) and opened.configs == CONFIGS
+    assert opened.size == (TINY_SIZE, TINY_SIZE) and opened.configs == TINY_CONFIGS
     assert not list(tiny.rglob("*.tmp")) and not (tiny / ".build").exists()
     for name in TINY_OBJECTS:
         mesh = trimesh.load(tiny / "meshes" / f"{name}.ply")
@@ -163,7 +162,7 @@ def test_mini_preset_has_every_split():
         ("horizontal", 18, {"single_shot", "horizontal"}),
         ("vertical", 19, {"single_shot", "vertical"}),
         ("sinusoidal", 36, {"single_shot", "horizontal", "vertical", "sinusoidal"}),
-        ("all", 52, set(CONFIGS)),
+        ("all", 52, set(TINY_CONFIGS)),
     ],
 )
 def test_groups_hold_every_frame_once(stored, count, configs):

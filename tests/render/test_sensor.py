@@ -15,7 +15,7 @@ from scipy import stats
 
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, named_light
-from fpp_ml_bench.loaders.render.projector import PatternPlace
+from fpp_ml_bench.loaders.render.projector import ALONG_U, PatternPlace
 from fpp_ml_bench.loaders.render.scene import uniform
 from fpp_ml_bench.loaders.render.sensor import (
     Exposure,
@@ -346,7 +346,7 @@ def in_numpy(exposure, frames, lit, pixels, stream):
     samples = lit.gain.size // pixels.size
     for frame in frames:
         profiles = exposure.pattern.table[frame]
-        index, weight = (p.u_index, p.u_weight) if exposure.pattern.vertical[frame] else (p.v_index, p.v_weight)
+        index, weight = (p.u_index, p.u_weight) if exposure.pattern.along[frame] == ALONG_U else (p.v_index, p.v_weight)
         low, high = profiles[0][index], profiles[0][index.astype(int) + 1]
         if len(profiles) > 1:
             share, level = p.level_weight, p.level.astype(int)

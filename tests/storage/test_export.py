@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import scipy.io
 import trimesh
-from conftest import TINY_OBJECTS, file_bytes
+from conftest import TINY_CONFIGS, TINY_OBJECTS, file_bytes
 from published_trees import command, imported, write_png
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.published import FrameOrder, import_notes, parse_order
@@ -52,7 +51,7 @@ def test_tree(opened, tmp_path_factory):
 
 
 def test_the_tree_comes_back_bit_by_bit_with_the_same_split(opened, returned):
-    assert returned.splits == opened.splits and returned.configs == CONFIGS
+    assert returned.splits == opened.splits and returned.configs == TINY_CONFIGS
     for sample in opened.samples("all"):
         assert returned.depth_mm(sample).tobytes() == opened.depth_mm(sample).tobytes()
         for index in range(52):
@@ -216,7 +215,7 @@ def parquet(opened, tmp_path_factory):
     return out
 
 
-@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("config", TINY_CONFIGS)
 def test_plain_datasets_opens_every_configuration_of_the_parquet(opened, parquet, config):
     loaded = datasets.load_dataset(str(parquet), config)
     columns = config_columns(opened.sequence, config, True)

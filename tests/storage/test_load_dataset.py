@@ -9,11 +9,11 @@ import datasets
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import TINY_SIZE, tiny_settings
+from conftest import TINY_CONFIGS, TINY_SIZE, tiny_settings
 from synthetic import SyntheticRows, make
 
 import fpp_ml_bench
-from fpp_ml_bench.constants import CONFIGS, OBJECTS, VIEWS, split_sample_name
+from fpp_ml_bench.constants import OBJECTS, VIEWS, split_sample_name
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import load_dataset
 from fpp_ml_bench.loaders.render import build
@@ -33,7 +33,7 @@ def rows_by_sample(dataset, columns):
     return {row["sample"]: {c: row[c] for c in columns} for row in formatted}
 
 
-@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("config", TINY_CONFIGS)
 def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, opened, config):
     dataset = load_dataset(tiny, config, split="validation")
     frames = [f"frame_{i:02d}" for i in PAPER_SEQUENCE.config(config)]
@@ -172,7 +172,7 @@ def test_fingerprints_follow_the_data(tiny, tmp_path):
     assert len(other_fingerprints | {fingerprint}) == 3
 
 
-@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("config", TINY_CONFIGS)
 @pytest.mark.parametrize("exact", [True, False])
 def test_schema_is_what_datasets_itself_would_write(config, exact):
     columns = config_columns(PAPER_SEQUENCE, config, exact)

@@ -1,0 +1,151 @@
+"""Crossed fringes: two carriers in one frame, since light adds.
+
+Frame n is ``127.5 + 127.5 (w1 cos(2 pi c1 / P1 + s1n) + w2 cos(2 pi c2 / P2 + s2n))`` with the projector coordinate
+``c_k = v cos(a_k) + u sin(a_k)`` across carrier k. One carrier leaves the fringe order open; the wrapped phases of two
+agree in depth at few orders (`fpp_ml_bench.design` finds periods for which only the true one is left). Each carrier is
+found from its neighbourhood, or from three frames that shift the first and keep the second still.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, check_keys, entry, real
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.optics import Rig
+
+Pair = tuple[float, float]
+LEAST_ANGLE_DEG = 5.0
+"""Between the two carriers. Spectra of a window must be apart, and nearly parallel carriers are apart by their periods
+alone."""
+_KEYS = ("pitches_px", "angles_deg", "weights", "shifts_deg")
+
+
+@dataclass(frozen=True)
+class Crossed:
+    """A family of crossed frames; pairs are of the first and the second carrier.
+
+    ``pitches_px``: periods in projector px. ``angles_deg``: 0 for a phase that grows along the projector's rows v
+    (horizontal fringes), 90 along its columns u (vertical fringes), anything else for tilted ones. ``weights``: shares
+    of the modulation, above 0, their sum at most 1. ``shifts_deg``: one pair of phase shifts a frame. Raises `RigError`
+    naming the key.
+    """
+
+    pitches_px: Pair
+    angles_deg: Pair = (0.0, 90.0)
+    weights: Pair = (0.5, 0.5)
+    shifts_deg: tuple[Pair, ...] = ((0.0, 0.0),)
+
+    def __post_init__(self) -> None:
+        if not min(self.pitches_px) >= SMALLEST_PITCH_PX:
+            raise RigError(f"pitches_px: expected {SMALLEST_PITCH_PX:g} px and more, got {min(self.pitches_px):g} px")
+        apart = abs(float(np.mod(self.angles_deg[0] - self.angles_deg[1] + 90, 180)) - 90)
+        if apart < LEAST_ANGLE_DEG:
+            first, second = self.angles_deg
+            raise RigError(
+                f"angles_deg: the carriers at {first:g} and {second:g} degrees are parallel; turn them apart by "
+                f"{LEAST_ANGLE_DEG:g} degrees or more (periods in one direction: the scheme composite)"
+            )
+        if not (min(self.weights) > 0 and sum(self.weights) <= 1 + 1e-12):
+            raise RigError(f"weights: expected two above 0 with a sum of at most 1, got {list(self.weights)}")
+        if not self.shifts_deg:
+            raise RigError("shifts_deg: expected a pair of degrees for each frame, got none")
+
+    @classmethod
+    def from_entries(cls, entries: Mapping[str, Any]) -> Crossed:
+        """The family of a rig file's entries; `RigError` naming the key."""
+        check_keys(entries, _KEYS)
+        given: dict[str, Any] = {"pitches_px": _pair(entry(entries, "pitches_px"), "pitches_px")}
+        for key in ("angles_deg", "weights"):
+            if key in entries:
+                given[key] = _pair(entries[key], key)
+        if "shifts_deg" in entries:
+            shifts = entries["shifts_deg"]
+            if not isinstance(shifts, list):
+                raise RigError(f"shifts_deg: expected a list with a pair of degrees for each frame, got {shifts!r}")
+            given["shifts_deg"] = tuple(_pair(pair, f"shifts_deg[{n}]") for n, pair in enumerate(shifts))
+        return cls(**given)
+
+    @classmethod
+    def of_pair(cls, rig: Rig) -> Crossed:
+        """The family of which `crossed_from_pair` makes the frame, from the first finest sinusoids of both directions
+        of a rig. Raises `RigError` where a direction has none."""
+        pitches = rig.pitch("horizontal"), rig.pitch("vertical")
+        first, second = (math.degrees(rig.shifts_rad(direction)[0]) for direction in ("horizontal", "vertical"))
+        return cls(pitches, shifts_deg=((first, second),))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entries of a rig file; `from_entries` gives an equal family back."""
+        return {
+            "pitches_px": list(self.pitches_px), "angles_deg": list(self.angles_deg), "weights": list(self.weights),
+            "shifts_deg": [list(pair) for pair in self.shifts_deg],
+        }  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.shifts_deg)
+
+    @property
+    def title(self) -> str:
+        """The family in a few words."""
+        carriers = " and ".join(
+            f"{pitch:g} px at {angle:g} degrees"
+            for pitch, angle in zip(self.pitches_px, self.angles_deg, strict=True)
+        )  # fmt: skip
+        return f"{len(self)} crossed frame(s) of {carriers}"
+
+    @property
+    def cycles_per_px(self) -> tuple[Pair, Pair]:
+        """The carriers' frequencies (f_u, f_v) in cycles per projector px: ``turns = f_u u + f_v v``."""
+        return tuple(  # type: ignore[return-value]
+            (float(sine_of_turns(angle / 360)) / pitch, float(cosine_of_turns(angle / 360)) / pitch)
+            for pitch, angle in zip(self.pitches_px, self.angles_deg, strict=True)
+        )
+
+    def check(self, width: int, height: int) -> None:
+        """Raise `RigError` where a period exceeds a pattern of ``width`` x ``height`` px."""
+        for number, (along_u, along_v) in enumerate(self.cycles_per_px):
+            if abs(along_u) * width + abs(along_v) * height < 1:
+                raise RigError(
+                    f"pitches_px[{number}]: a period of {self.pitches_px[number]:g} px exceeds the pattern of "
+                    f"{width} x {height} px in its direction"
+                )
+
+    def image(self, width: int, height: int, n: int) -> NDArray[np.uint8]:
+        """Frame ``n`` as the projector shows it, uint8 (height, width), the same bytes on every processor."""
+        u, v, half = np.arange(width), np.arange(height)[:, None], GREY_LEVELS / 2
+        first, second = (
+            weight * cosine_of_turns(v * along_v + u * along_u + shift / 360)
+            for weight, (along_u, along_v), shift in zip(
+                self.weights, self.cycles_per_px, self.shifts_deg[n], strict=True
+            )
+        )
+        return np.rint(half + half * (first + second)).astype(np.uint8)
+
+
+def _pair(values: object, key: str) -> Pair:
+    if not isinstance(values, list) or len(values) != 2:
+        raise RigError(f"{key}: expected a list of two numbers, one for each carrier, got {values!r}")
+    first, second = (real(value, f"{key}[{i}]") for i, value in enumerate(values))
+    return first, second
+
+
+def crossed_from_pair(first_horizontal: NDArray[np.uint8], first_vertical: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The crossed frame that a camera would have taken, from the first sinusoids of both directions, uint8 (H, W) each:
+    their mean, rounded half to even, uint8 (H, W). Its family is `Crossed.of_pair`. The mean of two exposures has less
+    noise than a single one: by a factor of sqrt(2). Raises `RigError` for other shapes or types."""
+    pair = first_horizontal, first_vertical
+    if any(frame.ndim != 2 or frame.dtype != np.uint8 for frame in pair) or pair[0].shape != pair[1].shape:
+        given = " and ".join(f"{frame.dtype} {frame.shape}" for frame in pair)
+        raise RigError(f"crossed frame of a pair: expected two uint8 images of one shape (H, W), got {given}")
+    total = first_horizontal.astype(np.uint16) + first_vertical
+    return np.rint(total / 2).astype(np.uint8)

@@ -1,0 +1,35 @@
+"""The rigs that this package names: the paper's, and the same with crossed fringes."""
+
+from dataclasses import replace
+
+from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.constants import FULL_SIZE
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import CodedSequence
+
+CROSSED = Crossed((18.0, 14.0), (0.0, 90.0), shifts_deg=((0.0, 0.0), (120.0, 0.0), (240.0, 0.0)))
+"""The crossed rig's frames: the first is the single shot; the three together shift the first carrier and keep the
+second still, so that the first is also measured pixel by pixel, and their mean holds the second."""
+
+
+def paper_rig(size: int = FULL_SIZE) -> Rig:
+    """The paper's rig (Table 1 and the public simulator's coordinates), its camera image ``size`` px square."""
+    focal = FULL_SIZE * 50 / 20.9995  # 50 cm focal length, 20.9995 cm horizontal aperture, square pixels
+    centre = (FULL_SIZE - 1) / 2
+    camera = Pinhole(FULL_SIZE, FULL_SIZE, focal, focal, centre, centre)
+    projector = Pinhole(912, 1140, 1824.0, 1824.0, 911 / 2, 1139 / 2)
+    rig = Rig(camera, projector, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.125, -0.1, 0.0))
+    return rig if size == FULL_SIZE else rig.scaled(size)
+
+
+def crossed_rig(size: int = FULL_SIZE) -> Rig:
+    """The paper's rig with the frames of `CROSSED` before its own, from which the ground truth is decoded."""
+    rig = paper_rig(size)
+    horizontal, vertical = rig.code("horizontal"), rig.code("vertical")
+    order = ("crossed", "horizontal", "vertical", "black", "white")
+    return replace(rig, sequence=CodedSequence(horizontal, vertical, order, CROSSED))
+
+
+NAMED_RIGS = {"paper": paper_rig, "crossed": crossed_rig}
+"""By the name that a command takes in place of a rig file."""

@@ -1,0 +1,141 @@
+"""Crossed fringes: two carriers in a frame, in a rig file, as an image, and as the mean of a pair of frames."""
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.coding import Crossed, crossed_from_pair
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.errors import DecodeError, RigError
+from fpp_ml_bench.optics import (
+    CROSSED,
+    CodedSequence,
+    Rig,
+    crossed_rig,
+    load_rig,
+    paper_rig,
+    pattern_image,
+    pattern_profile,
+    rig_from_dict,
+    save_rig,
+)
+
+FAMILY = {"pitches_px": [18, 14.5], "angles_deg": [30, 100], "weights": [0.6, 0.3], "shifts_deg": [[0, 0], [120, 45]]}
+
+
+def rig_of(**sequence) -> dict:
+    data = paper_rig(64).to_dict()
+    del data["pitch_px"]
+    return {**data, "sequence": sequence}
+
+
+def test_each_frame_is_the_sum_of_two_shifted_carriers():
+    family = Crossed.from_entries(FAMILY)
+    v, u = np.mgrid[:40, :50]
+    for n, (first_shift, second_shift) in enumerate(FAMILY["shifts_deg"]):
+        first = (v * np.cos(np.radians(30)) + u * np.sin(np.radians(30))) / 18 * 2 * np.pi + np.radians(first_shift)
+        second = (v * np.cos(np.radians(100)) + u * np.sin(np.radians(100))) / 14.5 * 2 * np.pi
+        expected = 127.5 + 127.5 * (0.6 * np.cos(first) + 0.3 * np.cos(second + np.radians(second_shift)))
+        image = family.image(50, 40, n)
+        assert image.dtype == np.uint8 and image.shape == (40, 50)
+        assert np.abs(image - expected).max() <= 0.5 + 1e-9
+    (f_u, f_v), (g_u, g_v) = family.cycles_per_px
+    np.testing.assert_allclose([f_u * 18, f_v * 18], [0.5, np.sqrt(3) / 2])
+    np.testing.assert_allclose(np.hypot(g_u, g_v), 1 / 14.5)
+
+
+def test_three_shifts_of_one_carrier_hold_the_other_still():
+    images = np.stack([CROSSED.image(60, 70, n) for n in range(3)]).astype(float)
+    wave = np.tensordot(np.exp(-2j * np.pi * np.arange(3) / 3), images, 1) * 2 / 3
+    (_, f_v), (g_u, _) = CROSSED.cycles_per_px
+    rows = np.angle(wave * np.exp(-2j * np.pi * f_v * np.arange(70))[:, None])
+    assert np.abs(rows).max() < 0.02  # of rounding to 8 bits
+    np.testing.assert_allclose(
+        images.mean(axis=0),
+        np.broadcast_to(127.5 + 63.75 * np.cos(2 * np.pi * g_u * np.arange(60)), (70, 60)),
+        atol=0.51,
+    )
+
+
+def test_a_rig_file_holds_crossed_fringes_beside_codes_or_alone(tmp_path):
+    wave = {"scheme": "phase-shift", "pitch_px": 57, "steps": 3}
+    for sequence in (
+        {"crossed": FAMILY},
+        {"order": ["white", "crossed"], "crossed": {"pitches_px": [18, 14]}},
+        {"order": ["crossed", "vertical", "black"], "crossed": FAMILY, "vertical": wave},
+    ):
+        rig = rig_from_dict(rig_of(**sequence))
+        save_rig(rig, tmp_path / "rig.yaml")
+        assert load_rig(tmp_path / "rig.yaml") == rig
+        indices = rig.sequence.config("crossed")
+        assert [rig.sequence.frames[i].kind for i in indices] == ["crossed"] * len(rig.crossed)
+        assert rig.sequence.config("single_shot") == indices[:1]
+        for n, index in enumerate(indices):
+            assert np.array_equal(pattern_image(rig, index), rig.crossed.image(912, 1140, n))
+            assert rig.sequence.frames[index].title == f"{index}: crossed fringes, step {n}"
+    alone: Rig = rig_from_dict(rig_of(crossed=FAMILY))
+    assert alone.directions == () and alone.crossed == Crossed.from_entries(FAMILY)
+    with pytest.raises(DecodeError, match="crossed fringes alone can't be decoded"):
+        decode_stack(np.zeros((2, 64, 64), np.uint8), alone)
+    with pytest.raises(RigError, match="an image, no profile"):
+        pattern_profile(alone, 0)
+    with pytest.raises(RigError, match="projects crossed fringes alone"):
+        alone.pitch("vertical")
+
+
+def test_the_crossed_rig_is_the_papers_with_three_frames_before_its_own():
+    rig, paper = crossed_rig(96), paper_rig(96)
+    assert rig.sequence.config("crossed") == (0, 1, 2) and rig.sequence.config("single_shot") == (0,)
+    assert paper.sequence.config("crossed") == () and paper.crossed is None
+    assert isinstance(rig.sequence, CodedSequence) and len(rig.sequence) == 55
+    for direction in ("horizontal", "vertical"):
+        assert rig.code(direction) == paper.code(direction) and rig.code(direction).is_plain
+        for own, of_paper in zip(rig.sequence.coded(direction), paper.sequence.coded(direction), strict=True):
+            assert np.array_equal(pattern_image(rig, own), pattern_image(paper, of_paper))
+    cycles = [rig.image_px_of_carrier(cycles) for cycles in Crossed((18.0, 18.0)).cycles_per_px]
+    np.testing.assert_allclose(cycles, [rig.image_px_per_period(d) for d in ("horizontal", "vertical")])
+    with pytest.raises(RigError, match=r"carrier 2 covers only 3\.51 px of a 192 px image"):
+        crossed_rig(192).check_sampling()
+
+
+def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
+    rig = paper_rig()
+    family = Crossed.of_pair(rig)
+    assert family == Crossed((18.0, 18.0))
+    made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 18))
+    assert made.dtype == np.uint8 and np.abs(made.astype(int) - family.image(912, 1140, 0)).max() <= 1
+    wave = {"scheme": "phase-shift", "pitch_px": 57, "shifts_deg": [30, 150, 270], "origin_px": 5}
+    rig = rig_from_dict(rig_of(horizontal=wave, vertical={**wave, "pitch_px": 48, "origin_px": 0}))
+    made = crossed_from_pair(pattern_image(rig, 0), pattern_image(rig, 3)).astype(int)
+    assert np.abs(made - Crossed.of_pair(rig).image(912, 1140, 0)).max() <= 1
+    with pytest.raises(RigError, match="two uint8 images"):
+        crossed_from_pair(np.zeros((3, 4)), np.zeros((3, 4), np.uint8))
+
+
+@pytest.mark.parametrize(
+    "changes, said",
+    [
+        ({"pitches_px": [18, 2]}, "crossed.pitches_px: expected 4 px and more"),
+        ({"pitches_px": 18}, "crossed.pitches_px: expected a list of two numbers"),
+        ({"pitches_px": [18, float("nan")]}, r"crossed.pitches_px\[1\]: expected a finite number"),
+        ({"pitches_px": [18, 3000]}, "exceeds the pattern of 912 x 1140 px"),
+        ({"angles_deg": [0, 182]}, "0 and 182 degrees are parallel"),
+        ({"angles_deg": [-179, 2]}, "are parallel"),
+        ({"weights": [0.7, 0.4]}, "weights: expected two above 0 with a sum of at most 1"),
+        ({"weights": [1, 0]}, "weights: expected two above 0"),
+        ({"shifts_deg": []}, "a pair of degrees for each frame"),
+        ({"shifts_deg": [[0, 0], [120]]}, r"shifts_deg\[1\]: expected a list of two"),
+        ({"steps": 3}, "crossed.steps: unknown key"),
+    ],
+)
+def test_a_family_that_is_none_is_refused(changes, said):
+    with pytest.raises(RigError, match=said):
+        rig_from_dict(rig_of(crossed={**FAMILY, **changes}))
+
+
+def test_an_order_that_does_not_fit_is_refused():
+    with pytest.raises(RigError, match="crossed missing"):
+        rig_from_dict(rig_of(order=["black"], crossed=FAMILY))
+    with pytest.raises(RigError, match="expected each of crossed, black, white at most once"):
+        rig_from_dict(rig_of(order=["crossed", "vertical"], crossed=FAMILY))
+    with pytest.raises(RigError, match="crossed: expected a mapping with the key pitches_px"):
+        rig_from_dict(rig_of(crossed=3))

@@ -1,0 +1,95 @@
+"""The light of crossed fringes: beside the mean of two directions, against a convolution of the image, in a dataset."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendering import DIRECT, PAPER, RIG, kept, studio
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.constants import VIEWS
+from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.projector import PatternLight, defocus_variance_px2, response_table
+from fpp_ml_bench.loaders.render.scene import BuildSettings, preset_settings
+from fpp_ml_bench.loaders.storage import DatasetFolder, verify
+from fpp_ml_bench.optics import CodedSequence, Sequence, crossed_rig, paper_rig
+
+SHORT = replace(RIG, sequence=Sequence(steps=3))
+
+
+def with_crossed(crossed, *order):
+    """The small rig with a few frames: crossed ones first, then sinusoids of both directions."""
+    return replace(
+        RIG, sequence=CodedSequence(SHORT.code("horizontal"), SHORT.code("vertical"), order, crossed)
+    )  # fmt: skip
+
+
+BOTH = with_crossed(Crossed((18.0, 18.0)), "crossed", "horizontal", "vertical", "black", "white")
+
+
+@pytest.mark.parametrize("light", [PAPER, DIRECT.changed("projector", pixel_blur_px=1.0, defocus_px=2.0, focus_m=1.6)])
+def test_a_crossed_frame_of_equal_periods_is_the_mean_of_both_directions(light):
+    frames = kept(studio(light, rig=BOTH).photograph(solid_mesh("mug"), "A60"))
+    rows, columns = BOTH.sequence.sinusoids("horizontal")[0], BOTH.sequence.sinusoids("vertical")[0]
+    difference = frames[0] - (frames[rows].astype(float) + frames[columns]) / 2
+    difference = difference[:, :-3]  # beyond, at the pattern's end, blur repeats its last pixel
+    assert frames[0].std() > 15 and np.abs(difference).max() <= 1.5
+    assert abs(difference.mean()) < 0.1
+
+
+@pytest.mark.parametrize("response", [1.0, 2.2, (0.0, 0.3, 0.5, 1.0)])
+@pytest.mark.parametrize("defocus_px", [0.0, 2.5])
+def test_light_is_the_image_through_response_and_blur(response, defocus_px):
+    family = Crossed((18.0, 13.0), (15.0, 80.0), (0.6, 0.4), ((90.0, 30.0),))
+    rig = with_crossed(family, "horizontal", "crossed", "vertical")
+    light = PAPER.changed(
+        "projector", response=response, pixel_blur_px=0.7, defocus_px=defocus_px, focus_m=1.6
+    ).projector
+    pattern, index = PatternLight.of(rig, light), rig.sequence.crossed_frames[0]
+    u, v = np.random.default_rng(3).uniform(200, 400, (2, 500))
+    distance_m = np.full(500, 2.1)
+    out = np.empty((len(rig.sequence), 500))
+    pattern.read(pattern.place(u, v, distance_m, rig, light), np.full(500, 2.0), out)
+    fine, image = 4, response_table(response)[family.image(912, 1140, 0)[150:450, 150:450]]
+    places = np.arange(299 * fine + 1) / fine
+    whole = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=1)
+    variance = light.pixel_blur_px**2 + (defocus_variance_px2(rig, light, distance_m)[0] if defocus_px else 0.0)
+    area = [rig.projector_px_per_image_px(direction) ** 2 / 12 for direction in ("horizontal", "vertical")]
+    blurred = gaussian_filter(whole, [fine * np.sqrt(variance + a) for a in area])
+    expected = map_coordinates(blurred, [(v - 150) * fine, (u - 150) * fine], order=1)
+    assert np.ptp(expected) > 0.1
+    np.testing.assert_allclose(out[index], 2 * expected, atol=0.008)  # of which rounding to 8 bits 0.004
+
+
+def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path):
+    rig = crossed_rig(240)
+    settings = BuildSettings(rig, ("cork",), stored="crossed")
+    build(tmp_path / "crossed", settings, 1)
+    build(tmp_path / "paper", BuildSettings(paper_rig(240), ("cork",), stored="single_shot"), 1)
+    opened, paper = DatasetFolder(tmp_path / "crossed"), DatasetFolder(tmp_path / "paper")
+    assert opened.configs == ("single_shot", "crossed") and opened.manifest.stored_frames == (0, 1, 2)
+    assert not verify(tmp_path / "crossed")
+    for view in VIEWS[:2]:
+        depth_mm, other_mm = (dataset.depth_mm(f"cork_{view}") for dataset in (opened, paper))
+        both = (depth_mm > 0) & (other_mm > 0)
+        assert both.sum() > 100 and np.array_equal(
+            opened.depth_mm(f"cork_{view}", "depth_exact"), paper.depth_mm(f"cork_{view}", "depth_exact")
+        )
+        assert np.abs(depth_mm - other_mm)[both].mean() < 0.5
+        frames = np.stack([opened.frame(f"cork_{view}", n) for n in range(3)]).astype(float)
+        wave = np.tensordot(np.exp(2j * np.pi * np.arange(3) / 3), frames, 1) * 2 / 3
+        assert np.median(np.abs(wave)[both]) > 20
+
+
+def test_what_can_not_be_built_is_said():
+    alone = replace(crossed_rig(240), sequence=CodedSequence(None, None, ("crossed",), Crossed((18.0, 14.0))))
+    with pytest.raises(BuildError, match="no ground truth can be decoded; add the horizontal"):
+        BuildSettings(alone, ("cork",))
+    with pytest.raises(BuildError, match="frames 'crossed': this rig's sequence has none"):
+        BuildSettings(paper_rig(240), ("cork",), stored="crossed")
+    assert preset_settings("unseen", 480, rig="crossed") == replace(
+        preset_settings("unseen", 480), rig=crossed_rig(480), stored="crossed"
+    )
