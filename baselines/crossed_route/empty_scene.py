@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.crossed_route.demodulation import Demodulated
-from fpp_ml_bench.baselines.phase_route import DEFAULT_NOISE_GREY, FLOOR_NOISE_GREY, Background, Image, Mask, image_noise_grey, plane_irradiance, wrapped
+from fpp_ml_bench.baselines.phase_route import (
+    DEFAULT_NOISE_GREY,
+    FLOOR_NOISE_GREY,
+    Background,
+    Image,
+    Mask,
+    image_noise_grey,
+    plane_irradiance,
+    wrapped,
+)
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it

@@ -132,16 +132,18 @@ class CrossedRoute:
             clipped_share=clipped_share, watch=watch,
         )  # fmt: skip
 
-    def conclude(self, seen: CrossedObservation) -> CrossedMeasurement:
-        """The measurement that follows from an observation."""
+    def conclude(self, seen: CrossedObservation, wrong_chance: Image | None = None) -> CrossedMeasurement:
+        """The measurement that follows from an observation. ``wrong_chance`` (h, w): probability of a wrong order, by
+        default from the observation's evidence and margin."""
         carriers, fit, watch, inside = seen.carriers, seen.fit, seen.watch, seen.inside
         depth_mm = carriers.depth_mm(fit.nearness)
         near_mm, far_mm = self.rig.working_range_mm
         slack_mm = 4 * self.settings.slack_mm  # a fit may move a pixel out of the range that its order was chosen in
         inside = inside & np.isfinite(depth_mm) & (depth_mm > near_mm - slack_mm) & (depth_mm < far_mm + slack_mm)
         depth_mm = np.where(inside, depth_mm, 0.0)
-        odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE
-        wrong_chance = (1 / (1 + np.exp(np.clip(odds, 0, 50)))).astype(np.float32)
+        if wrong_chance is None:
+            odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE
+            wrong_chance = (1 / (1 + np.exp(np.clip(odds, 0, 50)))).astype(np.float32)
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
         variance = fit.uncertainty_rad**2 + wrong_chance * apart_rad**2

@@ -1,3 +1,7 @@
+from .inputs import LARGEST_RAD as LARGEST_RAD
+from .inputs import SIDE_PERIODS as SIDE_PERIODS
+from .inputs import SIDES as SIDES
+from .inputs import from_the_sides as from_the_sides
 from .method import DEFAULT as DEFAULT
 from .method import NetFile as NetFile
 from .method import PhaseNetMethod as PhaseNetMethod
@@ -7,5 +11,12 @@ from .network import PhaseNet as PhaseNet
 from .route import AnsweredObservation as AnsweredObservation
 from .route import Levers as Levers
 from .route import NetworkRoute as NetworkRoute
+from .samples import companions as companions
+from .samples import united as united
 from .training import Recipe as Recipe
 from .training import train_phase_net as train_phase_net
+from .window_training import WindowRecipe as WindowRecipe
+from .window_training import WindowTraining as WindowTraining
+from .windows import IGNORED as IGNORED
+from .windows import Window as Window
+from .windows import place_of as place_of

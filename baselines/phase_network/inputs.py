@@ -5,7 +5,7 @@ how bright the pixel would be with each against how bright it is, and whether th
 map holds a distance. Maps are rotated so that phase grows downwards and with nearness, whatever the fringe direction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -193,39 +193,48 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
     fitted *= scene.weight > LEAST_WEIGHT
     image_maps = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
     turned_maps = rotation.turn(np.nan_to_num(np.concatenate([image_maps, fitted])))
-    x = np.concatenate([turned_maps, _from_the_sides(scene, layer, geometry)])
+    x = np.concatenate([turned_maps, _turned_sides(scene, layer, geometry)])
     if not shading:
         x[list(SHADING)] = 0
     return x, np.ascontiguousarray(rotation.turn(exists))
 
 
-def _misfit_around(light: Image, bright: Image, phase_rad: NDArray, valid: Mask | bool = True) -> Image:
-    """Root mean square, in the pixel's surroundings, by which light differs from a fringe's; 2 where not ``valid``."""
-    misfit = light / np.maximum(bright, np.float32(0.05)) - 1 - np.cos(phase_rad)
+def _misfit_around(light: Image, bright: Image, raised: NDArray, valid: Mask | bool = True) -> Image:
+    """Root mean square, in the pixel's surroundings, by which light over brightness differs from a fringe's, which is
+    ``raised``; 2 where not ``valid``."""
+    misfit = light / np.maximum(bright, np.float32(0.05)) - raised
     square = np.clip(np.where(valid, misfit, np.float32(2)), -2, 2).astype(np.float32) ** 2
     return np.sqrt(cv2.GaussianBlur(square, (0, 0), AROUND_PX, borderType=cv2.BORDER_REPLICATE))
 
 
-def _from_the_sides(scene: Scene, layer: CalibrationLayer, geometry: Geometry) -> Image:
+def from_the_sides(
+    light: Image, maps: NDArray[np.float32], reach_px: int, raised: Callable[[NDArray | float], NDArray],
+    difference: Callable[[NDArray], NDArray] = lambda rad: rad,
+) -> Image:  # fmt: skip
     """The phase extrapolated to a pixel from each of `SIDES`, minus its own phase, and the misfit of its light with it:
-    (17, h', w') float32, rotated. Beside a depth edge the window of a pixel covers two surfaces, a window further in
-    only one."""
+    (17, h, w) float32. ``maps`` (5, h, w): phase, its slopes down and right, brightness, object; ``raised``: light over
+    brightness of the pixel's fringe with the phase moved by so many rad; ``difference``: of two phases, from their
+    difference. Beside a depth edge the window of a pixel covers two surfaces, a window further in only one."""
+    _, height, width = maps.shape
+    padded = np.pad(maps, ((0, 0), (reach_px, reach_px), (reach_px, reach_px)))
+    corrections, misfits = [], [_misfit_around(light, maps[3], raised(0.0))]
+    for row, column in SIDES:
+        dy, dx = round(row * reach_px), round(column * reach_px)
+        side_maps = padded[:, reach_px + dy : reach_px + dy + height, reach_px + dx : reach_px + dx + width]
+        on_object = side_maps[4] > 0
+        step = side_maps[0] - side_maps[1] * np.float32(dy) - side_maps[2] * np.float32(dx) - maps[0]
+        step = np.clip(difference(step), -LARGEST_RAD, LARGEST_RAD) * on_object
+        corrections.append(step)
+        misfits.append(_misfit_around(light, side_maps[3], raised(step), on_object))
+    return np.stack(corrections + misfits).astype(np.float32)
+
+
+def _turned_sides(scene: Scene, layer: CalibrationLayer, geometry: Geometry) -> Image:
+    """`from_the_sides` of a scene, rotated for the network."""
     rotation, turn, sign = geometry.rotation, geometry.rotation.turn, np.float32(geometry.rotation.sign)
     psi = turn(sign * wrapped(scene.phase_rad - layer.infinity_rad).astype(np.float32))
     phase = turn(sign * scene.phase_rad)
-    reach = max(1, round(SIDE_PERIODS * geometry.route.period_px))
     turned_maps = (*rotation.down_and_right(scene.slopes), scene.bright, scene.inside.astype(np.float32))
     maps = np.stack([psi, *map(turn, turned_maps)])
-    height, width = psi.shape
-    padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
-    light = turn(scene.light)
-    corrections, misfits = [], [_misfit_around(light, maps[3], phase)]
-    for row, column in SIDES:
-        dy, dx = round(row * reach), round(column * reach)
-        side_maps = padded[:, reach + dy : reach + dy + height, reach + dx : reach + dx + width]
-        on_object = side_maps[4] > 0
-        step = wrapped(side_maps[0] - side_maps[1] * np.float32(dy) - side_maps[2] * np.float32(dx) - psi)
-        step = np.clip(step, -LARGEST_RAD, LARGEST_RAD) * on_object
-        corrections.append(step)
-        misfits.append(_misfit_around(light, side_maps[3], phase + step, on_object))
-    return np.stack(corrections + misfits).astype(np.float32)
+    reach_px = max(1, round(SIDE_PERIODS * geometry.route.period_px))
+    return from_the_sides(turn(scene.light), maps, reach_px, lambda step: 1 + np.cos(phase + step), wrapped)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, SIDES, STEPS
 from fpp_ml_bench.errors import NetworkError
 
 BLOCK = 2  # pixels along the side of a block that the first layer takes as one
@@ -17,6 +17,7 @@ COARSE = 4  # pixels along a block that the order's branch averages
 ORDER_SHARE = 0.1  # share of the order's gradient that reaches the branch of phase and mask
 TRUST = 6.0  # start value of the factor by which a proposal's brightness misfit lowers its logit
 FIRST_BIAS = 2.5  # start value of the biases of the base order and of no correction
+LOG_SCALES = -6.0, 1.0  # least and largest logarithm of the scale that the network states for its phase error in rad
 
 
 def _layers(inputs: int, outputs: int) -> nn.Sequential:
@@ -48,34 +49,37 @@ class PhaseNet(nn.Module):
     """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W). The
     correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
     none, with weights from the network, plus a free part of at most half of ``bound_rad``, clipped at ``bound_rad``.
+    ``uncertain``: it also gives the logarithm of the scale in rad of the phase error it expects, (B, H, W).
+    ``channels``: maps that it takes, the last of them the corrections of the sides, the misfit of none, and theirs.
     ``widths``: channels of each level, the first at half the image's resolution; ``squeezed`` and ``fine``: of the maps
     at full resolution, before and after them; ``order_widths``: of the branch that looks for the order, at a quarter of
     the resolution. H and W must be multiples of ``stride``."""
 
     def __init__(
         self, widths: tuple[int, ...] = (24, 32, 48, 64), fine: int = 14, squeezed: int = 20,
-        order_widths: tuple[int, ...] = (32, 48, 64), bound_rad: float = 1.5708,
+        order_widths: tuple[int, ...] = (32, 48, 64), bound_rad: float = 1.5708, channels: int = len(CHANNELS),
+        uncertain: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         widths, order_widths = tuple(widths), tuple(order_widths)
-        if min((*widths, *order_widths, fine, squeezed)) < 1 or not 0 < bound_rad < 3.1416:
+        if min((*widths, *order_widths, fine, squeezed, channels - 2 * len(SIDES))) < 1 or not 0 < bound_rad < 3.1416:
             raise NetworkError(
                 f"expected positive widths and bound_rad between 0 and pi; got widths {widths}, order_widths "
                 f"{order_widths}, fine {fine}, squeezed {squeezed}, bound_rad {bound_rad}"
             )
         self.options: dict[str, Any] = {
             "widths": list(widths), "fine": fine, "squeezed": squeezed, "order_widths": list(order_widths),
-            "bound_rad": bound_rad,
+            "bound_rad": bound_rad, "channels": channels, "uncertain": uncertain,
         }  # fmt: skip
-        self.bound_rad = bound_rad
+        self.bound_rad, self.uncertain = bound_rad, uncertain
         self.stride = max(BLOCK * 2 ** (len(widths) - 1), COARSE * 2 ** (len(order_widths) - 1))
-        self.squeeze = nn.Sequential(nn.Conv2d(len(CHANNELS), squeezed, 1), nn.ReLU(inplace=True))
+        self.squeeze = nn.Sequential(nn.Conv2d(channels, squeezed, 1), nn.ReLU(inplace=True))
         self.body = UNet(squeezed * BLOCK**2, widths)
         self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
         self.fine = nn.Sequential(nn.Conv2d(fine + squeezed, fine, 3, padding=1), nn.ReLU(inplace=True))
-        self.answer = nn.Conv2d(fine, len(STEPS) + 2 + 1 + len(SIDES), 1)
+        self.answer = nn.Conv2d(fine, len(STEPS) + 2 + 1 + len(SIDES) + uncertain, 1)
         self.trust = nn.Parameter(torch.tensor(TRUST))
-        self.order_body = UNet(len(CHANNELS), order_widths)
+        self.order_body = UNet(channels, order_widths)
         self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
         nn.init.normal_(self.answer.weight, std=0.05)
         bias = torch.zeros(self.answer.out_channels)
@@ -92,7 +96,7 @@ class PhaseNet(nn.Module):
                     block[number + 1] = nn.Identity()
         return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
             raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
         squeezed = self.squeeze(x)
@@ -104,7 +108,9 @@ class PhaseNet(nn.Module):
         # The order's loss is large where a whole region is wrong; it must not outweigh the phase's loss in the layers
         # that both use.
         order = order + ORDER_SHARE * answers[:, :3] + (1 - ORDER_SHARE) * answers[:, :3].detach()
-        proposed, misfits = x[:, FIRST_SIDE:FIRST_MISFIT], x[:, FIRST_MISFIT:]
-        shares = torch.softmax(answers[:, 5:] - self.trust * misfits, dim=1)[:, 1:]
+        sides = len(SIDES)
+        proposed, misfits = x[:, -2 * sides - 1 : -sides - 1], x[:, -sides - 1 :]
+        shares = torch.softmax(answers[:, 5 : 6 + sides] - self.trust * misfits, dim=1)[:, 1:]
         correction = (shares * proposed).sum(dim=1) + 0.5 * self.bound_rad * torch.tanh(answers[:, 4])
-        return order, answers[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)
+        told = order, answers[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)
+        return (*told, answers[:, -1].clamp(*LOG_SCALES)) if self.uncertain else told

@@ -62,7 +62,7 @@ def draw(
     """A random window of ``size`` px of one of ``samples``."""
     sample = samples[random.integers(len(samples))]
     geometry = geometries[sample.direction]
-    rows, columns = _place(sample, size, random.random() < vary.near_edge, random)
+    rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
     scene, missing = sample.scene.window(rows, columns).single(), sample.missing_rad[rows, columns].astype(np.float32)
     target = sample.target[rows, columns]
     moved = random.random() < vary.shift and target.any()
@@ -75,10 +75,14 @@ def draw(
     return _mirrored(window) if random.random() < vary.mirror else window
 
 
-def _place(sample: Sample, size: int, near_edge: bool, random: np.random.Generator) -> tuple[slice, slice]:
-    height, width = sample.target.shape
-    if near_edge and len(sample.edges):
-        row, column = sample.edges[random.integers(len(sample.edges))] + random.integers(-size // 3, size // 3 + 1, 2)
+def place_of(
+    edges: NDArray[np.int32], shape: tuple[int, ...], size: int, near_edge: bool, random: np.random.Generator
+) -> tuple[slice, slice]:
+    """Rows and columns of a random window of ``size`` px in an image of ``shape``, or of one near a point of ``edges``
+    (n, 2)."""
+    height, width = shape
+    if near_edge and len(edges):
+        row, column = edges[random.integers(len(edges))] + random.integers(-size // 3, size // 3 + 1, 2)
     else:
         row, column = random.integers(height), random.integers(width)
     top = int(np.clip(row - size // 2, 0, max(height - size, 0)))

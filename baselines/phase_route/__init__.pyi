@@ -9,6 +9,7 @@ from .labels import least_energy as least_energy
 from .local_fit import CURVED as CURVED
 from .local_fit import PLANE as PLANE
 from .local_fit import Window as Window
+from .local_fit import phase_slopes as phase_slopes
 from .local_fit import solve_symmetric as solve_symmetric
 from .method import FewestFrames as FewestFrames
 from .method import PhaseMethod as PhaseMethod

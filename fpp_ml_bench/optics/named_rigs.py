@@ -8,7 +8,7 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import CodedSequence
 
-CROSSED = Crossed((18.0, 14.0), (0.0, 90.0), shifts_deg=((0.0, 0.0), (120.0, 0.0), (240.0, 0.0)))
+CROSSED = Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=((0.0, 0.0), (120.0, 0.0), (240.0, 0.0)))
 """The crossed rig's frames: the first is the single shot; the three together shift the first carrier and keep the
 second still, so that the first is also measured pixel by pixel, and their mean holds the second."""
 

@@ -1,0 +1,116 @@
+"""The learned crossed route: measured candidates, the network's order, mask, bounded correction and its scale."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
+from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedMeasurement, CrossedObservation, CrossedRoute, Settings
+from fpp_ml_bench.baselines.phase_network import PhaseNet
+from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, least_energy, links_between, of_choice, repeated
+from fpp_ml_bench.optics import Rig
+
+GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
+JUMP_RAD = 2.5  # jump of the joint phase between neighbours from which on it costs no more
+LEAST_CHANCE = 1e-6  # of a wrong order, whatever the network answers
+SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The network's answers, maps (h, w) of the scene's crop: ``logits`` (3, h, w) of the turn further, the base and
+    the turn nearer, -inf where there is none; ``object_logit``; ``correction_rad`` of the joint phase; ``sigma_rad``:
+    its standard uncertainty."""
+
+    logits: Image
+    object_logit: Image
+    correction_rad: Image
+    sigma_rad: Image
+
+
+def network_answers(network: PhaseNet, scene: Scene, carriers: Carriers, lead: float = 0.0) -> Answers:
+    """Run ``network`` on a scene; ``lead`` is added to the base's logit: training makes up wrong base orders, so that
+    the network holds the base wrong more often than it is."""
+    x, exists = channels(scene, carriers)
+    _, height, width = x.shape
+    padded = np.pad(x, ((0, 0), (0, -height % network.stride), (0, -width % network.stride)))
+    with torch.inference_mode():
+        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
+        order, inside, correction, scale = (out[0, ..., :height, :width].numpy() for out in network(batch))
+    order = order + np.array([0, lead, 0], np.float32)[:, None, None]
+    return Answers(np.where(exists, order, -np.inf), inside, correction, SCALE_TO_SIGMA * np.exp(scale))
+
+
+def decided_mask(answers: Answers, threshold: float) -> Mask:
+    """Object pixels (h, w): those whose logit is above ``threshold``."""
+    return answers.object_logit > threshold
+
+
+def probabilities(answers: Answers) -> Image:
+    """Of the three orders, (3, h, w)."""
+    chances = np.exp(answers.logits - answers.logits.max(axis=0))
+    return chances / chances.sum(axis=0)  # type: ignore[no-any-return]
+
+
+def decided_order(answers: Answers, scene: Scene, carriers: Carriers, inside: Mask, stride: int) -> NDArray[np.intp]:
+    """Index of each pixel's order by least energy on a grid of every ``stride``-th pixel, (h, w)."""
+    chances = probabilities(answers)
+    weight, size, grid = inside.astype(np.float32), (stride, stride), slice(None, None, stride)
+    cost = np.stack([cv2.blur((-np.log(p + 1e-9) * weight).astype(np.float32), size) for p in chances])
+    cost = (cost / np.maximum(cv2.blur(weight, size), 1e-3))[:, grid, grid] * np.float32(stride**2)
+    points = inside[grid, grid]
+    psi = (scene.nearness * carriers.at(scene.crop).joint_gain)[grid, grid]
+    further, nearer = scene.step_rad[:, grid, grid]
+    phases = np.stack([psi + further, psi, psi + nearer]).astype(np.float32)
+    links = (link * np.float32(GRAPH * stride) for link in links_between(points))
+    cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
+    choice, _ = least_energy(cost, phases, *links, JUMP_RAD)
+    # A pixel takes the turn that is nearest to what its grid point chose.
+    chosen_rad = repeated(of_choice(phases, choice), stride, inside.shape)
+    own = scene.nearness * carriers.at(scene.crop).joint_gain
+    offered = np.stack([own + scene.step_rad[0], own, own + scene.step_rad[1]])
+    apart = np.where(np.isfinite(answers.logits), np.abs(offered - chosen_rad), np.inf)
+    return apart.argmin(axis=0)
+
+
+class CrossedNetRoute:
+    """One rig and network; ``threshold`` on the logit of the mask."""
+
+    def __init__(
+        self, rig: Rig, network: PhaseNet, threshold: float, lead: float, settings: Settings | None = None,
+    ) -> None:  # fmt: skip
+        self.route = CrossedRoute(rig, settings)
+        self.network, self.threshold, self.lead = network, threshold, lead
+
+    def measure(self, image: NDArray) -> CrossedMeasurement:
+        """Everything about one crossed frame (H, W). Raises `DecodeError` for another dtype or shape."""
+        seen = self.route.observe(image)
+        if not seen.inside.any():
+            return self.route.conclude(seen)
+        scene = Scene.of(seen)
+        answers = network_answers(self.network, scene, self.route.carriers, self.lead)
+        seen.watch.done("network")
+        return self.conclude(seen, scene, answers)
+
+    def conclude(self, seen: CrossedObservation, scene: Scene, answers: Answers) -> CrossedMeasurement:
+        """The measurement from the network's answers."""
+        joint = seen.carriers.joint_gain
+        inside = decided_mask(answers, self.threshold)
+        choice = decided_order(answers, scene, self.route.carriers, inside, self.route.stride)
+        offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
+        nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint
+        known = scene.share > LEAST_SHARE
+        if known.any() and not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
+            y, x = distance_transform_edt(~known, return_distances=False, return_indices=True)
+            nearness = nearness[y, x]
+        chances = probabilities(answers)
+        wrong = np.clip(1 - of_choice(chances, choice), LEAST_CHANCE, 1)
+        np.put_along_axis(chances, choice[None], -1, axis=0)
+        rival = scene.nearness + of_choice(offers, chances.argmax(axis=0)) / joint
+        fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
+        seen.watch.done("order")
+        return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong.astype(np.float32))

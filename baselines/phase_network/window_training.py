@@ -1,0 +1,225 @@
+"""Training a network on windows of images: three or four losses, a moving average of the weights, resumable."""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window
+from fpp_ml_bench.baselines.training import Panel, Record
+from fpp_ml_bench.errors import RecipeError, TrainingError
+
+SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
+IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
+LARGEST_GRADIENT = 50.0
+
+
+@dataclass(frozen=True)
+class WindowRecipe:
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
+    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses; ``averaged``: decay of the weights' moving
+    average, which is what the weights file holds. Raises `RecipeError` for values that train nothing."""
+
+    name: str = "phase-net"
+    steps: int = 5000
+    batch: int = 6
+    window: int = 160
+    rate: float = 3e-3
+    warm_up: int = 100
+    decay: float = 1e-4
+    averaged: float = 0.995
+    seed: int = 42
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
+    bound_rad: float = math.pi / 2
+    weight_order: float = 2.0
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    validate_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "window", "validate_every"):
+            if not getattr(self, name) >= 1:
+                raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        if not self.rate > 0 or not 0 <= self.averaged < 1:
+            raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Of the losses, by name."""
+        return {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
+
+    def network(self) -> PhaseNet:
+        """The network, untrained."""
+        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad)
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate of step 0, 1, ..."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+    def to_dict(self) -> dict[str, Any]:
+        return json.loads(json.dumps(asdict(self)))
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+
+Batch = dict[str, Tensor]  # the fields of `Window` with a leading axis B
+
+
+def batch_of(windows: list[Window]) -> Batch:
+    fields = Window.__dataclass_fields__
+    batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
+    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
+    return batch
+
+
+def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str, Tensor]:
+    """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
+    ``scale``, of a network that states one: negative log-likelihood of its phase error under a Laplace distribution."""
+    order, inside, correction, *scales = network(batch["x"])
+    logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
+    pixels = batch["fitted"].sum().clamp(min=1)
+    by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum") / pixels
+    by_pixel = functional.binary_cross_entropy_with_logits(inside, batch["target"].float(), reduction="none")
+    by_mask = (by_pixel * batch["mask_valid"]).sum() / batch["mask_valid"].sum().clamp(min=1)
+    target_rad = batch["correction_rad"].clamp(-bound_rad, bound_rad)
+    by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
+    parts = {"order": by_order, "mask": by_mask, "phase": (by_phase * batch["fitted"]).sum() / pixels}
+    if scales:
+        error = (correction.detach() - batch["correction_rad"]).abs()
+        by_scale = error * torch.exp(-scales[0]) + scales[0]
+        parts["scale"] = (by_scale * batch["fitted"]).sum() / pixels
+    return parts
+
+
+class WindowObjective:
+    """The weighted losses of a `PhaseNet`, and the moving average of its weights, updated after every step."""
+
+    def __init__(self, network: PhaseNet, recipe: WindowRecipe) -> None:
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.bound_rad, self.weights = recipe.bound_rad, recipe.weights
+        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+
+    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
+        parts = losses(self.modules["network"], batch, self.bound_rad)
+        total = torch.stack([self.weights[name] * parts[name] for name in self.weights]).sum()
+        yield "network", total, {name: value.detach() for name, value in parts.items()}
+        self.averaged.update_parameters(self.modules["network"])
+
+
+class WindowTraining(training.Training):
+    """Training in intervals between two validations, on the processor. ``draw`` gives a random window; ``validate``:
+    scores of a network, among them ``object_mae_mm``, ``right_mae_mm``, ``wrong_percent`` and ``missed_percent``, or
+    nothing. ``start``: the network whose weights it starts from (None: random ones). ``print_line`` is given a line for
+    every new record. Raises `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint
+    of another recipe."""
+
+    largest_gradient = LARGEST_GRADIENT
+
+    def __init__(
+        self, recipe: WindowRecipe, draw: Callable[[np.random.Generator], Window],
+        validate: Callable[[PhaseNet], dict[str, float]], out: Path, start: PhaseNet | None = None,
+        print_line: Callable[[str], None] = lambda line: None,
+    ) -> None:  # fmt: skip
+        super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
+        self.recipe, self.draw, self.validate, self.print_line = recipe, draw, validate, print_line
+        self.name = self.title = recipe.name
+        network = recipe.network()
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if start is not None:
+            if start.options != network.options:
+                raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+            network.load_state_dict(start.state_dict())
+        self.objective = self.windows = WindowObjective(network, recipe)
+        self.bare = {"network": network, "averaged": self.windows.averaged}
+        optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        self.windows.modules["network"], prepared = self.accelerator.prepare(network, optimizer)
+        self.optimizers = {"network": prepared}
+        self.resume()
+
+    @property
+    def network(self) -> PhaseNet:
+        """The averaged network, to be used."""
+        averaged: PhaseNet = self.windows.averaged.module.eval()  # type: ignore[assignment]
+        return averaged
+
+    @property
+    def steps_done(self) -> int:
+        return self.history[-1]["step"] if self.history else 0
+
+    @property
+    def _next_validation(self) -> int:
+        every = self.recipe.validate_every
+        return min((self.steps_done // every + 1) * every, self.recipe.steps)
+
+    @property
+    def total_steps(self) -> int:
+        return self.recipe.steps
+
+    @property
+    def over(self) -> bool:
+        return self.steps_done >= self.recipe.steps
+
+    def rate(self, number: int) -> float:
+        return self.recipe.rate_at(self.steps_done + number)
+
+    def batches(self) -> Iterator[Batch]:
+        """The batches up to the next validation: each is a function of seed and step alone, made one step ahead."""
+        first, last, recipe = self.steps_done, self._next_validation, self.recipe
+
+        def make(step: int) -> Batch:
+            random = np.random.default_rng([recipe.seed, step])
+            return batch_of([self.draw(random) for _ in range(recipe.batch)])
+
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(make, first)
+            for step in range(first, last):
+                batch = coming.result()
+                if step + 1 < last:
+                    coming = pool.submit(make, step + 1)
+                yield batch
+
+    def diverged(self, name: str, value: float, number: int, label: None) -> str:
+        return f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start again"
+
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        seconds, steps = perf_counter() - began, self._next_validation
+        record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
+        record |= {f"loss_{name}": value for name, value in losses.items()}
+        return record | self.validate(self.network)
+
+    def recorded(self, record: Record) -> None:
+        self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
+
+    def progress(self) -> str:
+        return f"step {self.steps_done}/{self.recipe.steps}  phase {self.history[-1]['loss_phase']:.4g}"
+
+    def panels(self) -> list[Panel]:
+        def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
+            return Panel.of(title, self.history, "step", labels, log)
+
+        return [
+            panel("training losses", {f"loss_{name}": name for name in ("order", "mask", "phase")}, log=True),
+            panel("validation MAE, mm", {"object_mae_mm": "object", "right_mae_mm": "right order"}),
+            panel("validation, % of object pixels", {"wrong_percent": "wrong order", "missed_percent": "missed"}),
+        ]
