@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__, baselines
-from fpp_ml_bench.baselines import networks, phase_network, phase_route, training
+from fpp_ml_bench.baselines import crossed_network, crossed_route, networks, phase_network, phase_route, training
 from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
@@ -96,6 +96,8 @@ METHODS: Mapping[str, Callable[..., Method]] = {
         rig, **_fringe_options("phase", rig, options)
     ),
     "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **_fringe_options("phase-net", rig, options)),
+    "crossed": lambda rig, **options: crossed_route.CrossedMethod(rig, **options),
+    "crossed-net": lambda rig, **options: crossed_network.CrossedNetMethod(rig, **options),
     "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a

@@ -1,4 +1,7 @@
 from .carriers import Carriers as Carriers
+from .method import CrossedMethod as CrossedMethod
+from .method import crossed_image as crossed_image
+from .method import frames_of as frames_of
 from .observation import CrossedMeasurement as CrossedMeasurement
 from .observation import CrossedObservation as CrossedObservation
 from .observation import CrossedReason as CrossedReason

@@ -15,16 +15,13 @@ from fpp_ml_bench.errors import PredictionError
 
 @dataclass(frozen=True)
 class Settings:
-    """``frames``: 1, or the 3 that shift the first carrier and keep the second; ``min_confidence``: pixels below it are
-    0 (0: dense); ``slack_mm`` widens the working range for noise at its ends. Raises `PredictionError`."""
+    """``min_confidence``: pixels below it are 0 (0: dense); ``slack_mm`` widens the working range for noise at its ends.
+    Raises `PredictionError`."""
 
-    frames: int = 1
     min_confidence: float = 0.0
     slack_mm: float = 15.0
 
     def __post_init__(self) -> None:
-        if self.frames not in (1, 3):
-            raise PredictionError(f"frames {self.frames!r}: crossed fringes are measured from 1 frame or 3")
         if not 0 <= self.min_confidence < 1:
             raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
 

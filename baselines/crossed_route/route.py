@@ -47,7 +47,8 @@ EVIDENCE_SCALE, MARGIN_SCALE = 1.0, 4.0
 """By how much evidence and margin of energy the odds of two orders grow e-fold."""
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 SATURATED_SHARE = 0.02
-LOST_SHARE = 0.2  # of a carrier's contrast: below, it counts as not seen
+LOST_SHARE, LOST_CHANCE = 0.25, 0.6
+"""Share of a carrier's contrast below which it counts as not seen, and the least probability of a wrong order then."""
 TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
 AMBIGUOUS_CHANCE = 0.3  # of a wrong order
 
@@ -144,6 +145,7 @@ class CrossedRoute:
         if wrong_chance is None:
             odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE
             wrong_chance = (1 / (1 + np.exp(np.clip(odds, 0, 50)))).astype(np.float32)
+        wrong_chance = np.where(_lost(seen), np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
         variance = fit.uncertainty_rad**2 + wrong_chance * apart_rad**2
@@ -174,12 +176,11 @@ class CrossedRoute:
         bright = np.maximum(fit.brightness, 0.5)
         window = Window(WINDOW_PERIODS * self.carriers.period_px)
         misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
-        weakest = min(seen.contrast)
         by_reason = {
             CrossedReason.BACKGROUND: ~inside,
             CrossedReason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
             CrossedReason.SATURATED: seen.clipped_share > SATURATED_SHARE,
-            CrossedReason.ONE_DIRECTION: seen.modulation.min(axis=0) < LOST_SHARE * weakest * bright,
+            CrossedReason.ONE_DIRECTION: _lost(seen),
             CrossedReason.TEXTURE: np.sqrt(misfit) > TEXTURE_SHARE * bright,
             CrossedReason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
             CrossedReason.UNSURE: confidence < self.settings.min_confidence,
@@ -227,3 +228,10 @@ def _lifted(carriers: Carriers, phase_rad: Image, nearness: NDArray) -> NDArray:
     """Nearness (h, w) of wrapped phases (2, h, w), both in the turns that are nearest to ``nearness``."""
     beside = wrapped(phase_rad - carriers.phases(nearness))
     return nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2  # type: ignore[no-any-return]
+
+
+def _lost(seen: CrossedObservation) -> Mask:
+    """Pixels (h, w) at which one of the carriers is not to be seen."""
+    bright = np.maximum(seen.fit.brightness, 0.5)
+    shares = [modulation / (weight * bright) for modulation, weight in zip(seen.modulation, seen.carriers.weights, strict=True)]
+    return np.minimum(*shares) < LOST_SHARE * max(seen.contrast) / max(seen.carriers.weights)  # type: ignore[no-any-return]

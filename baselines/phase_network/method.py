@@ -45,11 +45,11 @@ def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
     return write_file(path, PHASE_NETWORKS, config, tensors)
 
 
-def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True) -> NetFile:
-    """Configuration and network of shipped weights or of a file, float32; ``folded``: for inference alone
+def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, shipped: Path = SHIPPED) -> NetFile:
+    """Configuration and network of weights in the folder ``shipped`` or of a file, float32; ``folded``: for inference alone
     (`PhaseNet.folded`), False to train on. `WeightsError` for a file that is absent, damaged, of another kind or
     version, or whose tensors do not fit its configuration."""
-    path = weights_path(name_or_path, SHIPPED)
+    path = weights_path(name_or_path, shipped)
     shown = printable(str(path), 500)
     config, tensors, digest = read_file(path, PHASE_NETWORKS)
     try:

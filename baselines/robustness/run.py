@@ -33,12 +33,14 @@ Work = tuple[Method, Condition, FrameCache, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Setup:
-    """A method on a set. ``quick``: one view of each object and three severities, for a look."""
+    """A method on a set. ``quick``: one view of each object and three severities, for a look; ``rig``: one of
+    `optics.NAMED_RIGS`, which projects what the method needs."""
 
     method: Method
     set_name: SetName
     size: int
     quick: bool = False
+    rig: str = "paper"
 
     def __post_init__(self) -> None:
         if self.method.units != "mm":
@@ -61,7 +63,7 @@ class Setup:
         return [CLEAN, *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames))]
 
     def conditions(self, axis: str) -> list[Condition]:
-        return conditions_of(axis, self.severities, self.set_name, self.size)
+        return conditions_of(axis, self.severities, self.set_name, self.size, self.rig)
 
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""

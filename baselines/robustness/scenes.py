@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.robustness.scores import Truth
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics import NAMED_RIGS
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
 LIMIT_BYTES = 10_000_000_000
@@ -31,31 +31,35 @@ Frames = list[NDArray[np.uint8] | None]
 
 @dataclass(frozen=True)
 class Condition:
-    """An axis at a severity, 1 to 5, for the objects ``objects`` seen at ``size`` px; severity 0 is the clean scene."""
+    """An axis at a severity, 1 to 5, for the objects ``objects`` seen at ``size`` px; severity 0 is the clean scene.
+    ``rig``: one of `optics.NAMED_RIGS`."""
 
     axis: str
     severity: int
     objects: tuple[str, ...]
     size: int
+    rig: str = "paper"
 
     @property
     def settings(self) -> BuildSettings:
         rules = corruptions()
         light = rules.clean if self.axis == CLEAN else rules.axes[self.axis].light(rules.clean, self.severity)
-        return BuildSettings(rig=paper_rig(self.size), objects=self.objects, light=light)
+        return BuildSettings(rig=NAMED_RIGS[self.rig](self.size), objects=self.objects, light=light)
 
     def key(self, frames: Sequence[int]) -> str:
         """Name of the condition's folder. Where the object moves, each frame's place depends on which are captured."""
         return f"{self.axis}-{self.severity}-{_digest(self, tuple(frames))}"
 
 
-def conditions_of(axis: str, severities: Sequence[int], set_name: SetName, size: int) -> list[Condition]:
+def conditions_of(
+    axis: str, severities: Sequence[int], set_name: SetName, size: int, rig: str = "paper"
+) -> list[Condition]:
     """The conditions of an axis of `corruptions`, or of `CLEAN`, on the objects of a set of `SETS` that it disturbs."""
     objects = tuple(SETS[set_name])
     if axis == CLEAN:
-        return [Condition(CLEAN, 0, objects, size)]
+        return [Condition(CLEAN, 0, objects, size, rig)]
     disturbed = corruptions().axes[axis].seen_on(objects)
-    return [Condition(axis, severity, disturbed, size) for severity in severities]
+    return [Condition(axis, severity, disturbed, size, rig) for severity in severities]
 
 
 class FrameCache:

@@ -12,8 +12,9 @@ from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
-    "(single-shot phase; order, mask and correction learned), constant (looks at nothing), the name of weights that "
-    "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
+    "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, nothing "
+    "learned), crossed-net (the same, with order, mask and correction learned), constant (looks at nothing), the name "
+    "of weights that come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
@@ -29,6 +30,8 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
         "mask",
     ),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
+    "crossed": ("min_confidence", "mask"),
+    "crossed-net": ("min_confidence", "weights"),
     "constant": ("at",),
     "trained networks": ("depth_range", "frame", "device"),
 }
@@ -49,7 +52,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--depth-noise", type=float, metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
     )  # fmt: skip
-    add = parser.add_argument_group("phase and phase-net").add_argument
+    add = parser.add_argument_group("phase, phase-net, crossed and crossed-net").add_argument
     add("--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)")
     add("--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)")
     add("--error-mm", type=float, metavar="MM",
@@ -68,12 +71,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
              "image's darkest)")  # fmt: skip
     add("--mask", metavar="FILE",
-        help="object mask of phase: an image of the frames' size, above 0 on the object in every sample (default: "
+        help="object mask of phase or crossed: an image of the frames' size, above 0 on the object in every sample (default: "
              "found in each image)")  # fmt: skip
     add(
         "--weights",
         metavar="FILE",
-        help="weights of phase-net: a file, such as training writes (default: those that come with the package)",
+        help="weights of phase-net or crossed-net: a file, such as training writes (default: those that come with the package)",
     )
     add = parser.add_argument_group("constant").add_argument
     add("--at", metavar="DEPTH", help="standoff, middle (of the range), training-mean, or mm (default: standoff)")
@@ -205,6 +208,14 @@ def _phase_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]
     return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
 
 
+def _crossed(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    return _given(min_confidence=args.min_confidence, mask=args.mask)
+
+
+def _crossed_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    return _given(min_confidence=args.min_confidence, weights=args.weights, threads=args.threads)
+
+
 def _given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
@@ -213,4 +224,7 @@ def _constant(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     return _given(at=args.at)
 
 
-_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net, "constant": _constant}
+_MAKERS = {
+    "classical": _classical, "phase": _phase, "phase-net": _phase_net, "crossed": _crossed, "crossed-net": _crossed_net,
+    "constant": _constant,
+}  # fmt: skip

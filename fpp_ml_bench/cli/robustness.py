@@ -28,6 +28,9 @@ EXAMPLES = (
     "fpp-bench robustness unet-global-rmse --size 224 --out robustness-224",
 )
 
+CROSSED = "crossed", "crossed-net"
+"""Methods whose scenes are photographed by the rig that projects crossed fringes."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
@@ -57,11 +60,12 @@ def run(args: argparse.Namespace) -> int:
     names = [name.strip() for name in args.axes.split(",") if name.strip()]
     if args.into is not None and (names or args.quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    method = chosen_method(args, Scenes.of(args.objects, args.size), warn=False)
+    rig = "crossed" if args.method in CROSSED else "paper"
+    method = chosen_method(args, Scenes.of(args.objects, args.size, rig), warn=False)
     entry = None if args.into is None else read_entry(args.into)
     if entry is not None:
         check_same_method(entry, method)
-    setup = robustness.Setup(method, args.objects, args.size, args.quick)
+    setup = robustness.Setup(method, args.objects, args.size, args.quick, rig)
     folder, cache = args.out / slug(setup), None if args.no_cache else args.cache or robustness.CACHE
     views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(names) for c in setup.conditions(axis))
     with progress_bar(f"{args.method}, {args.objects}", views, "views") as advance:
@@ -82,8 +86,8 @@ class Scenes:
     settings: "render.BuildSettings"
 
     @classmethod
-    def of(cls, objects: "robustness.SetName", size: int) -> "Scenes":
-        return cls(robustness.Condition(robustness.CLEAN, 0, tuple(robustness.SETS[objects]), size).settings)
+    def of(cls, objects: "robustness.SetName", size: int, rig: str) -> "Scenes":
+        return cls(robustness.Condition(robustness.CLEAN, 0, tuple(robustness.SETS[objects]), size, rig).settings)
 
     path = Path("the robustness scenes")
 

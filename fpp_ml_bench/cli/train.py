@@ -3,14 +3,16 @@
 import argparse
 from pathlib import Path
 
-from fpp_ml_bench.baselines import networks, phase_network, training
+from fpp_ml_bench.baselines import crossed_network, networks, phase_network, training
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.machine import usable_cores
 
 SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
 EXAMPLES = (
     "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
     "fpp-bench train phase-net data/full --out runs/phase-net      the network of the phase route",
+    "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; it renders its own views",
     "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
@@ -19,18 +21,20 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or phase-net")
-    add("dataset", type=Path, metavar="DATASET", help="dataset folder, of the preset's image size")
+    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, phase-net, or "
+        "crossed-net")  # fmt: skip
+    add("dataset", type=Path, metavar="DATASET", nargs="?",
+        help="dataset folder, of the preset's image size (crossed-net: none, it renders its own views)")  # fmt: skip
     add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
     add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
     add("--minutes", type=float, metavar="M",
         help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
     add("--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added")
-    add("--steps", type=int, metavar="N", help="phase-net: training steps (default: as the shipped weights)")
+    add("--steps", type=int, metavar="N", help="phase-net and crossed-net: training steps (default: as the shipped weights)")
     add("--unions", type=int, metavar="N",
-        help="phase-net: images that join several objects, made from each sample (default: as the shipped weights)",
+        help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
     )  # fmt: skip
-    add("--rate", type=float, metavar="R", help="phase-net: largest learning rate (default: as the shipped weights)")
+    add("--rate", type=float, metavar="R", help="the same: largest learning rate (default: as the shipped weights)")
     add("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
@@ -38,6 +42,10 @@ def run(args: argparse.Namespace) -> int:
     """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
+    if args.recipe == "crossed-net":
+        return _crossed_net(args)
+    if args.dataset is None:
+        raise RecipeError(f"{args.recipe}: expected a dataset folder to train on, got none")
     if args.recipe == "phase-net":
         return _phase_net(args)
     for option in ("extra", "start", "steps", "unions", "rate"):
@@ -79,4 +87,26 @@ def _phase_net(args: argparse.Namespace) -> int:
     scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
     print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
     print(f"next: fpp-bench predict phase-net {args.dataset} --weights {trained.weights} --out predictions")
+    return 0
+
+
+def _crossed_net(args: argparse.Namespace) -> int:
+    import cv2
+
+    for option in ("dataset", "extra", "start"):
+        if getattr(args, option) is not None:
+            raise RecipeError(f"{option}: crossed-net renders what it learns from, and takes none; leave it out")
+    cv2.setNumThreads(1)
+    given = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
+    recipe = crossed_network.CrossedRecipe(**given)
+    trained = crossed_network.train_crossed_net(
+        recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
+    )  # fmt: skip
+    if trained.weights is None:
+        done = f"{trained.steps} of {recipe.steps} steps"
+        print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")
+        return CHECK_FAILED
+    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
+    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
+    print(f"next: fpp-bench predict crossed-net DATASET --weights {trained.weights} --out predictions")
     return 0

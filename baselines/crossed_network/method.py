@@ -1,0 +1,75 @@
+"""crossed-net as a method of ``fpp-bench predict``: one crossed frame, metric depth, nothing told."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
+from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute
+from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, Settings, crossed_image, frames_of
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.baselines.networks import torch_threads
+from fpp_ml_bench.baselines.phase_network import NetFile, load_net
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.optics import Rig
+
+SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
+DEFAULT = "crossed-net"
+PERIOD_TOLERANCE = 2.2
+"""Factor by which the fringe period in image px may differ from that of the training views."""
+
+
+class CrossedNetMethod(Method):
+    """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
+    fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
+    `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
+
+    name = "crossed-net"
+    packages = ("numpy", "numba", "torch")
+
+    def __init__(
+        self, rig: Rig, weights: str | Path | NetFile = DEFAULT, min_confidence: float = 0.0, threads: int = 1,
+    ) -> None:  # fmt: skip
+        self.file = weights if isinstance(weights, NetFile) else load_net(weights, shipped=SHIPPED)
+        config = self.file.config
+        if self.file.network.options["channels"] != len(CHANNELS) or "crossed" not in config.period_px:
+            raise PredictionError(
+                f"{self.file.path}: learned from {', '.join(config.period_px)} fringes, not from crossed ones; use "
+                "weights that fpp-bench train crossed-net wrote"
+            )
+        self.rig, self.threads, self.frames_used = rig, threads, frames_of(rig, self.name)
+        self.route = CrossedNetRoute(
+            rig, self.file.network, config.threshold, config.lead, Settings(min_confidence)
+        )  # fmt: skip
+        learned_px, seen_px = config.period_px["crossed"], self.route.route.carriers.period_px
+        if not learned_px / PERIOD_TOLERANCE <= seen_px <= learned_px * PERIOD_TOLERANCE:
+            raise PredictionError(
+                f"{self.file.path}: learned from crossed fringes of {learned_px:.1f} image px a period, and this rig's "
+                f"have {seen_px:.1f}; use the measured route (crossed), or train for this rig"
+            )
+        self.weights_config = config
+        self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
+        made = "" if len(self.frames_used) == 1 else ", the mean of two"
+        more = "" if config.name == DEFAULT else f" ({config.name})"
+        self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{more}"
+        self.settings = {
+            "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold, "order_lead": config.lead, "threads": threads,
+        }  # fmt: skip
+
+    def measure(self, frames: Frames) -> CrossedMeasurement:
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        with torch_threads(self.threads):
+            return self.route.measure(crossed_image(frames, self.frames_used))
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        return self.route.route.observe(crossed_image(frames, self.frames_used)).carriers.crop
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm
+
+    def answer(self, frames: Frames) -> Answer:
+        measurement = self.measure(frames)
+        return Answer(measurement.depth_mm, measurement.sigma_mm)

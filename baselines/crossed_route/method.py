@@ -1,0 +1,72 @@
+"""The crossed route as a method of ``fpp-bench predict``: one frame, nothing learned, nothing told."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, Settings
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.coding import crossed_from_pair
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.loaders.captures import read_mask
+from fpp_ml_bench.optics import DIRECTIONS, Rig
+
+
+def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
+    """The frames that make one crossed frame: the rig's first crossed one, or the first sinusoid of both directions,
+    whose mean is one. Raises `PredictionError` for a rig without either, in the words of the method ``name``."""
+    if crossed := rig.sequence.crossed_frames:
+        return crossed[:1]
+    if rig.fringe_directions == DIRECTIONS:
+        return tuple(sorted(rig.sequence.sinusoids(direction)[0] for direction in DIRECTIONS))
+    listed = " and ".join(rig.fringe_directions) or "no"
+    raise PredictionError(
+        f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig projects {listed} "
+        "fringes. fpp-bench design proposes crossed fringes for a rig"
+    )
+
+
+def crossed_image(frames: Frames, used: tuple[int, ...]) -> NDArray[np.uint8]:
+    """The crossed frame of a captured sequence; raises `DecodeError` for a frame that is missing."""
+    images = []
+    for index in used:
+        image = frames[index] if index < len(frames) else None
+        if image is None:
+            raise DecodeError(f"frame {index} is missing: the crossed frame is made from frames {used}")
+        images.append(image)
+    return images[0] if len(images) == 1 else crossed_from_pair(images[0], images[1])
+
+
+class CrossedMethod(Method):
+    """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
+    is one. ``mask``: a file (`captures.read_mask`) that says where the object is in every sample. Raises
+    `PredictionError` for a rig without such frames and for an invalid option, `CaptureError` for a mask that can't be
+    used."""
+
+    name = "crossed"
+
+    def __init__(self, rig: Rig, min_confidence: float = 0.0, mask: str | Path | None = None) -> None:
+        self.rig, self.frames_used = rig, frames_of(rig, self.name)
+        self.route = CrossedRoute(rig, Settings(min_confidence))
+        pitches = " and ".join(f"{pitch:g}" for pitch in self.route.family.pitches_px)
+        made = "" if len(self.frames_used) == 1 else ", the mean of two"
+        self.title = f"Crossed fringes of {pitches} px, one frame{made}, nothing learned"
+        self.mask = None if mask is None else read_mask(Path(mask), (rig.camera.height, rig.camera.width))
+        self.settings = {"min_confidence": min_confidence} | ({} if mask is None else {"mask": Path(mask).name})
+
+    def measure(self, frames: Frames) -> CrossedMeasurement:
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        return self.route.measure(crossed_image(frames, self.frames_used), self.mask)
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        return self.route.observe(crossed_image(frames, self.frames_used), self.mask).carriers.crop
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm
+
+    def answer(self, frames: Frames) -> Answer:
+        measurement = self.measure(frames)
+        return Answer(measurement.depth_mm, measurement.sigma_mm)
