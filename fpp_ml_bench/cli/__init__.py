@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "import": ("import_tree", "read a published tree, or a scanner's captures, into the same dataset format"),
     "calibrate": ("calibrate", "find the rig that took captures, from frames and their depth"),
     "patterns": ("patterns", "write the images to project, for any sequence"),
+    "design": ("design", "find two carriers for crossed fringes whose phases leave one order"),
     "decode": ("decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
     "info": ("info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
     "verify": ("verify", "check a dataset: checksums, missing and foreign files, split leaks"),

@@ -10,6 +10,7 @@ from .coordinates import STAGE_REASONS as STAGE_REASONS
 from .coordinates import Coordinates as Coordinates
 from .coordinates import Limits as Limits
 from .coordinates import Reason as Reason
+from .crossed import LEAST_ANGLE_DEG as LEAST_ANGLE_DEG
 from .crossed import Crossed as Crossed
 from .crossed import crossed_from_pair as crossed_from_pair
 from .gray_code import AMBIGUOUS_FRACTION as AMBIGUOUS_FRACTION

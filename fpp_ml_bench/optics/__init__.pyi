@@ -1,4 +1,5 @@
 from .named_rigs import CROSSED as CROSSED
+from .named_rigs import FIRST_SHIFTED_DEG as FIRST_SHIFTED_DEG
 from .named_rigs import NAMED_RIGS as NAMED_RIGS
 from .named_rigs import crossed_rig as crossed_rig
 from .named_rigs import paper_rig as paper_rig

@@ -1,16 +1,15 @@
 """The rigs that this package names: the paper's, and the same with crossed fringes."""
 
-from dataclasses import replace
-
 from fpp_ml_bench.coding import Crossed
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import CodedSequence
 
-CROSSED = Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=((0.0, 0.0), (120.0, 0.0), (240.0, 0.0)))
-"""The crossed rig's frames: the first is the single shot; the three together shift the first carrier and keep the
-second still, so that the first is also measured pixel by pixel, and their mean holds the second."""
+FIRST_SHIFTED_DEG = ((0.0, 0.0), (120.0, 0.0), (240.0, 0.0))
+"""Phase shifts of three crossed frames: the first is the single shot; the three together shift the first carrier and
+keep the second still, so that the first is also measured pixel by pixel, and their mean holds the second."""
+CROSSED = Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=FIRST_SHIFTED_DEG)
+"""The crossed rig's frames."""
 
 
 def paper_rig(size: int = FULL_SIZE) -> Rig:
@@ -25,10 +24,7 @@ def paper_rig(size: int = FULL_SIZE) -> Rig:
 
 def crossed_rig(size: int = FULL_SIZE) -> Rig:
     """The paper's rig with the frames of `CROSSED` before its own, from which the ground truth is decoded."""
-    rig = paper_rig(size)
-    horizontal, vertical = rig.code("horizontal"), rig.code("vertical")
-    order = ("crossed", "horizontal", "vertical", "black", "white")
-    return replace(rig, sequence=CodedSequence(horizontal, vertical, order, CROSSED))
+    return paper_rig(size).with_crossed(CROSSED)
 
 
 NAMED_RIGS = {"paper": paper_rig, "crossed": crossed_rig}

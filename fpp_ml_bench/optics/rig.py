@@ -205,6 +205,16 @@ class Rig:
         """The rig with a camera image ``size`` px wide; the projector, and with it the ambiguity, stays as it is."""
         return replace(self, camera=self.camera.scaled(size))
 
+    def with_crossed(self, crossed: Crossed) -> "Rig":
+        """The rig with the frames of ``crossed`` before its own; with others in place of its crossed frames."""
+        own = self.sequence
+        if isinstance(own, CodedSequence):
+            order = ("crossed", *(name for name in own.order if name != "crossed"))
+            return replace(self, sequence=replace(own, order=order, crossed=crossed))
+        horizontal, vertical = (self.code(direction) for direction in DIRECTIONS)
+        order = ("crossed", "horizontal", "vertical", "black", "white")
+        return replace(self, sequence=CodedSequence(horizontal, vertical, order, crossed))
+
     def project(self, points_m: ArrayLike) -> Maps:
         """Projector pixels (u_p, v_p) of points (..., 3) in the CAMERA's frame, metres; NaN behind the projector."""
         points = np.asarray(points_m, dtype=np.float64)
@@ -257,15 +267,20 @@ class Rig:
         left, right = (self._central_coordinate(direction, self.standoff_m, s)[0] for s in (-0.5, 0.5))
         return projector_px / change if (change := abs(float(right - left))) > 0 else math.inf
 
-    def image_px_of_carrier(self, cycles_per_px: tuple[float, float]) -> float:
-        """Image px that a period of crossed fringes covers, across them, as `image_px_per_period` for their frequency
-        (f_u, f_v) in cycles per projector px: of the pattern on a plane, whichever way the image turns it."""
+    def image_frequency(self, cycles_per_px: tuple[float, float]) -> tuple[float, float]:
+        """Cycles per image px along the image's columns and rows of a frequency (f_u, f_v) on the pattern, at the image
+        centre on a plane square to the axis at the standoff: a linear map."""
         shifts = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
         beside = np.array([self.camera.width - 1, self.camera.height - 1]) / 2 + shifts
         x, y = self.camera.normalised(beside[:, 0], beside[:, 1])
         u, v = self.project(self.standoff_m * np.column_stack([x, y, np.ones(4)]))
         turns = cycles_per_px[0] * u + cycles_per_px[1] * v
-        cycles = math.hypot(float(turns[1] - turns[0]), float(turns[3] - turns[2]))
+        return float(turns[1] - turns[0]), float(turns[3] - turns[2])
+
+    def image_px_of_carrier(self, cycles_per_px: tuple[float, float]) -> float:
+        """Image px that a period of crossed fringes covers, across them, as `image_px_per_period` for the direction of
+        their frequency, `Crossed.cycles_per_px`."""
+        cycles = math.hypot(*self.image_frequency(cycles_per_px))
         return 1 / cycles if cycles > 0 else math.inf
 
     def check_sampling(self) -> None:

@@ -1,0 +1,5 @@
+"""The design of crossed fringes: which periods and angles leave one order."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

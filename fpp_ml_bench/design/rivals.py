@@ -1,0 +1,77 @@
+"""Rivals of the true order: other depths at which two wrapped phases are nearly the same.
+
+Over the working range a pixel's pair of phases runs along a line on the torus and winds around it. A rival is another
+turn of that line. Unwrapped, the pair grows from 0 to ``turns`` (two numbers), and the rivals of a depth are the
+points (m, n) of the whole numbers but (0, 0), as near as the line comes to them.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+TAU = 2 * math.pi
+
+
+def nearest(
+    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float, own: bool = False
+) -> NDArray[np.float64]:
+    """Distance in rad from the line ``turns`` x place, place from ``low`` to ``high``, to the nearest whole numbers
+    (m, n); with ``own`` (0, 0) counts too. ``turns`` float64 (..., 2), ``low`` and ``high`` that broadcast to (...);
+    returns (...)."""
+    least = np.full(np.broadcast_shapes(turns.shape[:-1], np.shape(low), np.shape(high)), np.inf)
+    for m, n in _orders(turns, low, high):
+        if own or (m, n) != (0, 0):
+            np.minimum(least, distance(turns, m, n, low, high), out=least)
+    return least
+
+
+def distance(
+    turns: NDArray[np.float64], m: int, n: int, low: NDArray[np.float64] | float, high: NDArray[np.float64] | float
+) -> NDArray[np.float64]:
+    """Distance in rad of (m, n) from the line, as in `nearest`."""
+    first, second = turns[..., 0], turns[..., 1]
+    square = np.maximum(first * first + second * second, np.finfo(np.float64).tiny)
+    place = np.clip((m * first + n * second) / square, low, high)
+    return TAU * np.hypot(m - first * place, n - second * place)  # type: ignore[no-any-return]
+
+
+def rival_distance(turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance in rad of the nearest rival of any depth in the range, for ``turns`` (..., 2): what an error of the two
+    phases must cross half of to choose a wrong order."""
+    return nearest(turns, 0.0, 1.0)
+
+
+def background_distance(turns: NDArray[np.float64], background: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance in rad of the background's phases from those of every depth in the range; ``background``: its place on
+    the line (`EpipolarLines`), which broadcasts to (...)."""
+    return nearest(turns, background - 1.0, background, own=True)
+
+
+def wrong_order_rate(
+    turns: NDArray[np.float64], phase_sigma: float, surfaces: tuple[float, float] = (0.0, 1.0)
+) -> NDArray[np.float64]:
+    """Expected share of pixels with a wrong order, for ``turns`` (..., 2), where no neighbour helps: the mean over
+    depths at ``surfaces`` of the range (places on the line, evenly) and the sum over rivals.
+
+    Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy tails: across the line
+    they are taken as two-sided exponential with a standard deviation of ``phase_sigma`` rad. A rival at distance d is
+    chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
+    """
+    places = np.linspace(*surfaces, 41)
+    low, high = -places, 1.0 - places
+    line = turns[..., None, :]
+    total = np.zeros(np.broadcast_shapes(line.shape[:-1], places.shape))
+    for m, n in _orders(turns, -1.0, 1.0):
+        if (m, n) != (0, 0):
+            total += np.exp(-math.sqrt(2) * distance(line, m, n, low, high) / (2 * phase_sigma)) / 2
+    return np.minimum(total, 1.0).mean(axis=-1)  # type: ignore[no-any-return]
+
+
+def _orders(
+    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float
+) -> list[tuple[int, int]]:
+    """All (m, n) that the line may come near to."""
+    reach = float(max(np.max(np.abs(low)), np.max(np.abs(high))))
+    first, second = (math.ceil(reach * float(np.abs(turns[..., k]).max())) + 1 for k in (0, 1))
+    return [(m, n) for m in range(-first, first + 1) for n in range(-second, second + 1)]

@@ -1,0 +1,226 @@
+"""The search for two carriers: every pair of periods and angles within limits, what it costs, and the one to take."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding import LEAST_ANGLE_DEG, Crossed
+from fpp_ml_bench.design.epipolar import EpipolarLines
+from fpp_ml_bench.design.rivals import TAU, background_distance, rival_distance, wrong_order_rate
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.optics import Rig
+
+ANGLES_DEG = tuple(float(angle) for angle in range(0, 180, 15))
+FLAT_TURNS = 0.05
+"""A carrier that turns less over the whole range tells no depth."""
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """What the figures of a pair rest on.
+
+    ``image_px``: shortest and longest period in the image; the longest also of the beats of the two carriers, since a
+    window must tell their spectra from each other and from the mean light. ``phase_sigma``: error of a phase from a
+    single frame in rad, with edges, texture and the other carrier in it; it decides orders. ``noise_grey``: the
+    camera's noise, which alone decides the depth noise on smooth surfaces, with ``white_grey``, the grey level of white
+    at the near end (falling with the square of the distance), and a Gaussian window of ``window_px`` (sigma, image px).
+    ``surfaces_mm``: where surfaces are expected, None for anywhere in the range; a rival may be anywhere in it.
+    ``wrong_share``: the share of wrong orders that may be left to the neighbours.
+    """
+
+    image_px: tuple[float, float] = (10.0, 40.0)
+    phase_sigma: float = 0.2
+    noise_grey: float = 1.0
+    white_grey: float = 180.0
+    window_px: float = 6.0
+    surfaces_mm: tuple[float, float] | None = None
+    wrong_share: float = 0.001
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Two carriers and what is expected of them.
+
+    ``rival_rad``: distance of the nearest rival order. ``background_rad``: of the background plane, None where none is
+    known. ``noise_mm``: depth noise at the far end. ``wrong_share``: expected share of wrong orders before neighbours
+    help. ``image_px``: periods in the image. ``turns``: periods that the carriers cross over the range, the most of any
+    pixel.
+    """
+
+    crossed: Crossed
+    rival_rad: float
+    background_rad: float | None
+    noise_mm: float
+    wrong_share: float
+    image_px: tuple[float, float]
+    turns: tuple[float, float]
+
+    @property
+    def clearance_rad(self) -> float:
+        """The lesser of the distances from rivals and background."""
+        return self.rival_rad if self.background_rad is None else min(self.rival_rad, self.background_rad)
+
+    @property
+    def flat(self) -> tuple[int, ...]:
+        """Carriers, 0 or 1, that run along the epipolar lines and tell no depth."""
+        return tuple(k for k in (0, 1) if self.turns[k] < FLAT_TURNS)
+
+
+@dataclass(frozen=True)
+class Design:
+    """The outcome of a search over ``searched`` pairs: those that no other beats in both clearance and depth noise
+    (``front``, the largest clearance first), and the one ``proposed`` with its ``reason``."""
+
+    proposed: Candidate
+    reason: str
+    front: tuple[Candidate, ...]
+    searched: int
+
+
+def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> list[Candidate]:
+    """The figures of ``families`` on ``rig``, whatever their periods are. Raises `RigError` where no pixel sees the
+    pattern."""
+    if not families:
+        return []
+    lines = EpipolarLines.of(rig)
+    turns = np.stack([lines.turns(family) for family in families])
+    rival, background = _distances(turns, lines)
+    near_mm, far_mm = lines.range_mm
+    surfaces = lines.places(np.array(assumed.surfaces_mm or (near_mm, far_mm)))
+    if not (surfaces[0] < surfaces[1] and surfaces[0] >= -1e-9 and surfaces[1] <= 1 + 1e-9):
+        raise RigError(f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm")
+    wrong = wrong_order_rate(turns, assumed.phase_sigma, (float(surfaces[0]), float(surfaces[1]))).max(axis=-1)
+    noise = _depth_noise_mm(lines, families, assumed)
+    found = []
+    for number, family in enumerate(families):
+        first, second = (rig.image_px_of_carrier(cycles) for cycles in family.cycles_per_px)
+        most = np.abs(turns[number]).max(axis=0)
+        distance = None if background is None else float(background[number])
+        found.append(
+            Candidate(
+                family, float(rival[number]), distance, float(noise[number]), float(wrong[number]), (first, second),
+                (float(most[0]), float(most[1])),
+            )
+        )  # fmt: skip
+    return found
+
+
+def search(
+    rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = None,
+    angles_deg: Iterable[float] = ANGLES_DEG,
+) -> Design:  # fmt: skip
+    """The best pairs of carriers out of all ``pitches_px`` (by default all whole numbers that the image can hold) and
+    ``angles_deg``. Proposed is the one with the least depth noise of those with few enough wrong orders. Raises
+    `RigError` where the limits leave none."""
+    carriers = _carriers(rig, assumed, pitches_px, angles_deg)
+    pairs = _apart(rig, carriers, assumed)
+    if not len(pairs):
+        raise RigError(
+            f"no two of {len(carriers)} carriers have periods and beats of {assumed.image_px[0]:g} to "
+            f"{assumed.image_px[1]:g} px in an image of {rig.camera.width} x {rig.camera.height} px; give other "
+            "--pitches and --angles, or wider limits (--image-px)"
+        )
+    lines = EpipolarLines.of(rig)
+    own = np.stack([lines.across_px @ cycles for cycles in _cycles(carriers)])  # (carriers, lines)
+    clearance = np.concatenate([
+        np.minimum.reduce([part for part in _distances(own[pairs[start : start + _CHUNK]].swapaxes(1, 2), lines)
+                           if part is not None])
+        for start in range(0, len(pairs), _CHUNK)
+    ])  # fmt: skip
+    slopes = np.stack([lines.far_px_per_mm @ cycles for cycles in _cycles(carriers)])
+    noise = _noise_of_slopes(slopes[pairs].swapaxes(1, 2), lines, np.array([0.5, 0.5]), assumed)
+    families = [_family(carriers, pairs[index]) for index in _front(clearance, noise)]
+    front = tuple(describe(rig, families, assumed))
+    limit = f"{100 * assumed.wrong_share:g}% wrong orders"
+    few = [candidate for candidate in front if candidate.wrong_share <= assumed.wrong_share]
+    if few:
+        return Design(few[-1], f"the least depth noise of those with at most {limit}", front, len(pairs))
+    return Design(front[0], f"none has at most {limit}; the largest distance", front, len(pairs))
+
+
+def _carriers(
+    rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None, angles_deg: Iterable[float]
+) -> list[tuple[float, float]]:
+    """Period and angle of every carrier whose period in the image is within the limits."""
+    carriers = []
+    for angle in sorted({float(angle) % 180.0 for angle in angles_deg}):
+        (cycles, _) = Crossed((10.0, 10.0), (angle, angle + 90.0)).cycles_per_px
+        per_px = rig.image_px_of_carrier(cycles) / 10.0
+        if not math.isfinite(per_px):
+            continue
+        least, most = (limit / per_px for limit in assumed.image_px)
+        longest = math.hypot(rig.projector.width, rig.projector.height)
+        if pitches_px is None:
+            pitches = [float(pitch) for pitch in range(max(math.ceil(least), 4), int(min(most, longest)) + 1)]
+        else:
+            pitches = [float(pitch) for pitch in pitches_px if least <= pitch <= most]
+        carriers += [(pitch, angle) for pitch in sorted(set(pitches))]
+    return carriers
+
+
+def _cycles(carriers: list[tuple[float, float]]) -> NDArray[np.float64]:
+    turned = np.radians([angle for _, angle in carriers])
+    pitches = np.array([pitch for pitch, _ in carriers])
+    return np.column_stack([np.sin(turned), np.cos(turned)]) / pitches[:, None]
+
+
+def _apart(rig: Rig, carriers: list[tuple[float, float]], assumed: Assumptions) -> NDArray[np.intp]:
+    """Indices of pairs of carriers that can be told apart in the image, (n, 2)."""
+    pairs = np.array(list(combinations(range(len(carriers)), 2)), dtype=np.intp).reshape(-1, 2)
+    if not len(pairs):
+        return pairs
+    # The pattern's frequencies in the image are a linear map of those on the projector.
+    columns = [rig.image_frequency(unit) for unit in ((1.0, 0.0), (0.0, 1.0))]
+    cycles = _cycles(carriers) @ np.array(columns)
+    first, second = cycles[pairs[:, 0]], cycles[pairs[:, 1]]
+    least = 1.0 / assumed.image_px[1]
+    apart = [np.hypot(*(first + sign * second).T) >= least for sign in (1, -1)]
+    angles = np.array([angle for _, angle in carriers])[pairs]
+    across = np.abs((angles[:, 0] - angles[:, 1] + 90.0) % 180.0 - 90.0) >= LEAST_ANGLE_DEG
+    return pairs[apart[0] & apart[1] & across]
+
+
+def _family(carriers: list[tuple[float, float]], pair: NDArray[np.intp]) -> Crossed:
+    (first_px, first_deg), (second_px, second_deg) = (carriers[index] for index in pair)
+    return Crossed((first_px, second_px), (first_deg, second_deg))
+
+
+def _distances(
+    turns: NDArray[np.float64], lines: EpipolarLines
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Rival and background distance of ``turns`` (K, n, 2), the least over the lines; (K,) each."""
+    rival = rival_distance(turns).min(axis=1)
+    return rival, None if lines.background is None else background_distance(turns, lines.background).min(axis=1)
+
+
+def _depth_noise_mm(lines: EpipolarLines, families: Sequence[Crossed], assumed: Assumptions) -> NDArray[np.float64]:
+    slopes = np.stack([lines.far_px_per_mm @ np.array(family.cycles_per_px).T for family in families])
+    weights = np.array([family.weights for family in families])[:, None, :]
+    return _noise_of_slopes(slopes, lines, weights, assumed)
+
+
+def _noise_of_slopes(
+    slopes: NDArray[np.float64], lines: EpipolarLines, weights: NDArray[np.float64], assumed: Assumptions
+) -> NDArray[np.float64]:
+    """Depth noise at the far end, the most over the lines, of both carriers together; ``slopes`` (K, n, 2) in turns per
+    mm. A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))`` at noise s and modulation B."""
+    near_mm, far_mm = lines.range_mm
+    modulation = weights * assumed.white_grey / 2 * (near_mm / far_mm) ** 2
+    phase_noise = assumed.noise_grey / (modulation * assumed.window_px * math.sqrt(TAU))
+    precision = ((TAU * slopes / phase_noise) ** 2).sum(axis=-1)
+    with np.errstate(divide="ignore"):
+        return (1.0 / np.sqrt(precision)).max(axis=-1)  # type: ignore[no-any-return]
+
+
+def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[int]:
+    """Indices of the pairs that no other beats in both, the largest clearance first."""
+    front: list[int] = []
+    for index in np.lexsort((noise, -clearance)).tolist():
+        if not front or noise[index] < noise[front[-1]] * (1 - 1e-9):
+            front.append(index)
+    return front
