@@ -11,13 +11,15 @@ from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, Settings, c
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks import torch_threads
 from fpp_ml_bench.baselines.phase_network import NetFile, load_net
+from fpp_ml_bench.baselines.phase_route import Periods
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "crossed-net"
 PERIOD_TOLERANCE = 2.2
-"""Factor by which the fringe period in image px may differ from that of the training views."""
+"""Factor by which the fringe period in image px may differ from that of the training views; beyond, the image is
+resampled to theirs."""
 
 
 class CrossedNetMethod(Method):
@@ -39,15 +41,11 @@ class CrossedNetMethod(Method):
                 "weights that fpp-bench train crossed-net wrote"
             )
         self.rig, self.threads, self.frames_used = rig, threads, frames_of(rig, self.name)
+        learned_px = config.period_px["crossed"]
+        periods = Periods(learned_px / PERIOD_TOLERANCE, learned_px, learned_px * PERIOD_TOLERANCE)
         self.route = CrossedNetRoute(
-            rig, self.file.network, config.threshold, config.lead, Settings(min_confidence)
-        )  # fmt: skip
-        learned_px, seen_px = config.period_px["crossed"], self.route.route.carriers.period_px
-        if not learned_px / PERIOD_TOLERANCE <= seen_px <= learned_px * PERIOD_TOLERANCE:
-            raise PredictionError(
-                f"{self.file.path}: learned from crossed fringes of {learned_px:.1f} image px a period, and this rig's "
-                f"have {seen_px:.1f}; use the measured route (crossed), or train for this rig"
-            )
+            rig, self.file.network, config.threshold, config.lead, Settings(min_confidence), periods
+        )
         self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
@@ -64,7 +62,8 @@ class CrossedNetMethod(Method):
             return self.route.measure(crossed_image(frames, self.frames_used))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.route.observe(crossed_image(frames, self.frames_used)).carriers.crop
+        route = self.route.route
+        return route.resampling.captured_crop(route.observe(crossed_image(frames, self.frames_used)).carriers.crop)
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedMeasurement, CrossedObservation, CrossedRoute, Settings
 from fpp_ml_bench.baselines.phase_network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, least_energy, links_between, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, Periods, least_energy, links_between, of_choice, repeated
 from fpp_ml_bench.optics import Rig
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
@@ -82,8 +82,9 @@ class CrossedNetRoute:
 
     def __init__(
         self, rig: Rig, network: PhaseNet, threshold: float, lead: float, settings: Settings | None = None,
+        periods: Periods | None = None,
     ) -> None:  # fmt: skip
-        self.route = CrossedRoute(rig, settings)
+        self.route = CrossedRoute(rig, settings, periods=periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 
     def measure(self, image: NDArray) -> CrossedMeasurement:

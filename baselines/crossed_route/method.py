@@ -61,7 +61,8 @@ class CrossedMethod(Method):
         return self.route.measure(crossed_image(frames, self.frames_used), self.mask)
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.observe(crossed_image(frames, self.frames_used), self.mask).carriers.crop
+        seen = self.route.observe(crossed_image(frames, self.frames_used), self.mask)
+        return self.route.resampling.captured_crop(seen.carriers.crop)
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""

@@ -23,6 +23,8 @@ from fpp_ml_bench.baselines.phase_route import (
     Crop,
     Image,
     Mask,
+    Periods,
+    Resampling,
     Watch,
     Window,
     modulated_region,
@@ -54,12 +56,19 @@ AMBIGUOUS_CHANCE = 0.3  # of a wrong order
 
 
 class CrossedRoute:
-    """The route for one rig and one family of crossed frames (default: the rig's own)."""
+    """The route for one rig and one family of crossed frames (default: the rig's own). Images whose fringe period is
+    beyond ``periods`` are resampled: then `rig` and `carriers` are those of the resampled images, which a
+    `CrossedObservation` is of; images, masks and the `CrossedMeasurement` have the captured size."""
 
-    def __init__(self, rig: Rig, settings: Settings | None = None, family: Crossed | None = None) -> None:
-        self.rig, self.settings = rig, settings or Settings()
+    def __init__(
+        self, rig: Rig, settings: Settings | None = None, family: Crossed | None = None, periods: Periods | None = None,
+    ) -> None:  # fmt: skip
+        self.settings = settings or Settings()
         self.family = family or rig.crossed or Crossed.of_pair(rig)
         rig.check_sampling()
+        seen_px = max(rig.image_px_of_carrier(cycles) for cycles in self.family.cycles_per_px)
+        self.resampling = Resampling.to(rig, seen_px, periods or Periods())
+        self.rig = rig = self.resampling.rig
         self.carriers = Carriers.of(rig, self.family)
         self.stride = stride_of(self.carriers.period_px)
         self.demodulator = Demodulator(self.carriers, self.stride)
@@ -73,6 +82,7 @@ class CrossedRoute:
     def observe(self, image: NDArray, mask: Mask | None = None) -> CrossedObservation:
         """Mask, order and fit of a crossed frame; arguments as of `measure`."""
         grey, watch = self._checked(image), Watch()
+        mask = None if mask is None else self.resampling.mask(mask)
         seen = self.demodulator(grey)
         watch.done("phase")
         background = self._scene(grey, seen)
@@ -162,11 +172,32 @@ class CrossedRoute:
         reasons = paste(reason, np.uint8, CrossedReason.BACKGROUND)
         counts = np.bincount(reasons.ravel(), minlength=len(CrossedReason))
         watch.done("confidence")
-        return CrossedMeasurement(
+        measured = CrossedMeasurement(
             depth_mm=paste(kept), sigma_mm=paste(sigma_mm * (kept > 0)), confidence=paste(confidence),
             wrong_chance=paste(wrong_chance), brightness_grey=paste(fit.brightness), reason=reasons,
             counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
             background_share=seen.background.share, seconds=watch.seconds,
+        )  # fmt: skip
+        return self._restored(measured) if self.resampling.needed else measured
+
+    def _restored(self, measured: CrossedMeasurement) -> CrossedMeasurement:
+        """The measurement in the size of the captured image."""
+        joint, known = self.carriers.joint_gain, measured.depth_mm > 0
+        nearness = np.where(known, self.carriers.nearness(np.where(known, measured.depth_mm, 1000.0)), 0.0)
+        # The joint gain changes slowly over the image: its middle will do as a unit.
+        unit = float(np.median(joint))
+        on_object, psi, nearest = self.resampling.restored_phase((nearness * unit).astype(np.float64), known)
+        depth_mm = Carriers.of(self.resampling.captured, self.family).depth_mm(psi / unit)
+        maps = {
+            name: np.where(on_object, nearest(getattr(measured, name)), 0).astype(np.float32)
+            for name in ("sigma_mm", "confidence", "wrong_chance", "brightness_grey")
+        }
+        size = self.resampling.captured.camera.width, self.resampling.captured.camera.height
+        reason = cv2.resize(measured.reason, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        counts = np.bincount(reason.ravel(), minlength=len(CrossedReason))
+        return replace(
+            measured, depth_mm=np.where(on_object, np.nan_to_num(depth_mm), 0).astype(np.float32), reason=reason,
+            counts={code.name.lower(): int(counts[code]) for code in CrossedReason}, **maps,
         )  # fmt: skip
 
     def _reasons(
@@ -203,7 +234,7 @@ class CrossedRoute:
         return first, second
 
     def _checked(self, image: NDArray) -> Image:
-        camera = self.rig.camera
+        camera = self.resampling.captured.camera
         shape = camera.height, camera.width
         given = np.asarray(image)
         if given.dtype not in (np.uint8, np.float32) or given.shape != shape:
@@ -211,7 +242,7 @@ class CrossedRoute:
                 f"expected a crossed frame of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
                 f"{given.dtype} {given.shape}; use rig.scaled(width) for a resized image"
             )
-        return given.astype(np.float32)
+        return self.resampling.image(given).astype(np.float32)
 
     def _crop(self, region: Mask) -> Crop:
         """The part around ``region``, from a grid point on; a single point where there is no object."""

@@ -40,4 +40,5 @@ from .orders import repeated as repeated
 from .orders import spread_over_pixels as spread_over_pixels
 from .orders import stride_of as stride_of
 from .resampling import Periods as Periods
+from .resampling import Resampling as Resampling
 from .route import PhaseRoute as PhaseRoute

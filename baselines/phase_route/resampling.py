@@ -5,6 +5,7 @@ period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px 
 is lost of a longer period: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,7 +44,12 @@ class Resampling:
     @classmethod
     def of(cls, rig: Rig, direction: Direction, periods: Periods) -> "Resampling":
         """What brings the fringes of ``direction`` into ``periods``."""
-        seen_px, camera = rig.image_px_per_period(direction), rig.camera
+        return cls.to(rig, rig.image_px_per_period(direction), periods)
+
+    @classmethod
+    def to(cls, rig: Rig, seen_px: float, periods: Periods) -> "Resampling":
+        """What brings fringes of ``seen_px`` image px a period into ``periods``."""
+        camera = rig.camera
         if periods.shortest <= seen_px <= periods.longest:
             return cls(rig, rig)
         width, height = (max(1, round(length * periods.best / seen_px)) for length in (camera.width, camera.height))
@@ -90,15 +96,12 @@ class Resampling:
         ]
         return slice(*ends[0]), slice(*ends[1])
 
-    def restored(
-        self, measured: Measurement, layer: CalibrationLayer, captured_layer: CalibrationLayer,
-        range_mm: tuple[float, float],
-    ) -> Measurement:  # fmt: skip
-        """The measurement in the size of the captured image. The residual phase, order included, is interpolated (it
-        has no wraps), but not across jumps; depth, wrapped phase and order follow from it at every pixel of the
-        captured image. The other maps are taken from the nearest pixel. ``range_mm``: the range of the candidates."""
+    def restored_phase(
+        self, psi: NDArray[np.float64], inside: Mask
+    ) -> tuple[Mask, NDArray[np.float64], Callable[[NDArray], NDArray]]:
+        """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the phase (H, W), and
+        how any map is taken from the nearest object pixel. The phase is interpolated, but not across jumps."""
         size = self.captured.camera.width, self.captured.camera.height
-        inside = np.isfinite(measured.wrapped_phase_rad)
         y, x = np.indices(inside.shape)
         if inside.any():
             y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
@@ -107,7 +110,7 @@ class Resampling:
             """From the nearest object pixel."""
             return cv2.resize(image[y, x], size, interpolation=cv2.INTER_NEAREST_EXACT)
 
-        psi = np.where(inside, layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0)
+        psi = np.where(inside, psi, 0.0)
         weight, total = (cv2.resize(v, size, interpolation=cv2.INTER_LINEAR) for v in (inside.astype(np.float64), psi))
         # A pixel that mixes two surfaces takes the phase of the nearest one.
         lowest, highest = (
@@ -116,9 +119,20 @@ class Resampling:
         )
         step = np.subtract(highest, lowest, out=np.zeros_like(psi), where=inside)
         beside_jump = nearest((step > JUMP_RAD).astype(np.uint8)) > 0
-        on_object = weight > 0.5
+        return weight > 0.5, np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)), nearest
+
+    def restored(
+        self, measured: Measurement, layer: CalibrationLayer, captured_layer: CalibrationLayer,
+        range_mm: tuple[float, float],
+    ) -> Measurement:  # fmt: skip
+        """The measurement in the size of the captured image. The residual phase, order included, is interpolated (it
+        has no wraps), but not across jumps; depth, wrapped phase and order follow from it at every pixel of the
+        captured image. The other maps are taken from the nearest pixel. ``range_mm``: the range of the candidates."""
+        inside = np.isfinite(measured.wrapped_phase_rad)
+        psi = np.where(inside, layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0)
+        on_object, phases, nearest = self.restored_phase(psi, inside)
         part = captured_layer.at(on_object)
-        residual = np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6))[on_object]
+        residual = phases[on_object]
         absolute = residual + part.infinity_rad + TAU * part.infinity_order
         order = np.rint(absolute / TAU)
         phase = (absolute - TAU * order).astype(np.float32)
