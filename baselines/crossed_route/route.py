@@ -52,6 +52,7 @@ SATURATED_SHARE = 0.02
 LOST_SHARE, LOST_CHANCE = 0.25, 0.6
 """Share of a carrier's contrast below which it counts as not seen, and the least probability of a wrong order then."""
 TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
+TEXTURE_RAD = 0.5  # distance of both phases from the depth's at which something else than its fringes was seen
 AMBIGUOUS_CHANCE = 0.3  # of a wrong order
 
 
@@ -212,7 +213,8 @@ class CrossedRoute:
             CrossedReason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
             CrossedReason.SATURATED: seen.clipped_share > SATURATED_SHARE,
             CrossedReason.ONE_DIRECTION: _lost(seen),
-            CrossedReason.TEXTURE: np.sqrt(misfit) > TEXTURE_SHARE * bright,
+            CrossedReason.TEXTURE: (np.sqrt(misfit) > TEXTURE_SHARE * bright)
+            | (seen.candidates.misfit_rad[1] > TEXTURE_RAD),
             CrossedReason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
             CrossedReason.UNSURE: confidence < self.settings.min_confidence,
         }
@@ -264,5 +266,7 @@ def _lifted(carriers: Carriers, phase_rad: Image, nearness: NDArray) -> NDArray:
 def _lost(seen: CrossedObservation) -> Mask:
     """Pixels (h, w) at which one of the carriers is not to be seen."""
     bright = np.maximum(seen.fit.brightness, 0.5)
-    shares = [modulation / (weight * bright) for modulation, weight in zip(seen.modulation, seen.carriers.weights, strict=True)]
+    pairs = zip(seen.modulation, seen.carriers.weights, strict=True)
+    shares = [modulation / (weight * bright) for modulation, weight in pairs]
     return np.minimum(*shares) < LOST_SHARE * max(seen.contrast) / max(seen.carriers.weights)  # type: ignore[no-any-return]
+

@@ -34,6 +34,7 @@ U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 MODULES = {
     "phase": "phase_order", "order": "phase_order", "triangulation": "triangulation_rig", "rig": "triangulation_rig",
     "normalisation": "scores", "metrics": "scores", "networks": "networks", "scenes": "scenes",
+    "crossed": "crossed_fringes",
 }  # fmt: skip
 """Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
 

@@ -19,7 +19,7 @@ EXAMPLES = (
     "fpp-bench stability --group phase --group metrics --json",
     "fpp-bench stability --list",
 )
-_GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes")
+_GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes", "crossed")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
