@@ -49,22 +49,22 @@ def background_distance(turns: NDArray[np.float64], background: NDArray[np.float
 
 
 def wrong_order_rate(
-    turns: NDArray[np.float64], phase_sigma: float, surfaces: tuple[float, float] = (0.0, 1.0)
+    turns: NDArray[np.float64], sigma: NDArray[np.float64] | float, surfaces: tuple[float, float] = (0.0, 1.0)
 ) -> NDArray[np.float64]:
     """Expected share of pixels with a wrong order, for ``turns`` (..., 2), where no neighbour helps: the mean over
     depths at ``surfaces`` of the range (places on the line, evenly) and the sum over rivals.
 
     Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy tails: across the line
-    they are taken as two-sided exponential with a standard deviation of ``phase_sigma`` rad. A rival at distance d is
-    chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
+    they are taken as two-sided exponential with a standard deviation of ``sigma`` rad, (...) or one for all. A rival at
+    distance d is chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
     """
     places = np.linspace(*surfaces, 41)
     low, high = -places, 1.0 - places
-    line = turns[..., None, :]
+    line, spread = turns[..., None, :], 2 * np.asarray(sigma, dtype=np.float64)[..., None]
     total = np.zeros(np.broadcast_shapes(line.shape[:-1], places.shape))
     for m, n in _orders(turns, -1.0, 1.0):
         if (m, n) != (0, 0):
-            total += np.exp(-math.sqrt(2) * distance(line, m, n, low, high) / (2 * phase_sigma)) / 2
+            total += np.exp(-math.sqrt(2) * distance(line, m, n, low, high) / spread) / 2
     return np.minimum(total, 1.0).mean(axis=-1)  # type: ignore[no-any-return]
 
 
