@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import LEAST_ANGLE_DEG, Crossed
+from fpp_ml_bench.design.assumptions import SIGMA_PERIOD_PX, Assumptions
 from fpp_ml_bench.design.epipolar import EpipolarLines
 from fpp_ml_bench.design.rivals import TAU, background_distance, rival_distance, wrong_order_rate
 from fpp_ml_bench.errors import RigError
@@ -20,42 +21,7 @@ FLAT_TURNS = 0.05
 BACKGROUND_SIGMAS = 3.0
 """Phase errors that the background must be away from every depth, so that it is known as background. Rivals must be
 much farther: each is a depth like the true one, and half of the way to it is enough."""
-SIGMA_PERIOD_PX = 20.0
-"""Image px of the period at which a phase error is stated."""
 _CHUNK = 20_000
-
-
-@dataclass(frozen=True)
-class Assumptions:
-    """What the figures of a pair rest on.
-
-    ``image_px``: shortest and longest period in the image; the longest also of the beats of the two carriers, since a
-    window must tell their spectra from each other and from the mean light. ``phase_sigma``: error in rad of a phase
-    from a single frame, at a period of `SIGMA_PERIOD_PX` in the image and in proportion to it, since the spectra of
-    edges and texture fall with the frequency; it decides orders. ``blur_px``: sigma of the projector's blur, projector
-    px, which takes modulation from fine periods. ``noise_grey``: the camera's noise, which alone decides the depth
-    noise on smooth surfaces, with ``white_grey``, the grey level of white at the near end (falling with the square of
-    the distance), and a Gaussian window of ``window_px`` (sigma, image px). ``surfaces_mm``: where surfaces are
-    expected, None for anywhere in the range; a rival may be anywhere in it. ``wrong_share``: the share of wrong orders
-    that may be left to the neighbours.
-    """
-
-    image_px: tuple[float, float] = (12.0, 40.0)
-    phase_sigma: float = 0.2
-    blur_px: float = 1.0
-    noise_grey: float = 1.0
-    white_grey: float = 180.0
-    window_px: float = 6.0
-    surfaces_mm: tuple[float, float] | None = None
-    wrong_share: float = 0.0002
-
-    def kept(self, pitches_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The share of the modulation that blur leaves to periods of any shape."""
-        return np.exp(-2 * (math.pi * self.blur_px / pitches_px) ** 2)  # type: ignore[no-any-return]
-
-    def sigmas(self, pitches_px: NDArray[np.float64], image_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Error in rad of the phase of each carrier."""
-        return self.phase_sigma * image_px / (SIGMA_PERIOD_PX * self.kept(pitches_px))
 
 
 @dataclass(frozen=True)
@@ -110,7 +76,7 @@ def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> lis
     image_px = np.array([[rig.image_px_of_carrier(tuple(carrier)) for carrier in family] for family in cycles])
     turns = np.stack([lines.turns(family) for family in families])
     rival, background = _distances(turns, lines)
-    sigma = _sigma_across(turns, assumed.sigmas(pitches, image_px))
+    sigma = _sigma_across(turns, _sigmas(assumed, pitches, image_px))
     weights = np.array([family.weights for family in families])
     slopes = np.stack([lines.far_px_per_mm @ pair.T for pair in cycles])
     noise = _depth_noise_mm(slopes, pitches, weights, lines, assumed)
@@ -143,7 +109,8 @@ def search(
         )
     lines, cycles = EpipolarLines.of(rig), _cycles(carriers)
     pitches = np.array([pitch for pitch, _ in carriers])
-    sigmas = assumed.sigmas(pitches, np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles]))
+    image_px = np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles])
+    sigmas = _sigmas(assumed, pitches, image_px)
     turns, slopes = (np.stack([of_lines @ carrier for carrier in cycles])
                      for of_lines in (lines.across_px, lines.far_px_per_mm))  # fmt: skip
     clearance, noise = np.empty((2, len(pairs)))
@@ -157,6 +124,11 @@ def search(
         if background is not None:
             clearance[part][background < BACKGROUND_SIGMAS * sigma] = 0.0
         noise[part] = _depth_noise_mm(slopes[chosen].swapaxes(1, 2), pitches[chosen], 0.5, lines, assumed)
+    if not clearance.any():
+        raise RigError(
+            f"all {len(pairs):,} pairs show the background at {rig.background:g} m as they show a depth in the range; "
+            "give other --pitches and --angles, or leave background_m out of the rig"
+        )
     families = [_family(carriers, pairs[index]) for index in _front(clearance, noise)]
     front = tuple(describe(rig, families, assumed))
     limit = f"{100 * assumed.wrong_share:g}% wrong orders"
@@ -221,6 +193,18 @@ def _distances(
     return rival, None if lines.background is None else background_distance(turns, lines.background).min(axis=1)
 
 
+def _kept(assumed: Assumptions, pitches_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of the modulation that blur leaves to periods of any shape."""
+    return np.exp(-2 * (math.pi * assumed.blur_px / pitches_px) ** 2)  # type: ignore[no-any-return]
+
+
+def _sigmas(
+    assumed: Assumptions, pitches_px: NDArray[np.float64], image_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Error in rad of the phases of carriers, of any shape."""
+    return assumed.phase_sigma * image_px / (SIGMA_PERIOD_PX * _kept(assumed, pitches_px))
+
+
 def _sigma_across(turns: NDArray[np.float64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
     """Error in rad of the two phases across the line, the direction of rivals; ``turns`` (K, n, 2), ``sigmas`` (K, 2)
     of the carriers; returns (K, n)."""
@@ -237,7 +221,7 @@ def _depth_noise_mm(
     turns per mm, ``pitches_px`` (K, 2). A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))``
     at noise s and modulation B."""
     near_mm, far_mm = lines.range_mm
-    modulation = weights * assumed.kept(pitches_px) * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
+    modulation = weights * _kept(assumed, pitches_px) * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
     phase_noise = assumed.noise_grey / (modulation * assumed.window_px * math.sqrt(TAU))
     precision = ((TAU * slopes / phase_noise[:, None]) ** 2).sum(axis=-1)
     with np.errstate(divide="ignore"):
@@ -245,9 +229,11 @@ def _depth_noise_mm(
 
 
 def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[int]:
-    """Indices of the pairs that no other beats in both, the largest clearance first."""
+    """Indices of the pairs that no other beats in both, the largest clearance first; none without clearance. Rounded,
+    so that equal pairs stay in their order on every processor."""
+    clearance, noise = np.round(clearance, 6), np.round(noise, 9)
     front: list[int] = []
     for index in np.lexsort((noise, -clearance)).tolist():
-        if not front or noise[index] < noise[front[-1]] * (1 - 1e-9):
+        if clearance[index] > 0 and (not front or noise[index] < noise[front[-1]]):
             front.append(index)
     return front

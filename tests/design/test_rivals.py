@@ -158,6 +158,8 @@ def test_the_crossed_rig_has_the_proposed_pair():
 def test_what_can_not_be_searched_is_said():
     with pytest.raises(RigError, match="no two of 0 carriers have periods"):
         search(PAPER, Assumptions(), (3.0, 200.0))
+    with pytest.raises(RigError, match=r"all 4 pairs show the background at 3\.2 m"):
+        search(PAPER, Assumptions(phase_sigma=1.0), (18, 18.5), (0, 90))
     with pytest.raises(RigError, match="surfaces: expected a part of the working range 1500 to 2100 mm"):
         describe(PAPER, [CROSSED], Assumptions(surfaces_mm=(1400.0, 1900.0)))
     away = replace(PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None)
