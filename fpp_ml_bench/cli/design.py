@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--surfaces", type=working_range, metavar="NEAR,FAR",
         help="where surfaces are expected, mm, for the share of wrong orders (default: the whole range)")  # fmt: skip
     add("--phase-sigma", type=_positive, default=default.phase_sigma, metavar="RAD",
-        help=f"error of a phase, for wrong orders (default: {default.phase_sigma:g})")  # fmt: skip
+        help=f"error of a phase at 20 image px a period, for orders (default: {default.phase_sigma:g})")  # fmt: skip
+    add("--blur", type=_positive, default=default.blur_px, metavar="PX",
+        help=f"sigma of the projector's blur, projector px (default: {default.blur_px:g})")  # fmt: skip
     add("--wrong", type=_positive, default=100 * default.wrong_share, metavar="PERCENT",
         help=f"wrong orders that may be left to the neighbours (default: {100 * default.wrong_share:g})")  # fmt: skip
     add("--noise", type=_positive, default=default.noise_grey, metavar="GREY",
@@ -60,14 +62,14 @@ def run(args: argparse.Namespace) -> int:
     """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
     rig = optics.NAMED_RIGS[args.rig]() if args.rig in optics.NAMED_RIGS else optics.load_rig(args.rig)
     assumed = design.Assumptions(
-        args.image_px, args.phase_sigma, args.noise, args.white, args.window, args.surfaces, args.wrong / 100
+        args.image_px, args.phase_sigma, args.blur, args.noise, args.white, args.window, args.surfaces, args.wrong / 100
     )
     found = design.search(rig, assumed, args.pitches, args.angles or design.ANGLES_DEG)
     families = dict.fromkeys(args.pair, "asked for")
     if len(rig.fringe_directions) == 2:
-        families.setdefault(replace(coding.Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "the rig's pair")
+        families.setdefault(replace(coding.Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
     if rig.crossed is not None:
-        families.setdefault(rig.crossed, "the rig's crossed")
+        families.setdefault(rig.crossed, "its crossed")
     others = design.describe(rig, list(families), assumed)
     _print(rig, assumed, found, list(zip(others, families.values(), strict=True)))
     if args.picture is not None:
@@ -88,10 +90,11 @@ def _print(
     (near_mm, far_mm), flat_deg = rig.working_range_mm, design.EpipolarLines.of(rig).flat_angle_deg
     print(f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
           "epipolar lines and tells no depth")  # fmt: skip
-    print(f"orders          by a phase error of {assumed.phase_sigma:g} rad, before neighbours help")
+    print(f"orders          by a phase error of {assumed.phase_sigma:g} rad at 20 image px a period, before neighbours "
+          "help")  # fmt: skip
     print(f"depth noise     at {far_mm:g} mm, of {assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at "
-          f"{near_mm:g} mm, window {assumed.window_px:g} px")  # fmt: skip
-    names = ("projector px", "degrees", "image px", "rival, rad", "background, rad", "noise, mm", "wrong orders",
+          f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px")  # fmt: skip
+    names = ("projector px", "degrees", "image px", "rival, rad", "background", "error", "noise, mm", "wrong orders",
              "periods in range")  # fmt: skip
     table = Table(*(Column(name, justify="right") for name in names), "")
     front = [candidate for candidate in found.front if candidate.wrong_share <= MOST_WRONG]
@@ -103,7 +106,7 @@ def _print(
         background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
         table.add_row(
             _two(crossed.pitches_px, "g"), _two(crossed.angles_deg, "g"), _two(candidate.image_px, ".1f"),
-            f"{candidate.rival_rad:.2f}", background, f"{candidate.noise_mm:.3f}",
+            f"{candidate.rival_rad:.2f}", background, f"{candidate.sigma_rad:.2f}", f"{candidate.noise_mm:.3f}",
             f"{100 * candidate.wrong_share:.3f}%", _two(candidate.turns, ".2f"), about,
         )  # fmt: skip
     show(table)

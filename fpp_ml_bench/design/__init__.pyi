@@ -1,3 +1,4 @@
+from .assumptions import Assumptions as Assumptions
 from .epipolar import EpipolarLines as EpipolarLines
 from .picture import draw_design as draw_design
 from .rivals import background_distance as background_distance
@@ -5,7 +6,6 @@ from .rivals import nearest as nearest
 from .rivals import rival_distance as rival_distance
 from .rivals import wrong_order_rate as wrong_order_rate
 from .search import ANGLES_DEG as ANGLES_DEG
-from .search import Assumptions as Assumptions
 from .search import Candidate as Candidate
 from .search import Design as Design
 from .search import describe as describe

@@ -64,7 +64,7 @@ def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> Non
         )  # fmt: skip
     axes.set(
         title=f"{_title(candidate.crossed)}\nnearest rival {candidate.rival_rad:.2f} rad", xlim=(0, 1), ylim=(0, 1),
-        xlabel="phase of carrier 1, turns", ylabel="phase of carrier 2, turns", aspect="equal",
+        xlabel="phase of carrier 1, turns (near end: 0.5)", ylabel="phase of carrier 2, turns", aspect="equal",
     )  # fmt: skip
     axes.legend(loc="best", fontsize=8)
 

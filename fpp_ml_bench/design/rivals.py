@@ -6,11 +6,13 @@ points (m, n) of the whole numbers but (0, 0), as near as the line comes to them
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 TAU = 2 * math.pi
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def nearest(
@@ -20,20 +22,28 @@ def nearest(
     (m, n); with ``own`` (0, 0) counts too. ``turns`` float64 (..., 2), ``low`` and ``high`` that broadcast to (...);
     returns (...)."""
     least = np.full(np.broadcast_shapes(turns.shape[:-1], np.shape(low), np.shape(high)), np.inf)
-    for m, n in _orders(turns, low, high):
-        if own or (m, n) != (0, 0):
-            np.minimum(least, distance(turns, m, n, low, high), out=least)
+    for distance in _distances(turns, low, high, own):
+        np.minimum(least, distance, out=least)
     return least
 
 
-def distance(
-    turns: NDArray[np.float64], m: int, n: int, low: NDArray[np.float64] | float, high: NDArray[np.float64] | float
-) -> NDArray[np.float64]:
-    """Distance in rad of (m, n) from the line, as in `nearest`."""
-    first, second = turns[..., 0], turns[..., 1]
-    square = np.maximum(first * first + second * second, np.finfo(np.float64).tiny)
-    place = np.clip((m * first + n * second) / square, low, high)
-    return TAU * np.hypot(m - first * place, n - second * place)  # type: ignore[no-any-return]
+def _distances(
+    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float, own: bool
+) -> Iterator[NDArray[np.float64]]:
+    """Distances in rad from the line, as in `nearest`, to the whole numbers beside it: along the axis that grows
+    faster all that the line passes, and across the three next to it."""
+    steep = np.abs(turns[..., 1]) > np.abs(turns[..., 0])
+    fast, slow = np.where(steep, turns[..., 1], turns[..., 0]), np.where(steep, turns[..., 0], turns[..., 1])
+    fast, slow = np.abs(fast), np.where(fast < 0, -slow, slow)  # (m, n) and (-m, -n) are alike
+    fast = np.maximum(fast, _TINY)
+    square, slope, most = fast * fast + slow * slow, slow / fast, float(fast.max())
+    start, stop = math.floor(min(float(np.min(low)), 0.0) * most), math.ceil(float(np.max(high)) * most)
+    for m in range(start - 1, stop + 2):
+        middle = np.rint(m * slope)
+        for n in (middle - 1, middle, middle + 1):
+            place = np.clip((m * fast + n * slow) / np.maximum(square, _TINY), low, high)
+            distance = TAU * np.hypot(m - fast * place, n - slow * place)
+            yield np.where(n == 0, np.inf, distance) if m == 0 and not own else distance
 
 
 def rival_distance(turns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -49,29 +59,19 @@ def background_distance(turns: NDArray[np.float64], background: NDArray[np.float
 
 
 def wrong_order_rate(
-    turns: NDArray[np.float64], phase_sigma: float, surfaces: tuple[float, float] = (0.0, 1.0)
+    turns: NDArray[np.float64], sigma: NDArray[np.float64] | float, surfaces: tuple[float, float] = (0.0, 1.0)
 ) -> NDArray[np.float64]:
     """Expected share of pixels with a wrong order, for ``turns`` (..., 2), where no neighbour helps: the mean over
     depths at ``surfaces`` of the range (places on the line, evenly) and the sum over rivals.
 
     Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy tails: across the line
-    they are taken as two-sided exponential with a standard deviation of ``phase_sigma`` rad. A rival at distance d is
-    chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
+    they are taken as two-sided exponential with a standard deviation of ``sigma`` rad, (...) or one for all. A rival at
+    distance d is chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
     """
     places = np.linspace(*surfaces, 41)
     low, high = -places, 1.0 - places
-    line = turns[..., None, :]
+    line, spread = turns[..., None, :], 2 * np.asarray(sigma, dtype=np.float64)[..., None]
     total = np.zeros(np.broadcast_shapes(line.shape[:-1], places.shape))
-    for m, n in _orders(turns, -1.0, 1.0):
-        if (m, n) != (0, 0):
-            total += np.exp(-math.sqrt(2) * distance(line, m, n, low, high) / (2 * phase_sigma)) / 2
+    for distance in _distances(line, low, high, own=False):
+        total += np.exp(-math.sqrt(2) * distance / spread) / 2
     return np.minimum(total, 1.0).mean(axis=-1)  # type: ignore[no-any-return]
-
-
-def _orders(
-    turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float
-) -> list[tuple[int, int]]:
-    """All (m, n) that the line may come near to."""
-    reach = float(max(np.max(np.abs(low)), np.max(np.abs(high))))
-    first, second = (math.ceil(reach * float(np.abs(turns[..., k]).max())) + 1 for k in (0, 1))
-    return [(m, n) for m in range(-first, first + 1) for n in range(-second, second + 1)]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import LEAST_ANGLE_DEG, Crossed
+from fpp_ml_bench.design.assumptions import SIGMA_PERIOD_PX, Assumptions
 from fpp_ml_bench.design.epipolar import EpipolarLines
 from fpp_ml_bench.design.rivals import TAU, background_distance, rival_distance, wrong_order_rate
 from fpp_ml_bench.errors import RigError
@@ -17,29 +18,10 @@ from fpp_ml_bench.optics import Rig
 ANGLES_DEG = tuple(float(angle) for angle in range(0, 180, 15))
 FLAT_TURNS = 0.05
 """A carrier that turns less over the whole range tells no depth."""
+BACKGROUND_SIGMAS = 3.0
+"""Phase errors that the background must be away from every depth, so that it is known as background. Rivals must be
+much farther: each is a depth like the true one, and half of the way to it is enough."""
 _CHUNK = 20_000
-
-
-@dataclass(frozen=True)
-class Assumptions:
-    """What the figures of a pair rest on.
-
-    ``image_px``: shortest and longest period in the image; the longest also of the beats of the two carriers, since a
-    window must tell their spectra from each other and from the mean light. ``phase_sigma``: error of a phase from a
-    single frame in rad, with edges, texture and the other carrier in it; it decides orders. ``noise_grey``: the
-    camera's noise, which alone decides the depth noise on smooth surfaces, with ``white_grey``, the grey level of white
-    at the near end (falling with the square of the distance), and a Gaussian window of ``window_px`` (sigma, image px).
-    ``surfaces_mm``: where surfaces are expected, None for anywhere in the range; a rival may be anywhere in it.
-    ``wrong_share``: the share of wrong orders that may be left to the neighbours.
-    """
-
-    image_px: tuple[float, float] = (10.0, 40.0)
-    phase_sigma: float = 0.2
-    noise_grey: float = 1.0
-    white_grey: float = 180.0
-    window_px: float = 6.0
-    surfaces_mm: tuple[float, float] | None = None
-    wrong_share: float = 0.001
 
 
 @dataclass(frozen=True)
@@ -47,23 +29,19 @@ class Candidate:
     """Two carriers and what is expected of them.
 
     ``rival_rad``: distance of the nearest rival order. ``background_rad``: of the background plane, None where none is
-    known. ``noise_mm``: depth noise at the far end. ``wrong_share``: expected share of wrong orders before neighbours
-    help. ``image_px``: periods in the image. ``turns``: periods that the carriers cross over the range, the most of any
-    pixel.
+    known. ``sigma_rad``: error of the two phases in the direction of rivals. ``noise_mm``: depth noise at the far end.
+    ``wrong_share``: expected share of wrong orders before neighbours help. ``image_px``: periods in the image.
+    ``turns``: periods that the carriers cross over the range, the most of any pixel.
     """
 
     crossed: Crossed
     rival_rad: float
     background_rad: float | None
+    sigma_rad: float
     noise_mm: float
     wrong_share: float
     image_px: tuple[float, float]
     turns: tuple[float, float]
-
-    @property
-    def clearance_rad(self) -> float:
-        """The lesser of the distances from rivals and background."""
-        return self.rival_rad if self.background_rad is None else min(self.rival_rad, self.background_rad)
 
     @property
     def flat(self) -> tuple[int, ...]:
@@ -73,8 +51,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Design:
-    """The outcome of a search over ``searched`` pairs: those that no other beats in both clearance and depth noise
-    (``front``, the largest clearance first), and the one ``proposed`` with its ``reason``."""
+    """The outcome of a search over ``searched`` pairs: those that no other beats in both depth noise and the distance
+    of rivals in phase errors (``front``, the largest distance first), all clear of the background, and the one
+    ``proposed`` with its ``reason``."""
 
     proposed: Candidate
     reason: str
@@ -88,26 +67,29 @@ def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> lis
     if not families:
         return []
     lines = EpipolarLines.of(rig)
+    near_mm, far_mm = lines.range_mm
+    first, last = map(float, lines.places(np.array(assumed.surfaces_mm or (near_mm, far_mm))))
+    if not -1e-9 <= first < last <= 1 + 1e-9:
+        raise RigError(f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm")
+    cycles = np.array([family.cycles_per_px for family in families])
+    pitches = np.array([family.pitches_px for family in families])
+    image_px = np.array([[rig.image_px_of_carrier(tuple(carrier)) for carrier in family] for family in cycles])
     turns = np.stack([lines.turns(family) for family in families])
     rival, background = _distances(turns, lines)
-    near_mm, far_mm = lines.range_mm
-    surfaces = lines.places(np.array(assumed.surfaces_mm or (near_mm, far_mm)))
-    if not (surfaces[0] < surfaces[1] and surfaces[0] >= -1e-9 and surfaces[1] <= 1 + 1e-9):
-        raise RigError(f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm")
-    wrong = wrong_order_rate(turns, assumed.phase_sigma, (float(surfaces[0]), float(surfaces[1]))).max(axis=-1)
-    noise = _depth_noise_mm(lines, families, assumed)
-    found = []
-    for number, family in enumerate(families):
-        first, second = (rig.image_px_of_carrier(cycles) for cycles in family.cycles_per_px)
-        most = np.abs(turns[number]).max(axis=0)
-        distance = None if background is None else float(background[number])
-        found.append(
-            Candidate(
-                family, float(rival[number]), distance, float(noise[number]), float(wrong[number]), (first, second),
-                (float(most[0]), float(most[1])),
-            )
-        )  # fmt: skip
-    return found
+    sigma = _sigma_across(turns, _sigmas(assumed, pitches, image_px))
+    weights = np.array([family.weights for family in families])
+    slopes = np.stack([lines.far_px_per_mm @ pair.T for pair in cycles])
+    noise = _depth_noise_mm(slopes, pitches, weights, lines, assumed)
+    wrong = wrong_order_rate(turns, sigma, (first, last)).max(axis=-1)
+    most = np.abs(turns).max(axis=1)
+    return [
+        Candidate(
+            family, float(rival[k]), None if background is None else float(background[k]), float(sigma[k].max()),
+            float(noise[k]), float(wrong[k]), (float(image_px[k, 0]), float(image_px[k, 1])),
+            (float(most[k, 0]), float(most[k, 1])),
+        )
+        for k, family in enumerate(families)
+    ]  # fmt: skip
 
 
 def search(
@@ -125,15 +107,28 @@ def search(
             f"{assumed.image_px[1]:g} px in an image of {rig.camera.width} x {rig.camera.height} px; give other "
             "--pitches and --angles, or wider limits (--image-px)"
         )
-    lines = EpipolarLines.of(rig)
-    own = np.stack([lines.across_px @ cycles for cycles in _cycles(carriers)])  # (carriers, lines)
-    clearance = np.concatenate([
-        np.minimum.reduce([part for part in _distances(own[pairs[start : start + _CHUNK]].swapaxes(1, 2), lines)
-                           if part is not None])
-        for start in range(0, len(pairs), _CHUNK)
-    ])  # fmt: skip
-    slopes = np.stack([lines.far_px_per_mm @ cycles for cycles in _cycles(carriers)])
-    noise = _noise_of_slopes(slopes[pairs].swapaxes(1, 2), lines, np.array([0.5, 0.5]), assumed)
+    lines, cycles = EpipolarLines.of(rig), _cycles(carriers)
+    pitches = np.array([pitch for pitch, _ in carriers])
+    image_px = np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles])
+    sigmas = _sigmas(assumed, pitches, image_px)
+    turns, slopes = (np.stack([of_lines @ carrier for carrier in cycles])
+                     for of_lines in (lines.across_px, lines.far_px_per_mm))  # fmt: skip
+    clearance, noise = np.empty((2, len(pairs)))
+    for start in range(0, len(pairs), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        chosen = pairs[part]
+        across = turns[chosen].swapaxes(1, 2)
+        rival, background = _distances(across, lines)
+        sigma = np.maximum(_sigma_across(across, sigmas[chosen]).max(axis=-1), np.finfo(np.float64).tiny)
+        clearance[part] = rival / sigma
+        if background is not None:
+            clearance[part][background < BACKGROUND_SIGMAS * sigma] = 0.0
+        noise[part] = _depth_noise_mm(slopes[chosen].swapaxes(1, 2), pitches[chosen], 0.5, lines, assumed)
+    if not clearance.any():
+        raise RigError(
+            f"all {len(pairs):,} pairs show the background at {rig.background:g} m as they show a depth in the range; "
+            "give other --pitches and --angles, or leave background_m out of the rig"
+        )
     families = [_family(carriers, pairs[index]) for index in _front(clearance, noise)]
     front = tuple(describe(rig, families, assumed))
     limit = f"{100 * assumed.wrong_share:g}% wrong orders"
@@ -198,29 +193,47 @@ def _distances(
     return rival, None if lines.background is None else background_distance(turns, lines.background).min(axis=1)
 
 
-def _depth_noise_mm(lines: EpipolarLines, families: Sequence[Crossed], assumed: Assumptions) -> NDArray[np.float64]:
-    slopes = np.stack([lines.far_px_per_mm @ np.array(family.cycles_per_px).T for family in families])
-    weights = np.array([family.weights for family in families])[:, None, :]
-    return _noise_of_slopes(slopes, lines, weights, assumed)
+def _kept(assumed: Assumptions, pitches_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of the modulation that blur leaves to periods of any shape."""
+    return np.exp(-2 * (math.pi * assumed.blur_px / pitches_px) ** 2)  # type: ignore[no-any-return]
 
 
-def _noise_of_slopes(
-    slopes: NDArray[np.float64], lines: EpipolarLines, weights: NDArray[np.float64], assumed: Assumptions
+def _sigmas(
+    assumed: Assumptions, pitches_px: NDArray[np.float64], image_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Depth noise at the far end, the most over the lines, of both carriers together; ``slopes`` (K, n, 2) in turns per
-    mm. A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))`` at noise s and modulation B."""
+    """Error in rad of the phases of carriers, of any shape."""
+    return assumed.phase_sigma * image_px / (SIGMA_PERIOD_PX * _kept(assumed, pitches_px))
+
+
+def _sigma_across(turns: NDArray[np.float64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Error in rad of the two phases across the line, the direction of rivals; ``turns`` (K, n, 2), ``sigmas`` (K, 2)
+    of the carriers; returns (K, n)."""
+    first, second = turns[..., 0], turns[..., 1]
+    length = np.maximum(np.hypot(first, second), np.finfo(np.float64).tiny)
+    return np.hypot(sigmas[:, None, 0] * second, sigmas[:, None, 1] * first) / length  # type: ignore[no-any-return]
+
+
+def _depth_noise_mm(
+    slopes: NDArray[np.float64], pitches_px: NDArray[np.float64], weights: NDArray[np.float64] | float,
+    lines: EpipolarLines, assumed: Assumptions,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Depth noise at the far end, the most over the lines, of both carriers together (K,); ``slopes`` (K, n, 2) in
+    turns per mm, ``pitches_px`` (K, 2). A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))``
+    at noise s and modulation B."""
     near_mm, far_mm = lines.range_mm
-    modulation = weights * assumed.white_grey / 2 * (near_mm / far_mm) ** 2
+    modulation = weights * _kept(assumed, pitches_px) * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
     phase_noise = assumed.noise_grey / (modulation * assumed.window_px * math.sqrt(TAU))
-    precision = ((TAU * slopes / phase_noise) ** 2).sum(axis=-1)
+    precision = ((TAU * slopes / phase_noise[:, None]) ** 2).sum(axis=-1)
     with np.errstate(divide="ignore"):
         return (1.0 / np.sqrt(precision)).max(axis=-1)  # type: ignore[no-any-return]
 
 
 def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[int]:
-    """Indices of the pairs that no other beats in both, the largest clearance first."""
+    """Indices of the pairs that no other beats in both, the largest clearance first; none without clearance. Rounded,
+    so that equal pairs stay in their order on every processor."""
+    clearance, noise = np.round(clearance, 6), np.round(noise, 9)
     front: list[int] = []
     for index in np.lexsort((noise, -clearance)).tolist():
-        if not front or noise[index] < noise[front[-1]] * (1 - 1e-9):
+        if clearance[index] > 0 and (not front or noise[index] < noise[front[-1]]):
             front.append(index)
     return front

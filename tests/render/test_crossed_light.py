@@ -15,19 +15,12 @@ from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.projector import PatternLight, defocus_variance_px2, response_table
 from fpp_ml_bench.loaders.render.scene import BuildSettings, preset_settings
 from fpp_ml_bench.loaders.storage import DatasetFolder, verify
-from fpp_ml_bench.optics import CodedSequence, Sequence, crossed_rig, paper_rig
+from fpp_ml_bench.optics import CROSSED, CodedSequence, Sequence, crossed_rig, paper_rig
 
 SHORT = replace(RIG, sequence=Sequence(steps=3))
 
 
-def with_crossed(crossed, *order):
-    """The small rig with a few frames: crossed ones first, then sinusoids of both directions."""
-    return replace(
-        RIG, sequence=CodedSequence(SHORT.code("horizontal"), SHORT.code("vertical"), order, crossed)
-    )  # fmt: skip
-
-
-BOTH = with_crossed(Crossed((18.0, 18.0)), "crossed", "horizontal", "vertical", "black", "white")
+BOTH = SHORT.with_crossed(Crossed((18.0, 18.0)))
 
 
 @pytest.mark.parametrize("light", [PAPER, DIRECT.changed("projector", pixel_blur_px=1.0, defocus_px=2.0, focus_m=1.6)])
@@ -44,7 +37,7 @@ def test_a_crossed_frame_of_equal_periods_is_the_mean_of_both_directions(light):
 @pytest.mark.parametrize("defocus_px", [0.0, 2.5])
 def test_light_is_the_image_through_response_and_blur(response, defocus_px):
     family = Crossed((18.0, 13.0), (15.0, 80.0), (0.6, 0.4), ((90.0, 30.0),))
-    rig = with_crossed(family, "horizontal", "crossed", "vertical")
+    rig = SHORT.with_crossed(family)
     light = PAPER.changed(
         "projector", response=response, pixel_blur_px=0.7, defocus_px=defocus_px, focus_m=1.6
     ).projector
@@ -65,8 +58,8 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
 
 
 def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path):
-    rig = crossed_rig(240)
-    settings = BuildSettings(rig, ("cork",), stored="crossed")
+    family = Crossed((18.0, 14.0), (0.0, 75.0), shifts_deg=CROSSED.shifts_deg)
+    settings = BuildSettings(paper_rig(240).with_crossed(family), ("cork",), stored="crossed")
     build(tmp_path / "crossed", settings, 1)
     build(tmp_path / "paper", BuildSettings(paper_rig(240), ("cork",), stored="single_shot"), 1)
     opened, paper = DatasetFolder(tmp_path / "crossed"), DatasetFolder(tmp_path / "paper")
@@ -85,7 +78,7 @@ def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path)
 
 
 def test_what_can_not_be_built_is_said():
-    alone = replace(crossed_rig(240), sequence=CodedSequence(None, None, ("crossed",), Crossed((18.0, 14.0))))
+    alone = replace(paper_rig(240), sequence=CodedSequence(None, None, ("crossed",), Crossed((18.0, 14.0))))
     with pytest.raises(BuildError, match="no ground truth can be decoded; add the horizontal"):
         BuildSettings(alone, ("cork",))
     with pytest.raises(BuildError, match="frames 'crossed': this rig's sequence has none"):

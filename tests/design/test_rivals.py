@@ -1,0 +1,172 @@
+"""Rivals on the torus: against all pairs of depths of all pixels, and the figures of pairs on rigs of several kinds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.design import (
+    Assumptions,
+    EpipolarLines,
+    background_distance,
+    describe,
+    draw_design,
+    rival_distance,
+    search,
+    wrong_order_rate,
+)
+from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.optics import CROSSED, paper_rig
+
+PAPER = paper_rig()
+TURNED = replace(
+    PAPER, rotation=((0.98, 0.0, 0.198997487421324), (0.0, 1.0, 0.0), (-0.198997487421324, 0.0, 0.98)),
+    translation_m=(-0.25, -0.12, 0.06),
+)  # fmt: skip
+"""Looks to the side, with the projector in front of the camera: lines of all directions and lengths."""
+SIDEWAYS = replace(PAPER, translation_m=(0.16, 0.0, 0.0))
+
+
+def brute_force(rig, crossed, samples=500):
+    """Least distance of the phases of two depths of a pixel of the image's grid whose orders differ, and of the
+    background from any depth, rad."""
+    columns, rows = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, rig.camera.width - 1, 5)]))
+    near_m, far_m = (limit / 1000 for limit in rig.working_range_mm)
+    depths_m = 1 / np.linspace(1 / near_m, 1 / far_m, samples)
+    rival, background = np.inf, np.inf
+    for x, y in zip(*rig.camera.normalised(columns, rows), strict=True):
+        u, v = rig.project(np.outer(depths_m, [x, y, 1.0]))
+        middle = rig.project(rig.standoff_m * np.array([x, y, 1.0]))
+        if not (np.isfinite(u).all() and 0 <= middle[0] <= 911 and 0 <= middle[1] <= 1139):
+            continue
+        behind = rig.project(rig.background_m * np.array([x, y, 1.0]))
+        phases = np.stack([f_u * u + f_v * v for f_u, f_v in crossed.cycles_per_px], axis=1)
+        of_plane = np.array([f_u * behind[0] + f_v * behind[1] for f_u, f_v in crossed.cycles_per_px])
+        apart = phases[:, None] - phases
+        order = np.rint(apart)
+        distance = 2 * np.pi * np.hypot(*np.moveaxis(apart - order, -1, 0))
+        rival = min(rival, distance[(order != 0).any(axis=-1)].min(initial=np.inf))
+        apart = phases - of_plane
+        background = min(background, 2 * np.pi * np.hypot(*(apart - np.rint(apart)).T).min())
+    return rival, background
+
+
+@pytest.mark.parametrize("rig", [PAPER, TURNED, SIDEWAYS], ids=["paper", "turned", "sideways"])
+@pytest.mark.parametrize(
+    "crossed",
+    [
+        Crossed((18.0, 18.0)),
+        Crossed((18.0, 14.0)),
+        Crossed((13.0, 24.0), (30.0, 75.0)),
+        Crossed((9.0, 22.5), (150, 20)),
+    ],
+)
+def test_distances_are_those_of_all_pairs_of_depths(rig, crossed):
+    lines = EpipolarLines.of(rig)
+    turns = lines.turns(crossed)
+    rival, background = brute_force(rig, crossed)
+    assert float(rival_distance(turns).min()) == pytest.approx(min(rival, 7), abs=0.05)
+    assert float(background_distance(turns, lines.background).min()) == pytest.approx(background, abs=0.05)
+    candidate = describe(rig, [crossed], Assumptions())[0]
+    assert candidate.rival_rad == rival_distance(turns).min()
+    assert candidate.background_rad == background_distance(turns, lines.background).min()
+
+
+def test_the_papers_pair_by_hand():
+    """18 / 18 px: 1.930 and 2.413 periods; the rival (1, 1) is 2 pi |1.930 - 2.413| / |(1.930, 2.413)| away."""
+    turns = EpipolarLines.of(PAPER).turns(Crossed((18.0, 18.0)))
+    across = 0.1 * 1824 * (1 / 1.5 - 1 / 2.1) / 18, 0.125 * 1824 * (1 / 1.5 - 1 / 2.1) / 18
+    np.testing.assert_allclose(np.abs(turns), [across], rtol=1e-6)
+    assert float(rival_distance(turns)[0]) == pytest.approx(2 * np.pi * (across[1] - across[0]) / np.hypot(*across))
+
+
+def test_wrong_orders_are_about_those_measured():
+    """Measured on rendered objects near the middle of the range, before any smoothing: 2.5, 0.7, 0.7, 7 to 9 and 7 to
+    9 percent."""
+    families = [Crossed(pair) for pair in ((18.0, 18.0), (18.0, 14.0), (16.0, 13.0), (18.0, 25.0), (12.0, 17.0))]
+    near_the_middle = Assumptions(surfaces_mm=(1700.0, 1900.0))
+    shares = [100 * candidate.wrong_share for candidate in describe(PAPER, families, near_the_middle)]
+    for share, measured in zip(shares, (2.5, 0.7, 0.7, 8.0, 8.0), strict=True):
+        assert measured / 3 < share < measured * 3
+    assert max(shares[1:3]) < shares[0] < min(shares[3:])
+
+
+def test_wrong_orders_of_drawn_errors():
+    turns, sigma = np.array([1.93, -2.41]), 0.5
+    generator, places = np.random.default_rng(1), np.linspace(0.0, 1.0, 1500)
+    along = turns / np.hypot(*turns)
+    across = np.array([-along[1], along[0]])
+    error = generator.laplace(0.0, sigma / np.sqrt(2), 4000)[:, None] * across / (2 * np.pi)
+    true = generator.uniform(0.0, 1.0, 4000)
+    apart = (true[:, None] * turns + error)[:, None] - places[:, None] * turns
+    order = np.rint(apart)
+    best = np.argmin(((apart - order) ** 2).sum(axis=-1), axis=1)
+    wrong = (order[np.arange(4000), best] != 0).any(axis=-1).mean()
+    assert float(wrong_order_rate(turns, sigma)) == pytest.approx(wrong, rel=0.12)
+
+
+def test_a_carrier_along_the_epipolar_lines_tells_no_depth():
+    lines = EpipolarLines.of(SIDEWAYS)
+    assert lines.flat_angle_deg == pytest.approx(0, abs=1e-6)
+    straight, tilted = describe(SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions())
+    assert straight.flat == (0,) and straight.rival_rad < 1e-9 and tilted.flat == ()
+    found = search(SIDEWAYS, Assumptions(), angles_deg=(0, 30, 60, 90, 120, 150))
+    assert found.proposed.rival_rad > 1.3
+
+
+def test_depth_noise_is_that_of_drawn_noise():
+    """Of both phases together, by least squares along the line at the far end."""
+    crossed, assumed = Crossed((18.0, 14.0)), Assumptions()
+    slopes = 2 * np.pi * EpipolarLines.of(PAPER).far_px_per_mm[0] @ np.array(crossed.cycles_per_px).T
+    rows, columns = np.mgrid[-40:41, -40:41]
+    window = np.exp(-(rows**2 + columns**2) / (2 * assumed.window_px**2))
+    window /= window.sum()
+    kept = np.exp(-2 * (np.pi * assumed.blur_px / np.array([18, 14])) ** 2)
+    modulations = 0.5 * assumed.white_grey / 2 * (1500 / 2100) ** 2 * kept
+    weights = (modulations * slopes) ** 2 / ((modulations * slopes) ** 2).sum() / slopes
+    generator, errors = np.random.default_rng(2), []
+    for _ in range(400):
+        noise = generator.normal(0, assumed.noise_grey, (2, *window.shape))
+        waves = np.exp(-2j * np.pi * np.stack([rows / 22.6, columns / 17.5]))
+        values = modulations / 2 + (window * noise * waves).sum(axis=(1, 2))
+        errors.append(weights @ np.angle(values))
+    assert describe(PAPER, [crossed], assumed)[0].noise_mm == pytest.approx(np.std(errors), rel=0.1)
+
+
+def test_the_search_reaches_far_and_proposes_the_finest_of_the_safe():
+    found = search(PAPER, Assumptions())
+    assert found.front[0].rival_rad > 3 and found.proposed.rival_rad > 1.7
+    assert found.proposed.wrong_share <= 0.0002 and "at most 0.02% wrong orders" in found.reason
+    safe = [candidate for candidate in found.front if candidate.wrong_share <= 0.0002]
+    assert found.proposed.noise_mm == min(candidate.noise_mm for candidate in safe)
+    for candidate in found.front:
+        assert all(12 <= seen <= 40 for seen in candidate.image_px)
+        assert candidate.background_rad >= 3 * candidate.sigma_rad
+    for first, second in zip(found.front, found.front[1:], strict=False):
+        assert first.rival_rad / first.sigma_rad >= second.rival_rad / second.sigma_rad
+        assert first.noise_mm > second.noise_mm
+    none = search(PAPER, Assumptions(wrong_share=1e-9), (18, 20), (0, 90))
+    assert "none has at most" in none.reason and none.proposed is none.front[0]
+
+
+def test_the_crossed_rig_has_the_proposed_pair():
+    proposed = search(PAPER, Assumptions()).proposed.crossed
+    assert (CROSSED.pitches_px, CROSSED.angles_deg) == (proposed.pitches_px, proposed.angles_deg)
+
+
+def test_what_can_not_be_searched_is_said():
+    with pytest.raises(RigError, match="no two of 0 carriers have periods"):
+        search(PAPER, Assumptions(), (3.0, 200.0))
+    with pytest.raises(RigError, match=r"all 4 pairs show the background at 3\.2 m"):
+        search(PAPER, Assumptions(phase_sigma=1.0), (18, 18.5), (0, 90))
+    with pytest.raises(RigError, match="surfaces: expected a part of the working range 1500 to 2100 mm"):
+        describe(PAPER, [CROSSED], Assumptions(surfaces_mm=(1400.0, 1900.0)))
+    away = replace(PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None)
+    with pytest.raises(RigError, match="no pixel sees the pattern"):
+        EpipolarLines.of(away)
+
+
+def test_the_picture_is_a_png():
+    pair = describe(SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions())
+    assert draw_design(replace(SIDEWAYS, background_m=None), pair[1], pair[0], Assumptions()).startswith(b"\x89PNG")
