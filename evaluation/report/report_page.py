@@ -7,7 +7,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.protocol import HEADLINE, SINCE_2
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, sheet_png
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, page, percent, render, signed
 from fpp_ml_bench.evaluation.result import Result, SampleResult, write_file
@@ -38,6 +38,8 @@ _TITLES = {
     "object_wide_band_mae_mm": "Object within 8 px of edges, MAE",
     "object_wide_interior_mae_mm": "Object 8 px or more from edges, MAE",
     "object_wide_band_share": "Object within 8 px of edges, share of pixels",
+    "void_share": "Void, share of the image", "unlit_mae_mm": "Unlit, MAE", "unlit_rmse_mm": "Unlit, RMSE",
+    "unlit_valid_mae_mm": "Unlit where predicted, MAE", "unlit_missing_share": "Unlit, not predicted",
 }  # fmt: skip
 """Every key of `METRICS` in the order of the page."""
 
@@ -125,6 +127,8 @@ def score_table(result: Result) -> str:
     """Every score of a result: mean over samples with its interval, median over samples, pooled over pixels."""
     rows = []
     for key, title in _TITLES.items():
+        if key in SINCE_2 and getattr(result.metrics, key) is None:
+            continue
         mean, median = (_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
         interval = interval_text(result.intervals.of(key)) if key in HEADLINE else ""
         pooled = getattr(result.pooled, key, None)

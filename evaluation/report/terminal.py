@@ -79,6 +79,14 @@ def _notes(result: Result) -> Text:
         f"MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm, away from edges "
         f"{millimetres(scores.object_interior_valid_mae_mm)} mm.",
     ]
+    if scores.void_share is not None:
+        lines.append(f"Void pixels, in no set: {percent(scores.void_share)} of the image (unlit, or of mixed depths).")
+    if scores.unlit_mae_mm is not None:
+        lines.append(
+            f"Unlit pixels: MAE {millimetres(scores.unlit_mae_mm)}, RMSE {millimetres(scores.unlit_rmse_mm)} mm; "
+            f"{percent(scores.unlit_missing_share)} not measured, MAE of the others "
+            f"{millimetres(scores.unlit_valid_mae_mm)} mm."
+        )
     if result.samples_without_object:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
     if result.samples_without_background:

@@ -84,8 +84,13 @@ class Result(SparseModel):
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:
                 raise ValueError(f"robustness.{name} is that of the set {block.set}")
+        first = self.protocol_version.startswith("1.")
+        if self.mode not in (("standard", "paper-individual") if first else protocol.MODES):
+            raise ValueError(f"protocol {self.protocol_version} has no mode {self.mode}")
+        void = not first and self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width)
+            _check_void(row, height * width, void, void and self.target == "depth_exact")
         stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
         for key, computed in derived.items():
             _check_same(key, stored[key], computed)
@@ -132,8 +137,10 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
 
 
 def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None] = statistics.fmean) -> Scores:
-    """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it; None if none has."""
-    columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
+    """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it. Where none has it, it
+    is None, or left out if it is one of `SINCE_2`."""
+    columns = {key: [value for row in rows if (value := row.get(key)) is not None] for key in METRICS}
+    columns = {key: values for key, values in columns.items() if values or key not in protocol.SINCE_2}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 
 
@@ -158,8 +165,8 @@ def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
 
 def _check_sample(row: SampleResult, pixels: int) -> None:
     """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
-    if row.object_pixels + row.background_pixels != pixels:
-        raise ValueError(f"{row.sample}: object and background pixels do not add up to the image's {pixels}")
+    if row.object_pixels + row.background_pixels + (row.void_pixels or 0) != pixels:
+        raise ValueError(f"{row.sample}: object, background and void pixels do not add up to the image's {pixels}")
     sets = {name: row.stats(name) for name in ("object", "background")}
     for name, stats in sets.items():
         mae, rmse = stats.mae_mm, stats.rmse_mm
@@ -182,6 +189,23 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
         raise ValueError(f"{row.sample}: object median, 95th percentile, RMSE and maximum are out of order")
     if abs(bias) > mae * loose or shift_free > mae * loose:
         raise ValueError(f"{row.sample}: object bias or shift-free MAE is above the MAE, which no error has")
+
+
+def _check_void(row: SampleResult, pixels: int, void: bool, unlit: bool) -> None:
+    """Refuse (ValueError) a sample whose void or unlit pixels are missing, extra, or contradict their scores; ``void``,
+    ``unlit``: whether the rules know them."""
+    for name, known in (("void", void), ("unlit", unlit)):
+        if (getattr(row, f"{name}_pixels") is not None) != known:
+            raise ValueError(f"{row.sample}: {name}_pixels {'is missing' if known else 'is extra by these rules'}")
+    if not same(row.void_share, None if row.void_pixels is None else row.void_pixels / pixels):
+        raise ValueError(f"{row.sample}: void_share does not follow from void_pixels")
+    if (row.unlit_pixels or 0) > (row.void_pixels or 0):
+        raise ValueError(f"{row.sample}: unlit_pixels is above void_pixels")
+    mae, rmse, share = row.unlit_mae_mm, row.unlit_rmse_mm, row.unlit_missing_share
+    if not (mae is None) == (rmse is None) == (share is None) == (not row.unlit_pixels):
+        raise ValueError(f"{row.sample}: unlit scores must be null exactly when there is no unlit pixel")
+    if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
+        raise ValueError(f"{row.sample}: unlit RMSE is below its MAE, which no error has")
 
 
 def _check_reliance(reliance: Reliance, submission: Submission) -> None:

@@ -39,9 +39,9 @@ def evaluate(
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
-    or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
-    of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once while threads
-    score: a command uses it to import what it needs afterwards.
+    or ``paper`` (the paper's pixel sets, without void, and its rule for normalised depth). Memory does not grow with
+    the number of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once
+    while threads score: a command uses it to import what it needs afterwards.
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
     and DatasetError for a target that is not a depth map."""
@@ -68,7 +68,7 @@ def evaluate(
     description = None
     if content is not None:
         try:
-            description = _checked(folder, content, len(dataset.sequence), listing.form, mode)
+            description = _checked(folder, content, len(dataset.sequence), listing.form)
         except SubmissionError as error:
             description_error = error
         result.environment  # noqa: B018  imported while the threads score
@@ -119,8 +119,8 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     return samples
 
 
-def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> submission.Submission:
-    """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
+def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str) -> submission.Submission:
+    """The folder's description, checked against the predictions' form and a sequence of ``frames``."""
     description = submission.check_submission(folder, content)
     outside = [index for index in description.frames_used if index >= frames]
     if outside:
@@ -130,9 +130,6 @@ def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode
         problem = "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
     elif form != ".png" and description.png_mm_per_level is not None:
         problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
-    elif mode == "paper-individual" and description.units != "normalised":
-        scored = "--mode paper-individual scores normalised depth (units: normalised)"
-        problem = f"{scored}, these are in {description.units}; score them with --mode standard"
     else:
         return description
     raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
@@ -150,6 +147,8 @@ def _scored(
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
             target = dataset.target_mm(sample, target_name)
+            void = dataset.void(sample) if mode == "standard" else None
+            unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
@@ -158,7 +157,8 @@ def _scored(
             values, digest = reader.read(sample)
             problems = value_problems(values, target, high, units)
             if not problems:
-                scores = score_sample(*scored_pair(values, target, units, mode, sample), edge_band_px)
+                pair = scored_pair(values, target, units, mode, sample)
+                scores = score_sample(*pair, edge_band_px, void, unlit_mm)
         except PredictionError as error:
             problems = [str(error)]
         with dataset_lock:
@@ -168,8 +168,7 @@ def _scored(
             problems += submission.sigma_problems(sigmas, sample, dataset.size)
         if problems:
             return problems, []
-        pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
-        return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
+        return [], [{"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}]
 
     return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
@@ -211,7 +210,7 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
 
 
 def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
-    exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
+    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
     for key in protocol.METRICS:
         # Signed means and the error without an offset are small differences of large numbers.

@@ -70,10 +70,10 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
     D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
 
-    ``paper-individual`` (paper Section 5.3.2, individual normalisation): the target is normalised first, its mask is
-    D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in every difference,
-    so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and subtracting
-    1.7 m. Only for normalised values.
+    ``paper`` differs for normalised values (paper Section 5.3.2, individual normalisation): the target is normalised
+    first, its mask is D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in
+    every difference, so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding
+    and subtracting 1.7 m.
 
     Raises DatasetError where the target has no range to normalise by."""
     if units == "mm":

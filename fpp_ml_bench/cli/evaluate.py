@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--edge-band", type=_band, default=EDGE_BAND_PX, metavar="PX",
         help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})")  # fmt: skip
     add("--mode", choices=MODES, default=MODES[0],
-        help="standard: mm, object where depth is above 0 (default); paper-individual: the paper's rule for its "
-        "individually normalised rows, for units: normalised only, never ranked with the others")  # fmt: skip
+        help="standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, "
+        "and its rule for normalised depth; never ranked with the others")  # fmt: skip
     add("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
     add("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
     add_explain_options(parser)
