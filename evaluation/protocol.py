@@ -54,6 +54,20 @@ SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", 
 METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
 HIGHER_IS_BETTER = WITHIN
 
+COVERED = (68, 95, 99)
+NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Coverages of the intervals whose hits are counted; those of `COVERED`, in per cent, are scores of their own."""
+LEFT_OUT = tuple(step / 20 for step in range(20))
+"""Shares of the least sure object pixels that the sparsification curve leaves out."""
+SURE_LEFT_OUT = 0.05
+NLL_LEAST_SIGMA_MM, NLL_LARGEST_RATIO = 0.01, 10.0
+"""The negative log-likelihood takes no sigma below the first, and no |error| / sigma above the second."""
+UNCERTAINTY = (
+    *(f"coverage_{percent}" for percent in COVERED), "sigma_mean_mm", "sigma_median_mm", "nll", "ause_mae_mm",
+    "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm", "unstated_share",
+)  # fmt: skip
+"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result."""
+
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""
 

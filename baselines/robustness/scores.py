@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.robustness.axes import Corruptions
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.score import states_sigma
 from fpp_ml_bench.loaders.sample import void_pixels
 
 Scores = dict[str, float | None]
@@ -64,7 +65,7 @@ def score(
     }
     if sigma_mm is not None:
         sigma = sigma_mm[truth.scored].astype(np.float64)
-        stated = answered & (sigma > 0)
+        stated = states_sigma(given, sigma)
         scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
         scores["coverage"] = float(stated.mean())
     return scores

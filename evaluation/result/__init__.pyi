@@ -28,3 +28,6 @@ from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
 from .parts import dataset_identity as dataset_identity
 from .parts import ends as ends
+from .uncertainty import SigmaScores as SigmaScores
+from .uncertainty import Uncertainty as Uncertainty
+from .uncertainty import uncertainty_of as uncertainty_of

@@ -14,6 +14,7 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.result import parts
 from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
+from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.schema import Count, SparseModel, Text
@@ -27,7 +28,7 @@ Scores = dict[str, float | None]
 class Result(SparseModel):
     """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
 
-    SPARSE = ("reliance", "robustness")
+    SPARSE = ("reliance", "robustness", "uncertainty")
 
     schema_version: SchemaVersion
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
@@ -51,6 +52,7 @@ class Result(SparseModel):
     environment: parts.Environment
     reliance: Reliance | None = None
     robustness: dict[Literal["test", "unseen"], Robustness] | None = None
+    uncertainty: Uncertainty | None = None
 
     @property
     def track(self) -> Track:
@@ -80,6 +82,8 @@ class Result(SparseModel):
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
         if self.reliance is not None:
             _check_reliance(self.reliance, self.submission)
+        if self.uncertainty is not None:
+            self.uncertainty.check({row.sample: row for row in self.per_sample}, self.metrics)
         for name, block in (self.robustness or {}).items():
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:

@@ -9,6 +9,10 @@ from .sample_scores import combine as combine
 from .sample_scores import mean_of as mean_of
 from .sample_scores import score_sample as score_sample
 from .sample_scores import stats_of as stats_of
+from .sigma_scores import SigmaSample as SigmaSample
+from .sigma_scores import gaussian_quantile as gaussian_quantile
+from .sigma_scores import score_sigma as score_sigma
+from .sigma_scores import states_sigma as states_sigma
 from .torch_metric import DepthScores as DepthScores
 from .uncertainty import Interval as Interval
 from .uncertainty import caution as caution

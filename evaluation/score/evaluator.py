@@ -19,6 +19,7 @@ from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.sigma_scores import score_sigma
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.sample import stored_frames
@@ -83,8 +84,11 @@ def evaluate(
     if description_error:
         raise description_error
     benchmark = benchmark_of(dataset.fingerprint)
+    stated = {row["sample"]: row.pop("stated") for row in rows}
+    owners = {row["sample"]: row["object"] for row in rows}
     return result.result_from_rows(
-        [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
+        rows,
+        uncertainty=result.uncertainty_of(stated, owners) if listing.sigmas else None,
         protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=description,
@@ -161,14 +165,20 @@ def _scored(
                 scores = score_sample(*pair, edge_band_px, void, unlit_mm)
         except PredictionError as error:
             problems = [str(error)]
+        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
+        stated = None
+        if sigmas is not None:
+            try:
+                sigma_mm = submission.read_sigma(sigmas, sample, dataset.size)
+                stated = None if problems else score_sigma(*pair, sigma_mm, void)
+            except PredictionError as error:
+                problems.append(f"{sample}{submission.SIGMA}: {error}")
         with dataset_lock:
             dataset.release(sample)
-        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
-        if sigmas is not None:
-            problems += submission.sigma_problems(sigmas, sample, dataset.size)
         if problems:
             return problems, []
-        return [], [{"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}]
+        row = {"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
+        return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
 
     return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
@@ -206,7 +216,22 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
         return [*problems, "per_sample: other samples than the split has"]
     for row in again.per_sample:
         problems += _sample_differences(stored_rows[row.sample], row)
-    return problems
+    return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
+
+
+def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: result.Uncertainty | None) -> list[str]:
+    if stored is None or recomputed is None:
+        blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
+        return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
+    lines = []
+    for sample, scores in recomputed.per_sample.items():
+        for key in protocol.UNCERTAINTY:
+            first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
+            # The area between two curves is a small difference of large numbers.
+            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 0.0):
+                texts = f"{_value_text(first)} in the result, {_value_text(second)} recomputed"
+                lines.append(f"{sample}: uncertainty.{key}: {texts}")
+    return lines
 
 
 def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:

@@ -9,5 +9,5 @@ from .prediction_files import Reader as Reader
 from .prediction_files import list_folder as list_folder
 from .prediction_files import read_plain as read_plain
 from .prediction_files import read_plain_file as read_plain_file
+from .prediction_files import read_sigma as read_sigma
 from .prediction_files import reader_for as reader_for
-from .prediction_files import sigma_problems as sigma_problems
