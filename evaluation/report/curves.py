@@ -1,6 +1,6 @@
 """The two plots of a stated uncertainty, as the lines that ``report.html`` draws: reliability and sparsification."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
@@ -32,7 +32,7 @@ def uncertainty_plots(block: Uncertainty | None) -> list[SimpleNamespace]:
 
 
 def _plot(
-    lines: dict[str, Points], highest: float, label: str, write: Callable[[float | None], str]
+    lines: Mapping[str, Points], highest: float, label: str, write: Callable[[float | None], str]
 ) -> SimpleNamespace:
     """Lines over [0, 1] in px, the first of them dashed; ``write`` gives a height as text. The legend stands where no
     line is: left of rising lines, right of falling ones."""

@@ -3,7 +3,7 @@ robustness."""
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -38,7 +38,7 @@ class Metrics(Headline, SparseModel):
     """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those of `SINCE_2` are not written where
     there are none: no unlit pixels are scored, or the rules know no void."""
 
-    SPARSE = SINCE_2
+    SPARSE: ClassVar[tuple[str, ...]] = SINCE_2
 
     object_interior_mae_mm: NonNegative | None
     object_interior_rmse_mm: NonNegative | None

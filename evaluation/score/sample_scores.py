@@ -237,10 +237,8 @@ def score_sample(
     excluded = index = np.flatnonzero(inside)
     if void is not None and void.any():
         excluded, index = np.flatnonzero(inside | void.ravel()), np.flatnonzero(inside & ~void.ravel())
-    beside = {
-        "void": None if void is None else int(np.count_nonzero(void)),
-        "unlit": None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel()),
-    }  # fmt: skip
+    void_px = None if void is None else int(np.count_nonzero(void))
+    unlit = None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     depths = prediction.take(index)
     errors = depths.astype(np.float64)
     errors -= target.take(index)
@@ -248,7 +246,7 @@ def score_sample(
         raise PredictionError(NOT_FINITE)
     background = _background_stats(prediction, target, excluded)
     if not index.size:
-        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), **beside)
+        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
     missing = depths <= 0
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
@@ -256,7 +254,7 @@ def score_sample(
     zone |= missing.view(np.uint8) * np.uint8(_MISSING)
     present = np.flatnonzero(np.bincount(zone)).tolist()
     zones = {code: stats_of(errors[zone == code]) for code in present}
-    return SampleScores(background, zones, _distribution(errors, missing), **beside)
+    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit)
 
 
 def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:

@@ -71,9 +71,7 @@ def score_sigma(
     if not stated.any():
         return SigmaSample(scores, None, curves)
     magnitude, sigma = magnitude[stated], sigma[stated]
-    observed = [
-        np.count_nonzero(magnitude <= gaussian_quantile(level) * sigma) / sigma.size for level in protocol.NOMINAL
-    ]
+    observed = [float(np.mean(magnitude <= gaussian_quantile(level) * sigma)) for level in protocol.NOMINAL]
     for percent in protocol.COVERED:
         scores[f"coverage_{percent}"] = observed[protocol.NOMINAL.index(percent / 100)]
     scores |= {"sigma_mean_mm": mean_of(sigma), "sigma_median_mm": float(np.median(sigma))}
