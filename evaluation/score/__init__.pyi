@@ -1,3 +1,5 @@
+from .check import Checked as Checked
+from .check import check_folder as check_folder
 from .evaluator import differences as differences
 from .evaluator import evaluate as evaluate
 from .evaluator import explain_eval as explain_eval

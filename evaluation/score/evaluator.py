@@ -18,6 +18,7 @@ from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.score.check import checked_description
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.sigma_scores import score_sigma
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
@@ -69,7 +70,7 @@ def evaluate(
     description = None
     if content is not None:
         try:
-            description = _checked(folder, content, len(dataset.sequence), listing.form)
+            description = checked_description(folder, content, listing.form, len(dataset.sequence))
         except SubmissionError as error:
             description_error = error
         result.environment  # noqa: B018  imported while the threads score
@@ -121,22 +122,6 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     if not samples:
         raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
     return samples
-
-
-def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str) -> submission.Submission:
-    """The folder's description, checked against the predictions' form and a sequence of ``frames``."""
-    description = submission.check_submission(folder, content)
-    outside = [index for index in description.frames_used if index >= frames]
-    if outside:
-        expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
-        problem = f"frames_used: {expected}, got {printable(str(outside), 100)}"
-    elif form == ".png" and description.png_mm_per_level is None:
-        problem = "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
-    elif form != ".png" and description.png_mm_per_level is not None:
-        problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
-    else:
-        return description
-    raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
 
 
 def _scored(

@@ -64,6 +64,17 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     return None
 
 
+def unit_note(largest: float, units: Units) -> str | None:
+    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value of all samples."""
+    suspicious = {
+        "mm": (0 < largest < protocol.METRES_BELOW, "are these metres or normalised depth?"),
+        "m": (largest > protocol.METRES_AT_MOST, "are these mm?"),
+        "normalised": (largest > protocol.METRES_BELOW, "are these m or mm?"),
+    }
+    wrong, question = suspicious[units]
+    return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
+
+
 def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str) -> tuple[Depth, Depth]:
     """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
 

@@ -105,6 +105,16 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     return Listing(form, problems, present, sigmas)
 
 
+def samples_in(folder: Path) -> list[str]:
+    """The samples that a folder holds a file of its own for, by the files' names, ascending."""
+    try:
+        names = sorted(path.name for path in folder.iterdir())
+    except OSError as error:
+        raise PredictionError(f"{printable(str(folder), 500)} can't be read: {error.strerror}") from None
+    stems = (name.removesuffix(suffix) for name in names for suffix in PER_SAMPLE if name.endswith(suffix))
+    return list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
+
+
 def read_sigma(folder: Path, sample: str, size: tuple[int, int]) -> NDArray[Any]:
     """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the file's name, for any other
     content."""
