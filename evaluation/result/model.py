@@ -14,10 +14,10 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.result import parts
 from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
-from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty
-from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
+from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty, uncertainty_of
+from fpp_ml_bench.evaluation.score import ErrorStats, SigmaSample, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.schema import Count, SparseModel, Text
+from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
 
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
@@ -99,6 +99,29 @@ class Result(SparseModel):
         for key, computed in derived.items():
             _check_same(key, stored[key], computed)
         return self
+
+
+class ArrayScores(StrictModel):
+    """The scores that a `Result` has, of arrays in memory: without a submission and a dataset, so it is not ranked."""
+
+    metrics: Metrics
+    intervals: parts.Intervals
+    median: Metrics
+    pooled: parts.Headline
+    samples_without_object: Count
+    samples_without_background: Count
+    per_object: list[parts.ObjectResult]
+    per_sample: list[SampleResult]
+    bootstrap: parts.Bootstrap
+    seeds: dict[Text, Count]
+    uncertainty: Uncertainty | None = None
+
+
+def array_scores(rows: list[dict[str, Any]], stated: Mapping[str, SigmaSample]) -> ArrayScores:
+    """`ArrayScores` from ``per_sample`` rows (keys of `SampleResult`) and the ``stated`` uncertainty of all or none."""
+    per_sample = [SampleResult(**row) for row in rows]
+    uncertainty = uncertainty_of(stated, {row.sample: row.object for row in per_sample}) if stated else None
+    return ArrayScores(per_sample=per_sample, uncertainty=uncertainty, **_derived(per_sample))
 
 
 def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:

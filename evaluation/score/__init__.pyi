@@ -1,3 +1,4 @@
+from .arrays import evaluate_arrays as evaluate_arrays
 from .check import Checked as Checked
 from .check import check_folder as check_folder
 from .conformal import Calibration as Calibration

@@ -14,8 +14,7 @@ SUMMARY = (
 EXAMPLES = (
     "fpp-bench predict phase data/full --split validation --out predictions-validation",
     "fpp-bench predict phase data/full --split test --out predictions",
-    "fpp-bench conformal predictions --dataset data/full --calibrate validation --from predictions-validation \\",
-    "    --out predictions-conformal",
+    "fpp-bench conformal predictions --dataset data/full --from predictions-validation --out predictions-conformal",
     "fpp-eval predictions-conformal --dataset data/full --split test",
 )
 
