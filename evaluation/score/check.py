@@ -1,5 +1,7 @@
 """What can be checked of a submission without ground truth: its description, its files, their size and values."""
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path

@@ -252,8 +252,8 @@ def score_sample(
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
     zone |= wide.ravel().take(index).view(np.uint8) * np.uint8(_WIDE)
     zone |= missing.view(np.uint8) * np.uint8(_MISSING)
-    present = np.flatnonzero(np.bincount(zone)).tolist()
-    zones = {code: stats_of(errors[zone == code]) for code in present}
+    within = {code: zone == code for code in range(_EDGE + _WIDE + _MISSING + 1)}
+    zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
     return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit)
 
 
