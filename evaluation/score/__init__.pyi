@@ -3,6 +3,7 @@ from .check import Checked as Checked
 from .check import check_folder as check_folder
 from .conformal import Calibration as Calibration
 from .conformal import calibrate as calibrate
+from .conformal import counted as counted
 from .conformal import largest_coverage as largest_coverage
 from .conformal import write_calibrated as write_calibrated
 from .evaluator import differences as differences

@@ -50,6 +50,11 @@ def largest_coverage(objects: int) -> float:
     return objects / (objects + 1)
 
 
+def counted(objects: int) -> str:
+    """``5 calibration objects``."""
+    return f"{objects} calibration object{'' if objects == 1 else 's'}"
+
+
 def conformal_quantile(scores: Mapping[str, list[Scores]], coverage: float) -> float:
     """The smallest score q such that the shares of scores up to q, (n,) for each view of each object, averaged over the
     views of an object and summed over the n objects, reach ``coverage`` x (n + 1). Raises PredictionError where the
@@ -57,10 +62,9 @@ def conformal_quantile(scores: Mapping[str, list[Scores]], coverage: float) -> f
     objects = {name: views for name, own in scores.items() if (views := [view for view in own if view.size])}
     count = len(objects)
     if coverage > largest_coverage(count) + 1e-12:
-        raise PredictionError(
-            f"{count} calibration objects support a coverage of at most {100 * largest_coverage(count):.1f}%, "
-            f"{100 * coverage:g}% was asked: give a smaller --coverage, or calibrate on a split of more objects"
-        )
+        support = f"{counted(count)} can support a coverage of at most {100 * largest_coverage(count):.1f}%"
+        more = "calibrate on a split of more objects (train, for a method that learned from none)"
+        raise PredictionError(f"{support}, {100 * coverage:g}% was asked: give a smaller --coverage, or {more}")
     values = np.concatenate([view for views in objects.values() for view in views])
     weights = np.concatenate(
         [np.full(view.size, 1 / (len(views) * view.size)) for views in objects.values() for view in views]

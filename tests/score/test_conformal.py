@@ -68,7 +68,7 @@ def command(folders, dataset, out, *arguments):
 def test_the_command_scales_sigma_and_nothing_else(folders, dataset, tmp_path, capsys):
     assert command(folders, dataset, tmp_path / "out", "--coverage", "0.5") == 0
     said = capsys.readouterr().out
-    assert "2 samples of 1 objects, which support at most 50.0%" in said
+    assert "2 samples; 1 calibration object can support at most 50.0%" in said
     found = calibrate(folders[1], dataset, coverage=0.5)
     # With one object, 50% need all of it: the factor is its largest score.
     assert found.factor * gaussian_quantile(0.5) == pytest.approx(4 * 3.5, rel=0.4)
@@ -89,7 +89,7 @@ def test_what_can_not_be_calibrated_is_refused(folders, dataset, tmp_path, capsy
     test, validation = folders
     out = tmp_path / "out"
     assert command(folders, dataset, out) == 2
-    assert "1 calibration objects support a coverage of at most 50.0%, 68% was asked" in capsys.readouterr().err
+    assert "1 calibration object can support a coverage of at most 50.0%, 68% was asked" in capsys.readouterr().err
     assert command(folders, dataset, out, "--coverage", "95") == 2
     assert "expected a share between 0 and 1" in capsys.readouterr().err
     half = ("--coverage", "0.5")
