@@ -84,6 +84,15 @@ class Method(ABC):
         return {}
 
     @property
+    def learned_from(self) -> dict[str, Any]:
+        """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
+        if (config := self.weights_config) is None:
+            return {"data": "none"}
+        benchmark = training.training_benchmark(config.dataset_fingerprint) or config.benchmark
+        title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
+        return {"data": "train-split", "versions": [title]}
+
+    @property
     def software(self) -> dict[str, str]:
         """Versions of this package, Python and the packages that the method computes with."""
         versions = {package: version(package) for package in self.packages}

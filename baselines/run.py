@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, check_submission
@@ -42,31 +43,40 @@ def predict_split(
     submission's settings.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
-    the median over the split. Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the
-    same samples, and `DatasetError` when the dataset lacks a frame that the method needs."""
+    the median over the split. A run that was stopped continues behind its last finished sample.
+
+    Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same method, settings, data
+    and machine, and `DatasetError` when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)
-    _prepare(out, samples)
-    seconds: list[float] = []
-    reports: dict[str, dict[str, Any]] = {}
-    for number, sample in enumerate(samples):
-        frames = captured_frames(opened, method, sample)
-        if number == 0:
-            method.predict(frames)
-        started = perf_counter()
-        answer = method.answer(frames)
-        seconds.append(perf_counter() - started)
-        reports[sample] = dict(answer.report)
-        _write_prediction(out / f"{sample}{PREDICTION_SUFFIX}", answer.depth, opened.size)
-        if answer.sigma_mm is not None:
-            _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+    run = _prepare(out, opened, method, split)
+    warm = False
+    for sample in samples:
+        path = out / f"{sample}{PREDICTION_SUFFIX}"
+        if not run.holds(sample, path, opened.size):
+            frames = captured_frames(opened, method, sample)
+            if not warm:
+                method.predict(frames)
+                warm = True
+            started = perf_counter()
+            answer = method.answer(frames)
+            seconds = perf_counter() - started
+            _write_prediction(path, answer.depth, opened.size)
+            if answer.sigma_mm is not None:
+                _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+            run.add(sample, Finished(seconds, dict(answer.report) if method.reports else {}))
         progress(1)
-    median = statistics.median(seconds)
+    median = statistics.median(run.finished[sample].seconds for sample in samples)
     summary: dict[str, Any] = {}
     if method.reports:
+        reports = {sample: run.finished[sample].report for sample in samples}
         write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
         summary = method.summary(list(reports.values()))
-    submission = check_submission(out, _described(method, median, summary))
+    timed = {"seconds_per_sample": float(f"{median:.6g}"), "seconds_source": "measured"}
+    described = _described(method)
+    described["settings"] |= summary
+    submission = check_submission(out, {**described, **timed})
     write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
+    run.remove()
     return Run(len(samples), median)
 
 
@@ -83,21 +93,30 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
     return frames
 
 
-def _prepare(out: Path, samples: list[str]) -> None:
-    """Make ``out``, or take over one that a stopped run of the same samples left (it has no submission.yaml)."""
-    expected = {f"{sample}{suffix}" for sample in samples for suffix in (PREDICTION_SUFFIX, SIGMA)} | {REPORTS_FILE}
+def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> UnfinishedRun:
+    """Make ``out``, or take over one that a stopped run left; what of it is finished."""
+    samples = opened.samples(split)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
     file_names = sorted(path.name for path in out.iterdir())
+    expected = set()
+    if UNFINISHED_FILE in file_names:
+        expected = {f"{sample}{suffix}" for sample in samples for suffix in (PREDICTION_SUFFIX, SIGMA)}
+        expected |= {UNFINISHED_FILE, REPORTS_FILE, SUBMISSION_FILE}
     foreign = [name for name in file_names if name not in expected and not name.endswith(".tmp")]
+    foreign.sort(key=lambda name: name != SUBMISSION_FILE)  # of a finished run: its first name to say
+    data = {"split": split, "fingerprint": opened.fingerprint}
+    run = UnfinishedRun(out, {**_described(method), **data})
     if foreign:
         raise PredictionError(
             f"{out}: already holds {foreign[0]}{' and more' if len(foreign) > 1 else ''}; give a new or empty folder"
         )
     for name in file_names:
-        (out / name).unlink()
+        if name.endswith(".tmp"):
+            (out / name).unlink()
+    return run
 
 
 def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
@@ -111,15 +130,15 @@ def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int
     temporary.replace(path)
 
 
-def _described(method: Method, seconds_per_sample: float, summary: dict[str, Any]) -> dict[str, Any]:
-    """What the submission says of ``method`` and the run."""
+def _described(method: Method) -> dict[str, Any]:
+    """What the submission says of ``method`` and the machine, beside the time."""
     return {
         "name": method.title, "method": method.name, "units": method.units, "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
         **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
-        "seconds_per_sample": float(f"{seconds_per_sample:.6g}"), "seconds_source": "measured",
+        "learned_from": method.learned_from,
         "hardware": describe_hardware().to_dict(), "software": method.software,
-        "settings": {**method.settings, **summary}, **({"seeds": dict(method.seeds)} if method.seeds else {}),
+        "settings": {**method.settings}, **({"seeds": dict(method.seeds)} if method.seeds else {}),
     }  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """A predictor that looks at nothing: what a method's error is worth is how far it is from this one's."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,8 +11,8 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
 
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
-TRAINING_MEAN_MM = 1743.75
-"""Mean exact depth over the object pixels of the training split of ``fpp-bench-full`` version 1."""
+TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
+"""Mean exact depth over the object pixels of the training split of that benchmark."""
 
 
 class ConstantMethod(Method):
@@ -34,6 +36,11 @@ class ConstantMethod(Method):
         self.frames_used = rig.sequence.config("single_shot")
         self.title = f"Constant depth, {at} mm" if at not in known else f"Constant depth: {at}"
         self.settings = {"at": at, "depth_mm": self.depth_mm}
+
+    @property
+    def learned_from(self) -> dict[str, Any]:
+        train_split = {"data": "train-split", "versions": [TRAINING_MEAN_DATA]}
+        return train_split if self.settings["at"] == TRAINING_MEAN else super().learned_from
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return np.full(self.shape, self.depth_mm, dtype=np.float32)

@@ -38,7 +38,6 @@ from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.render import BuildSettings, build, single_mesh
-from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import paper_rig
@@ -121,7 +120,7 @@ def measure(
     add("decode, depth alone", *switched(lambda: depth(reasons=False)))
     add("decode in the mask, against whole and masked", lambda: depth(mask=mask, reasons=False),
         lambda: np.where(mask, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes())  # fmt: skip
-    void = (dataset.flags(samples[0]) & VOID) > 0
+    void = dataset.void(samples[0])
 
     def unmixed(**options: Any) -> bytes:
         depth_mm = decode_stack(frames, rig, reasons=False, **options).depth_mm

@@ -4,19 +4,21 @@ different protocol versions are never ranked together."""
 
 from typing import Literal, get_args
 
-PROTOCOL_VERSION = "1.1.0"
-SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.2.0"
-"""What is written. 2.1.0 adds the optional ``dataset.benchmark``, 2.2.0 the optional ``robustness``; files of every
-`SchemaVersion` are read."""
+PROTOCOL_VERSION = "2.0.0"
+SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0", "2.3.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.3.0"
+"""What is written. 2.1.0 adds the optional ``dataset.benchmark``, 2.2.0 the optional ``robustness``, 2.3.0 the keys of
+protocol 2: void and unlit pixels, ``uncertainty`` and ``submission.learned_from``; every `SchemaVersion` is read."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]
 """What a method was given of the ground truth of the scored samples; see PROTOCOL.md."""
-Mode = Literal["standard", "paper-individual"]
+Mode = Literal["standard", "paper", "paper-individual"]
+"""By which rules; see PROTOCOL.md. ``paper-individual`` stands in results of protocol 1 only: ``paper`` for normalised
+depth."""
 Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)
-MODES: tuple[str, ...] = get_args(Mode)
+MODES: tuple[Mode, ...] = ("standard", "paper")
 
 EDGE_BAND_PX = 3
 """Object pixels nearer than this to a depth edge form the edge set, the others the interior."""
@@ -45,8 +47,26 @@ DISTRIBUTION = (
 (the MAE once the median error has been subtracted)."""
 WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share")
 
-METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND
+SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", "unlit_missing_share")
+"""Since protocol 2: the share of the image that counts in no set, and scores of its unlit pixels, against
+``depth_exact`` only. Left out of a result where no sample has them."""
+
+METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
 HIGHER_IS_BETTER = WITHIN
+
+COVERED = (68, 95, 99)
+NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Coverages of the intervals whose hits are counted; those of `COVERED`, in per cent, are scores of their own."""
+LEFT_OUT = tuple(step / 20 for step in range(20))
+"""Shares of the least sure object pixels that the sparsification curve leaves out."""
+SURE_LEFT_OUT = 0.05
+NLL_LEAST_SIGMA_MM, NLL_LARGEST_RATIO = 0.01, 10.0
+"""The negative log-likelihood takes no sigma below the first, and no |error| / sigma above the second."""
+UNCERTAINTY = (
+    *(f"coverage_{percent}" for percent in COVERED), "sigma_mean_mm", "sigma_median_mm", "nll", "ause_mae_mm",
+    "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm", "unstated_share",
+)  # fmt: skip
+"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result."""
 
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""

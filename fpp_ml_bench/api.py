@@ -13,10 +13,12 @@ True
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from fpp_ml_bench import decoding
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import report, result, score
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.loaders import storage
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fpp_ml_bench.baselines.method import Method
+    from fpp_ml_bench.evaluation.score.arrays import Maps
     from fpp_ml_bench.leaderboard.groups import Group
     from fpp_ml_bench.optics import Rig
 
@@ -174,40 +177,78 @@ def decode(
     return decoding.decode_stack(frames, rig, direction, steps, mask)  # type: ignore[arg-type]
 
 
+@overload
 def evaluate(
-    predictions: str | Path, dataset: "str | Path | storage.DatasetFolder", split: str = "test", target: str = "depth"
-) -> "result.Result":
-    """Score a folder of predictions, as ``fpp-eval`` does.
+    predictions: str | Path, dataset: "str | Path | storage.DatasetFolder", split: str = "test", target: str = "depth",
+    *, mode: str = "standard", edge_band_px: int = EDGE_BAND_PX,
+) -> "result.Result": ...  # fmt: skip
+
+
+@overload
+def evaluate(
+    predictions: "Maps", dataset: "Maps", *, flags: "Maps | None" = None, sigma: "Maps | None" = None,
+    objects: Sequence[str] | None = None, edge_band_px: int = EDGE_BAND_PX,
+) -> "result.ArrayScores": ...  # fmt: skip
+
+
+def evaluate(
+    predictions: Any, dataset: Any, split: str = "test", target: str = "depth", *, mode: str = "standard",
+    edge_band_px: int = EDGE_BAND_PX, flags: Any = None, sigma: Any = None, objects: Any = None,
+) -> "result.Result | result.ArrayScores":  # fmt: skip
+    """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
     Parameters
     ----------
-    predictions : str or Path
-        Folder with a ``submission.yaml`` and a prediction for each sample of the split.
-    dataset : str, Path or DatasetFolder
-        What was predicted.
+    predictions : str or Path, or array
+        Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm, 0 = not
+        measured: floats (N, H, W), or a list of maps (H, W).
+    dataset : str, Path or DatasetFolder, or array
+        What was predicted. For arrays, the true depth in mm, 0 = background, in the form of the predictions.
     split : {"train", "validation", "test"}
-        Its samples must all be there, and no others.
+        Of a folder: its samples must all be there, and no others.
     target : {"depth", "depth_exact"}
-        Decoded depth as in the paper, or the exact depth of generated data.
+        Of a folder: decoded depth as in the paper, or the exact depth of generated data.
+    mode : {"standard", "paper"}
+        Of a folder: void pixels in no set, or the paper's sets, without void.
+    edge_band_px : int
+        Object pixels nearer than this to a depth edge count as edge.
+    flags : array, optional
+        Of arrays: uint8, the column ``flags`` of the data; unlit and mixed pixels are void.
+    sigma : array, optional
+        Of arrays: the stated standard uncertainty in mm, 0 where none is stated.
+    objects : sequence of str, optional
+        Of arrays: what each sample shows; intervals are over objects. By default, each sample is an object of its own.
 
     Returns
     -------
-    Result
-        The content of ``result.json``: ``metrics.object_mae_mm`` and the other scores in mm, with intervals.
+    Result or ArrayScores
+        ``metrics.object_mae_mm`` and the other scores in mm, with intervals; of a folder, the content of
+        ``result.json``.
 
     Raises
     ------
     SubmissionError, PredictionError, DatasetError
-        Naming every file with a problem.
+        Naming every file with a problem, or the first sample with one.
 
     Examples
     --------
     >>> import fpp_ml_bench as fpp
     >>> fpp.evaluate("predictions", "data/mini", target="depth_exact").metrics.object_mae_mm < 1.0
     True
+    >>> import numpy as np
+    >>> truth = np.full((2, 4, 5), 1800.0)
+    >>> fpp.evaluate(truth + 2.0, truth).metrics.object_mae_mm
+    2.0
     """
+    in_memory = {"flags": flags, "sigma": sigma, "objects": objects}
+    if not isinstance(predictions, (str, Path)):
+        if isinstance(dataset, (str, Path, storage.DatasetFolder)):
+            raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")
+        return score.evaluate_arrays(predictions, dataset, **in_memory, edge_band_px=edge_band_px)
+    if given := [name for name, values in in_memory.items() if values is not None]:
+        raise PredictionError(f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own")
     opened = dataset if isinstance(dataset, storage.DatasetFolder) else storage.DatasetFolder(dataset)
-    return score.evaluate(predictions, opened, split, target)
+    return score.evaluate(predictions, opened, split, target, edge_band_px, mode)
 
 
 def compare(first: "str | Path | result.Result", second: "str | Path | result.Result") -> "report.Comparison":

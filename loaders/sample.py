@@ -52,6 +52,11 @@ class Flag(IntFlag):
 VOID = Flag.UNLIT | Flag.MIXED
 
 
+def void_pixels(flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels that are void, neither object nor background, bool (H, W), of the `Flag`s of each."""
+    return (flags & np.uint8(VOID)) != 0
+
+
 @dataclass
 class Row:
     """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest,

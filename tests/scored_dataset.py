@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.sample import Flag, Row
 from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
@@ -44,11 +44,12 @@ Scene = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.float32]]]
 
 def make_dataset(
     folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True, views: Sequence[str] = VIEWS,
-    scene: Scene | None = None,
+    scene: Scene | None = None, flagged: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
 ) -> DatasetFolder:  # fmt: skip
     """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more than ``depth``.
 
     ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
+    ``flagged`` gives the flags of a depth, by default none. Unlit pixels lose their ``depth``, not their exact one.
     """
     scratch = folder / ".build"
     scratch.mkdir(parents=True)
@@ -64,6 +65,9 @@ def make_dataset(
                     frame, depth = np.full(size, index, dtype=np.uint8), disk_depth(size, 10 * number + index)
                 else:
                     frame, depth = scene(seed)
+                exact_mm = depth + np.float32(0.5) * (depth > 0)
+                flags = np.zeros(depth.shape, np.uint8) if flagged is None else flagged(depth)
+                depth = np.where(flags & np.uint8(Flag.UNLIT), np.float32(0), depth)
                 rows.append(
                     Row(
                         sample,
@@ -71,9 +75,9 @@ def make_dataset(
                         view,
                         {0: frame},
                         depth,
-                        depth + np.float32(0.5) * (depth > 0) if exact else None,
+                        exact_mm if exact else None,
                         {},
-                        np.zeros(depth.shape, np.uint8),
+                        flags,
                         np.full(depth.shape, 255, np.uint8),
                     )
                 )

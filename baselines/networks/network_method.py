@@ -54,7 +54,7 @@ class NetworkMethod(Method):
         self.frames_used = (self.frame,)
         self.uses_ground_truth_mask = config.background_removed
         if self.depth_range == "oracle":
-            self.uses_ground_truth_range, self.units, self.mode = True, "normalised", "paper-individual"
+            self.uses_ground_truth_range, self.units, self.mode = True, "normalised", "paper"
         of_range = "" if self.depth_range is None else f"{self.depth_range} range"
         parts = [config.title, of_range, "" if self.frame == usual_frame else f"frame {self.frame}"]
         self.title = ", ".join(part for part in parts if part) + (f" ({remark})" if remark else "")

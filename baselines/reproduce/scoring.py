@@ -99,11 +99,12 @@ def score_all_frames(
     scores: dict[tuple[str, int], Scores] = {}
     for sample in samples:
         target_mm = opened.target_mm(sample)
+        void = opened.void(sample) if scoring[1] == "standard" else None
         for frame in frames:
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            metrics = score_sample(*scored_pair(values, target_mm, *scoring, sample)).metrics()
+            metrics = score_sample(*scored_pair(values, target_mm, *scoring, sample), void=void).metrics()
             scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
     rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
     of_frames = [_mean([scores[sample, frame] for sample in samples]) for frame in frames]

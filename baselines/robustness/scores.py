@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.robustness.axes import Corruptions
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.sample import VOID
+from fpp_ml_bench.evaluation.score import states_sigma
+from fpp_ml_bench.loaders.sample import void_pixels
 
 Scores = dict[str, float | None]
 SCORES = ("mae_mm", "protocol_mae_mm", "wrong_share", "unanswered_share", "confident_share", "coverage")
@@ -30,7 +32,7 @@ class Truth:
 
     @classmethod
     def of(cls, depth_mm: NDArray[np.float32], flags: NDArray[np.uint8]) -> "Truth":
-        return cls(depth_mm, (depth_mm > 0) & ((flags & VOID) == 0))
+        return cls(depth_mm, object_mask(depth_mm) & ~void_pixels(flags))
 
 
 def score(
@@ -63,7 +65,7 @@ def score(
     }
     if sigma_mm is not None:
         sigma = sigma_mm[truth.scored].astype(np.float64)
-        stated = answered & (sigma > 0)
+        stated = states_sigma(given, sigma)
         scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
         scores["coverage"] = float(stated.mean())
     return scores

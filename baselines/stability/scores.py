@@ -94,7 +94,7 @@ NORMALISATION.family(
 )(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))  # fmt: skip
 
 
-@NORMALISATION.family("scored", "mm", refuses=DatasetError, mode=("standard", "paper-individual"),
+@NORMALISATION.family("scored", "mm", refuses=DatasetError, mode=("standard", "paper"),
                       kind=("part", "full frame", "flat plane", "one pixel", "empty"),
                       expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either")  # fmt: skip
 def scored(kind: str, mode: str) -> Outcome:

@@ -108,7 +108,9 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         run_s, depth = rules.timed(predict)
         seconds.append(run_s)
         if setting.scored:
-            sample = score_sample(*scored_pair(depth, views.target_mm(name), method.units, method.mode, name))
+            void = views.void(name) if method.mode == "standard" else None
+            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name)
+            sample = score_sample(*pair, void=void)
             missing_share = sample.missing / max(sample.object.pixels, 1)
             scores.append((sample.object.mae_mm, sample.valid.mae_mm, missing_share))
     # A run longer than the limit is not repeated.

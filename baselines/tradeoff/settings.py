@@ -22,7 +22,7 @@ from fpp_ml_bench.decoding import Directions, plain_plan
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.sample import Row, void_pixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
@@ -60,6 +60,10 @@ class StoredViews:
         """Depth float32 (H, W) in mm to score against, 0 = background."""
         return self.opened.target_mm(name, self.target)
 
+    def void(self, name: str) -> NDArray[np.bool_]:
+        """Pixels bool (H, W) that count in no set."""
+        return self.opened.void(name)
+
 
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> StoredViews:
     """``per_object`` views of each object of ``split``, spread over its views, in row order. `DatasetError` for a split
@@ -92,6 +96,9 @@ class PhotographedViews:
     def target_mm(self, name: str) -> NDArray[np.float32]:
         row = self._rows[name]
         return np.where(object_mask(row.depth_mm), np.asarray(row.depth_exact_mm), np.float32(0))
+
+    def void(self, name: str) -> NDArray[np.bool_]:
+        return void_pixels(np.asarray(self._rows[name].flags))
 
     @cached_property
     def _rows(self) -> dict[str, Row]:

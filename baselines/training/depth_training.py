@@ -38,7 +38,7 @@ from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 WEIGHTS, DONE = "weights.safetensors", "done.json"
 SCORING: dict[Normalisation, tuple[Units, Mode]] = {
-    "raw": ("mm", "standard"), "global": ("m", "standard"), "individual": ("normalised", "paper-individual"),
+    "raw": ("mm", "standard"), "global": ("m", "standard"), "individual": ("normalised", "paper"),
 }  # fmt: skip
 """How a network's output is scored: its unit, and the evaluator's mode."""
 LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
@@ -215,8 +215,10 @@ class DepthTraining(Training):
                 sample = self.validation.samples[row]
                 if not np.isfinite(values).all():
                     raise TrainingError(f"{self.out}: the network's answer to {sample} is not finite; it has diverged")
-                pair = scored_pair(values, self.validation.source.depth_mm(sample), units, mode, sample)
-                metric.update(*(torch.tensor(depth)[None] for depth in pair))
+                source = self.validation.source
+                pair = scored_pair(values, source.depth_mm(sample), units, mode, sample)
+                maps = (*pair, source.void(sample)) if mode == "standard" else pair
+                metric.update(*(torch.tensor(pixels)[None] for pixels in maps))
         losses = gather_object(losses)
         means = {key: float(mean) for key, mean in metric.compute().items() if key in LOGGED}
         scores = {key: None if math.isnan(means[key]) else means[key] for key in LOGGED}

@@ -2,15 +2,17 @@
 
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from markupsafe import Markup
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.protocol import COVERED, HEADLINE, SINCE_2
+from fpp_ml_bench.evaluation.report.curves import uncertainty_plots
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, sheet_png
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, page, percent, render, signed
-from fpp_ml_bench.evaluation.result import Result, SampleResult, write_file
+from fpp_ml_bench.evaluation.result import Result, SampleResult, Uncertainty, write_file
 from fpp_ml_bench.evaluation.score import scored_pair
 from fpp_ml_bench.evaluation.submission import list_folder, reader_for
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -38,6 +40,8 @@ _TITLES = {
     "object_wide_band_mae_mm": "Object within 8 px of edges, MAE",
     "object_wide_interior_mae_mm": "Object 8 px or more from edges, MAE",
     "object_wide_band_share": "Object within 8 px of edges, share of pixels",
+    "void_share": "Void, share of the image", "unlit_mae_mm": "Unlit, MAE", "unlit_rmse_mm": "Unlit, RMSE",
+    "unlit_valid_mae_mm": "Unlit where predicted, MAE", "unlit_missing_share": "Unlit, not predicted",
 }  # fmt: skip
 """Every key of `METRICS` in the order of the page."""
 
@@ -55,6 +59,8 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
         samples=_panels(result, dataset, Path(predictions_folder)),
         bars=histogram(errors, statistics.fmean(errors), "object MAE of a sample") if errors else None,
         score_table=Markup(score_table(result)),
+        plots=uncertainty_plots(result.uncertainty),
+        uncertainty_table=Markup(uncertainty_table(result.uncertainty)) if result.uncertainty else "",
         sample_table=Markup(sample_table(result)),
     )
     path = Path(out) / REPORT_FILE
@@ -125,12 +131,39 @@ def score_table(result: Result) -> str:
     """Every score of a result: mean over samples with its interval, median over samples, pooled over pixels."""
     rows = []
     for key, title in _TITLES.items():
+        if key in SINCE_2 and getattr(result.metrics, key) is None:
+            continue
         mean, median = (_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
         interval = interval_text(result.intervals.of(key)) if key in HEADLINE else ""
         pooled = getattr(result.pooled, key, None)
         rows.append([title, mean, interval, median, "" if pooled is None else _text(key, pooled)])
     caption = "Scores in mm. Mean, its 95% interval over objects, and median over samples; pooled over all pixels"
     return html_table(caption, ("Score", "Mean", "95% interval", "Median", "Pooled"), rows)
+
+
+_UNCERTAINTY_TITLES = {
+    **{f"coverage_{level}": f"Pixels in their {level}% interval" for level in COVERED},
+    "sigma_mean_mm": "Mean sigma", "sigma_median_mm": "Median sigma", "nll": "Negative log-likelihood, nats",
+    "ause_mae_mm": "AUSE, MAE", "ause_rmse_mm": "AUSE, RMSE", "sure_mae_mm": "MAE of the surest 95%",
+    "sure_rmse_mm": "RMSE of the surest 95%", "unstated_share": "Object without a sigma",
+}  # fmt: skip
+"""Every key of `UNCERTAINTY` in the order of the page."""
+
+
+def uncertainty_table(block: Uncertainty) -> str:
+    """Every score of a stated uncertainty: mean over samples, and over the views of each object."""
+    columns = [block.metrics, *block.per_object.values()]
+    rows = []
+    for key, title in _UNCERTAINTY_TITLES.items():
+        write = (
+            percent
+            if "coverage" in key or "share" in key
+            else partial(signed, plus="")
+            if key == "nll"
+            else millimetres
+        )
+        rows.append([title, *(write(getattr(scores, key)) for scores in columns)])
+    return html_table("Stated uncertainty; mm", ("Score", "All", *block.per_object), rows)
 
 
 def sample_table(result: Result) -> str:

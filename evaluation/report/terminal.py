@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.evaluation import report
-from fpp_ml_bench.evaluation.protocol import PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import COVERED, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, percent, seconds, signed
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import caution
@@ -35,7 +35,8 @@ def result_table(result: Result) -> Group:
         f"{info.size[1]}x{info.size[0]} px, against {result.target}, {result.track} track"
         f"{'' if result.mode == 'standard' else f', mode {result.mode}'}\n"
     )
-    return Group(*(part for part in (title, _scores(result), _notes(result), _worst(result)) if part))
+    parts = (title, _scores(result), _notes(result), _uncertainty(result), _worst(result))
+    return Group(*(part for part in parts if part))
 
 
 def _scores(result: Result) -> Table:
@@ -79,6 +80,14 @@ def _notes(result: Result) -> Text:
         f"MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm, away from edges "
         f"{millimetres(scores.object_interior_valid_mae_mm)} mm.",
     ]
+    if scores.void_share is not None:
+        lines.append(f"Void pixels, in no set: {percent(scores.void_share)} of the image (unlit, or of mixed depths).")
+    if scores.unlit_mae_mm is not None:
+        lines.append(
+            f"Unlit pixels: MAE {millimetres(scores.unlit_mae_mm)}, RMSE {millimetres(scores.unlit_rmse_mm)} mm; "
+            f"{percent(scores.unlit_missing_share)} not measured, MAE of the others "
+            f"{millimetres(scores.unlit_valid_mae_mm)} mm."
+        )
     if result.samples_without_object:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
     if result.samples_without_background:
@@ -93,6 +102,24 @@ def _notes(result: Result) -> Text:
     time = f"{seconds(submission.seconds_per_sample)} s ({submission.seconds_source})" if known else "unknown time"
     lines.append(f"Frames used: {len(submission.frames_used)}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
+
+
+def _uncertainty(result: Result) -> Table | None:
+    if (block := result.uncertainty) is None:
+        return None
+    titles = [*(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL", "AUSE\nMAE"]
+    table = _table(
+        "Stated uncertainty", [*titles, "MAE of the\nsurest 95%", "Not\nstated"],
+        caption="mm; pixels within Gaussian intervals of sigma, means over samples; AUSE: area between the "
+        "sparsification curves by sigma and by error",
+    )  # fmt: skip
+    for name, scores in {"all": block.metrics, **block.per_object}.items():
+        cells = [percent(getattr(scores, f"coverage_{level}")) for level in COVERED]
+        cells += map(millimetres, (scores.sigma_mean_mm, scores.sigma_median_mm))
+        cells += [signed(scores.nll, plus=""), millimetres(scores.ause_mae_mm), millimetres(scores.sure_mae_mm)]
+        style = "bold" if name == "all" else None
+        table.add_row(Text(printable(name)), *cells, percent(scores.unstated_share), style=style)
+    return table
 
 
 def _worst(result: Result) -> Table | None:

@@ -8,7 +8,9 @@ from .file import result_json as result_json
 from .file import write_file as write_file
 from .file import write_json as write_json
 from .file import write_result as write_result
+from .model import ArrayScores as ArrayScores
 from .model import Result as Result
+from .model import array_scores as array_scores
 from .model import over_samples as over_samples
 from .model import result_from_rows as result_from_rows
 from .model import same as same
@@ -28,3 +30,6 @@ from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
 from .parts import dataset_identity as dataset_identity
 from .parts import ends as ends
+from .uncertainty import SigmaScores as SigmaScores
+from .uncertainty import Uncertainty as Uncertainty
+from .uncertainty import uncertainty_of as uncertainty_of

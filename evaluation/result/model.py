@@ -14,9 +14,10 @@ from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
 from fpp_ml_bench.evaluation.result import parts
 from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
-from fpp_ml_bench.evaluation.score import ErrorStats, combine, intervals_over_objects
+from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty, uncertainty_of
+from fpp_ml_bench.evaluation.score import ErrorStats, SigmaSample, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.schema import Count, SparseModel, Text
+from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
 
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
@@ -27,7 +28,7 @@ Scores = dict[str, float | None]
 class Result(SparseModel):
     """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
 
-    SPARSE = ("reliance", "robustness")
+    SPARSE = ("reliance", "robustness", "uncertainty")
 
     schema_version: SchemaVersion
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
@@ -51,6 +52,7 @@ class Result(SparseModel):
     environment: parts.Environment
     reliance: Reliance | None = None
     robustness: dict[Literal["test", "unseen"], Robustness] | None = None
+    uncertainty: Uncertainty | None = None
 
     @property
     def track(self) -> Track:
@@ -80,16 +82,46 @@ class Result(SparseModel):
             raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
         if self.reliance is not None:
             _check_reliance(self.reliance, self.submission)
+        if self.uncertainty is not None:
+            self.uncertainty.check({row.sample: row for row in self.per_sample}, self.metrics)
         for name, block in (self.robustness or {}).items():
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:
                 raise ValueError(f"robustness.{name} is that of the set {block.set}")
+        first = self.protocol_version.startswith("1.")
+        if self.mode not in (("standard", "paper-individual") if first else protocol.MODES):
+            raise ValueError(f"protocol {self.protocol_version} has no mode {self.mode}")
+        void = not first and self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width)
+            _check_void(row, height * width, void, void and self.target == "depth_exact")
         stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
         for key, computed in derived.items():
             _check_same(key, stored[key], computed)
         return self
+
+
+class ArrayScores(StrictModel):
+    """The scores that a `Result` has, of arrays in memory: without a submission and a dataset, so it is not ranked."""
+
+    metrics: Metrics
+    intervals: parts.Intervals
+    median: Metrics
+    pooled: parts.Headline
+    samples_without_object: Count
+    samples_without_background: Count
+    per_object: list[parts.ObjectResult]
+    per_sample: list[SampleResult]
+    bootstrap: parts.Bootstrap
+    seeds: dict[Text, Count]
+    uncertainty: Uncertainty | None = None
+
+
+def array_scores(rows: list[dict[str, Any]], stated: Mapping[str, SigmaSample]) -> ArrayScores:
+    """`ArrayScores` from ``per_sample`` rows (keys of `SampleResult`) and the ``stated`` uncertainty of all or none."""
+    per_sample = [SampleResult(**row) for row in rows]
+    uncertainty = uncertainty_of(stated, {row.sample: row.object for row in per_sample}) if stated else None
+    return ArrayScores(per_sample=per_sample, uncertainty=uncertainty, **_derived(per_sample))
 
 
 def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
@@ -132,8 +164,10 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
 
 
 def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None] = statistics.fmean) -> Scores:
-    """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it; None if none has."""
-    columns = {key: [value for row in rows if (value := row[key]) is not None] for key in METRICS}
+    """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it. Where none has it, it
+    is None, or left out if it is one of `SINCE_2`."""
+    columns = {key: [value for row in rows if (value := row.get(key)) is not None] for key in METRICS}
+    columns = {key: values for key, values in columns.items() if values or key not in protocol.SINCE_2}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 
 
@@ -158,8 +192,8 @@ def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
 
 def _check_sample(row: SampleResult, pixels: int) -> None:
     """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
-    if row.object_pixels + row.background_pixels != pixels:
-        raise ValueError(f"{row.sample}: object and background pixels do not add up to the image's {pixels}")
+    if row.object_pixels + row.background_pixels + (row.void_pixels or 0) != pixels:
+        raise ValueError(f"{row.sample}: object, background and void pixels do not add up to the image's {pixels}")
     sets = {name: row.stats(name) for name in ("object", "background")}
     for name, stats in sets.items():
         mae, rmse = stats.mae_mm, stats.rmse_mm
@@ -182,6 +216,23 @@ def _check_sample(row: SampleResult, pixels: int) -> None:
         raise ValueError(f"{row.sample}: object median, 95th percentile, RMSE and maximum are out of order")
     if abs(bias) > mae * loose or shift_free > mae * loose:
         raise ValueError(f"{row.sample}: object bias or shift-free MAE is above the MAE, which no error has")
+
+
+def _check_void(row: SampleResult, pixels: int, void: bool, unlit: bool) -> None:
+    """Refuse (ValueError) a sample whose void or unlit pixels are missing, extra, or contradict their scores; ``void``,
+    ``unlit``: whether the rules know them."""
+    for name, known in (("void", void), ("unlit", unlit)):
+        if (getattr(row, f"{name}_pixels") is not None) != known:
+            raise ValueError(f"{row.sample}: {name}_pixels {'is missing' if known else 'is extra by these rules'}")
+    if not same(row.void_share, None if row.void_pixels is None else row.void_pixels / pixels):
+        raise ValueError(f"{row.sample}: void_share does not follow from void_pixels")
+    if (row.unlit_pixels or 0) > (row.void_pixels or 0):
+        raise ValueError(f"{row.sample}: unlit_pixels is above void_pixels")
+    mae, rmse, share = row.unlit_mae_mm, row.unlit_rmse_mm, row.unlit_missing_share
+    if not (mae is None) == (rmse is None) == (share is None) == (not row.unlit_pixels):
+        raise ValueError(f"{row.sample}: unlit scores must be null exactly when there is no unlit pixel")
+    if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
+        raise ValueError(f"{row.sample}: unlit RMSE is below its MAE, which no error has")
 
 
 def _check_reliance(reliance: Reliance, submission: Submission) -> None:

@@ -3,10 +3,11 @@ robustness."""
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from fpp_ml_bench.evaluation.protocol import SINCE_2
 from fpp_ml_bench.evaluation.score import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
@@ -33,8 +34,11 @@ class Headline(StrictModel):
     background_rmse_mm: NonNegative | None
 
 
-class Metrics(Headline):
-    """All scores: errors in mm, shares of the object's pixels. PROTOCOL.md defines each."""
+class Metrics(Headline, SparseModel):
+    """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those of `SINCE_2` are not written where
+    there are none: no unlit pixels are scored, or the rules know no void."""
+
+    SPARSE: ClassVar[tuple[str, ...]] = SINCE_2
 
     object_interior_mae_mm: NonNegative | None
     object_interior_rmse_mm: NonNegative | None
@@ -58,16 +62,26 @@ class Metrics(Headline):
     object_wide_band_mae_mm: NonNegative | None
     object_wide_interior_mae_mm: NonNegative | None
     object_wide_band_share: Share | None
+    void_share: Share | None = None
+    unlit_mae_mm: NonNegative | None = None
+    unlit_rmse_mm: NonNegative | None = None
+    unlit_valid_mae_mm: NonNegative | None = None
+    unlit_missing_share: Share | None = None
 
 
 class SampleResult(Metrics):
-    """Scores of one sample, how many pixels each set has, and the hash of the prediction file they come from."""
+    """Scores of one sample, how many pixels each set has, and the hash of the prediction file they come from.
+    ``void_pixels`` is absent by rules without void, ``unlit_pixels`` where the unlit ones are not scored."""
+
+    SPARSE = (*SINCE_2, "void_pixels", "unlit_pixels")
 
     sample: Text
     object: Text
     prediction_sha256: Sha256
     object_pixels: Count
     background_pixels: Count
+    void_pixels: Count | None = None
+    unlit_pixels: Count | None = None
 
     def stats(self, pixels: str) -> ErrorStats:
         """Errors of the ``object`` or the ``background`` set."""

@@ -1,3 +1,11 @@
+from .arrays import evaluate_arrays as evaluate_arrays
+from .check import Checked as Checked
+from .check import check_folder as check_folder
+from .conformal import Calibration as Calibration
+from .conformal import calibrate as calibrate
+from .conformal import counted as counted
+from .conformal import largest_coverage as largest_coverage
+from .conformal import write_calibrated as write_calibrated
 from .evaluator import differences as differences
 from .evaluator import evaluate as evaluate
 from .evaluator import explain_eval as explain_eval
@@ -9,6 +17,10 @@ from .sample_scores import combine as combine
 from .sample_scores import mean_of as mean_of
 from .sample_scores import score_sample as score_sample
 from .sample_scores import stats_of as stats_of
+from .sigma_scores import SigmaSample as SigmaSample
+from .sigma_scores import gaussian_quantile as gaussian_quantile
+from .sigma_scores import score_sigma as score_sigma
+from .sigma_scores import states_sigma as states_sigma
 from .torch_metric import DepthScores as DepthScores
 from .uncertainty import Interval as Interval
 from .uncertainty import caution as caution

@@ -18,7 +18,9 @@ from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.score.check import checked_description
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.sigma_scores import score_sigma
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.sample import stored_frames
@@ -39,9 +41,9 @@ def evaluate(
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
-    or ``paper-individual`` (the paper's rule for individually normalised depth). Memory does not grow with the number
-    of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once while threads
-    score: a command uses it to import what it needs afterwards.
+    or ``paper`` (the paper's pixel sets, without void, and its rule for normalised depth). Memory does not grow with
+    the number of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once
+    while threads score: a command uses it to import what it needs afterwards.
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
     and DatasetError for a target that is not a depth map."""
@@ -68,7 +70,7 @@ def evaluate(
     description = None
     if content is not None:
         try:
-            description = _checked(folder, content, len(dataset.sequence), listing.form, mode)
+            description = checked_description(folder, content, listing.form, len(dataset.sequence))
         except SubmissionError as error:
             description_error = error
         result.environment  # noqa: B018  imported while the threads score
@@ -83,8 +85,11 @@ def evaluate(
     if description_error:
         raise description_error
     benchmark = benchmark_of(dataset.fingerprint)
+    stated = {row["sample"]: row.pop("stated") for row in rows}
+    owners = {row["sample"]: row["object"] for row in rows}
     return result.result_from_rows(
-        [{**row, "object": split_sample_name(row["sample"])[0]} for row in rows],
+        rows,
+        uncertainty=result.uncertainty_of(stated, owners) if listing.sigmas else None,
         protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=description,
@@ -119,25 +124,6 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     return samples
 
 
-def _checked(folder: Path, content: dict[Any, Any], frames: int, form: str, mode: str) -> submission.Submission:
-    """The folder's description, checked against the predictions' form, the mode and a sequence of ``frames``."""
-    description = submission.check_submission(folder, content)
-    outside = [index for index in description.frames_used if index >= frames]
-    if outside:
-        expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
-        problem = f"frames_used: {expected}, got {printable(str(outside), 100)}"
-    elif form == ".png" and description.png_mm_per_level is None:
-        problem = "png_mm_per_level: expected what one level of the .png files is in mm, like 0.05, got nothing"
-    elif form != ".png" and description.png_mm_per_level is not None:
-        problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
-    elif mode == "paper-individual" and description.units != "normalised":
-        scored = "--mode paper-individual scores normalised depth (units: normalised)"
-        problem = f"{scored}, these are in {description.units}; score them with --mode standard"
-    else:
-        return description
-    raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
-
-
 def _scored(
     reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units, mode: Mode,
     edge_band_px: int, sigmas: Path | None,
@@ -150,6 +136,8 @@ def _scored(
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
             target = dataset.target_mm(sample, target_name)
+            void = dataset.void(sample) if mode == "standard" else None
+            unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
         low, high = float(target.min()), float(target.max())
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
@@ -158,18 +146,24 @@ def _scored(
             values, digest = reader.read(sample)
             problems = value_problems(values, target, high, units)
             if not problems:
-                scores = score_sample(*scored_pair(values, target, units, mode, sample), edge_band_px)
+                pair = scored_pair(values, target, units, mode, sample)
+                scores = score_sample(*pair, edge_band_px, void, unlit_mm)
         except PredictionError as error:
             problems = [str(error)]
+        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
+        stated = None
+        if sigmas is not None:
+            try:
+                sigma_mm = submission.read_sigma(sigmas, sample, dataset.size)
+                stated = None if problems else score_sigma(*pair, sigma_mm, void)
+            except PredictionError as error:
+                problems.append(f"{sample}{submission.SIGMA}: {error}")
         with dataset_lock:
             dataset.release(sample)
-        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
-        if sigmas is not None:
-            problems += submission.sigma_problems(sigmas, sample, dataset.size)
         if problems:
             return problems, []
-        pixels = {"object_pixels": scores.object.pixels, "background_pixels": scores.background.pixels}
-        return [], [{"sample": sample, "prediction_sha256": digest, **pixels, **scores.metrics()}]
+        row = {"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
+        return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
 
     return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
@@ -207,11 +201,26 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
         return [*problems, "per_sample: other samples than the split has"]
     for row in again.per_sample:
         problems += _sample_differences(stored_rows[row.sample], row)
-    return problems
+    return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
+
+
+def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: result.Uncertainty | None) -> list[str]:
+    if stored is None or recomputed is None:
+        blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
+        return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
+    lines = []
+    for sample, scores in recomputed.per_sample.items():
+        for key in protocol.UNCERTAINTY:
+            first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
+            # The area between two curves is a small difference of large numbers.
+            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 0.0):
+                texts = f"{_value_text(first)} in the result, {_value_text(second)} recomputed"
+                lines.append(f"{sample}: uncertainty.{key}: {texts}")
+    return lines
 
 
 def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
-    exact = ("object", "prediction_sha256", "object_pixels", "background_pixels")
+    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
     for key in protocol.METRICS:
         # Signed means and the error without an offset are small differences of large numbers.

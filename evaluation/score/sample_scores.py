@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, METRICS, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
+from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 
 BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
@@ -95,7 +96,7 @@ def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors:
 
 
 def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> ErrorStats:
-    """Statistics of every pixel but the object's at ``index`` (sorted), by setting the object's errors to 0. Not
+    """Statistics of every pixel but those at ``index`` (sorted; object and void), by setting their errors to 0. Not
     overall minus object: that would leave rounding errors where the background is perfect."""
     pixels = prediction.size - index.size
     if pixels == 0:
@@ -122,7 +123,8 @@ def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> 
         absolute += buffer.sum(axis=1).tolist()
 
     def errors_outside() -> Errors:
-        outside = ~object_mask(target)
+        outside = np.ones(target.shape, dtype=bool)
+        outside[index] = False
         return prediction[outside].astype(np.float64) - target[outside]
 
     return _from_sums(pixels, absolute, squares, errors_outside)
@@ -144,11 +146,15 @@ def _zones(bits: int, value: int) -> property:
 class SampleScores:
     """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
     A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones."""
+    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones. ``void``: pixels in
+    no set, None by rules without void. ``unlit``: statistics of the unlit pixels and of those that were measured; None
+    where they are not scored."""
 
     background: ErrorStats
     zones: dict[int, ErrorStats]
     distribution: dict[str, float | None]
+    void: int | None = None
+    unlit: tuple[ErrorStats, ErrorStats] | None = None
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
@@ -166,7 +172,7 @@ class SampleScores:
         return combine(self.object, self.background)
 
     def metrics(self) -> dict[str, float | None]:
-        """The keys of ``protocol.METRICS``; None where the pixel set is empty."""
+        """The keys of ``protocol.METRICS``; where the pixel set is empty None, those of `SINCE_2` left out."""
         sets: dict[str, ErrorStats] = {name: getattr(self, name.removeprefix("object_")) for name in _SETS}
         whole, interior = sets["object"].pixels, sets["object_interior"].pixels
         values: dict[str, float | None] = {
@@ -178,7 +184,21 @@ class SampleScores:
         for name, stats in sets.items():
             values |= {f"{name}_mae_mm": stats.mae_mm, f"{name}_rmse_mm": stats.rmse_mm}
         values |= self.distribution
-        return {key: values[key] for key in METRICS}
+        void = self.void or 0
+        unlit, measured = self.unlit or (EMPTY, EMPTY)
+        values |= {
+            "void_share": None if self.void is None else void / (whole + self.background.pixels + void),
+            "unlit_mae_mm": unlit.mae_mm, "unlit_rmse_mm": unlit.rmse_mm, "unlit_valid_mae_mm": measured.mae_mm,
+            "unlit_missing_share": _share(unlit.pixels - measured.pixels, unlit.pixels),
+        }  # fmt: skip
+        optional = {key for key in protocol.SINCE_2 if values[key] is None}
+        return {key: values[key] for key in protocol.METRICS if key not in optional}
+
+    def pixels(self) -> dict[str, int | None]:
+        """How many pixels each set of a result's row has; None for a set that the rules do not know."""
+        unlit = None if self.unlit is None else self.unlit[0].pixels
+        counts = {"object": self.object.pixels, "background": self.background.pixels, "void": self.void, "unlit": unlit}
+        return {f"{name}_pixels": count for name, count in counts.items()}
 
 
 def _share(part: int, whole: int) -> float | None:
@@ -186,11 +206,16 @@ def _share(part: int, whole: int) -> float | None:
 
 
 @np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
-def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BAND_PX) -> SampleScores:
+def score_sample(
+    prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BAND_PX, void: NDArray[np.bool_] | None = None,
+    unlit_mm: Map | None = None,
+) -> SampleScores:  # fmt: skip
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
-    sets after paper Section 5.3.2 (`fpp_ml_bench.depth`): object where the target is above 0, else background.
+    sets after paper Section 5.3.2 (`fpp_ml_bench.depth`): object where the target is above 0, else background. Pixels
+    in ``void`` (bool (H, W)) are in neither; they still take part in finding the depth edges. ``unlit_mm`` (H, W): true
+    depth in mm of the pixels that are scored as a set of their own, 0 elsewhere.
 
     Raises PredictionError for shapes that differ, dtypes that are not real floats, and errors that are not finite.
 
@@ -204,24 +229,42 @@ def score_sample(prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BA
         raise PredictionError(f"{expected}, got {prediction_mm.shape}")
     if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+    for name, part in (("void", void), ("unlit_mm", unlit_mm)):
+        if part is not None and part.shape != target_mm.shape:
+            raise PredictionError(f"{name}: expected a map of {target_mm.shape}, got {part.shape}")
     prediction, target = prediction_mm.ravel(), target_mm.ravel()
-    index = np.flatnonzero(object_mask(target))
+    inside = object_mask(target)
+    excluded = index = np.flatnonzero(inside)
+    if void is not None and void.any():
+        excluded, index = np.flatnonzero(inside | void.ravel()), np.flatnonzero(inside & ~void.ravel())
+    void_px = None if void is None else int(np.count_nonzero(void))
+    unlit = None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     depths = prediction.take(index)
     errors = depths.astype(np.float64)
     errors -= target.take(index)
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
-    background = _background_stats(prediction, target, index)
+    background = _background_stats(prediction, target, excluded)
     if not index.size:
-        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION))
+        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
     missing = depths <= 0
     near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
     zone |= wide.ravel().take(index).view(np.uint8) * np.uint8(_WIDE)
     zone |= missing.view(np.uint8) * np.uint8(_MISSING)
-    present = np.flatnonzero(np.bincount(zone)).tolist()
-    zones = {code: stats_of(errors[zone == code]) for code in present}
-    return SampleScores(background, zones, _distribution(errors, missing))
+    within = {code: zone == code for code in range(_EDGE + _WIDE + _MISSING + 1)}
+    zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
+    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit)
+
+
+def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:
+    """Statistics of the errors (n,) where ``unlit_mm`` is above 0, and of those of them that were measured."""
+    index = np.flatnonzero(object_mask(unlit_mm))
+    depths = prediction.take(index)
+    errors = depths.astype(np.float64) - unlit_mm.take(index)
+    if not np.isfinite(errors).all():
+        raise PredictionError(NOT_FINITE)
+    return stats_of(errors), stats_of(errors[depths > 0])
 
 
 def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float | None]:

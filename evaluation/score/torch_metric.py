@@ -28,9 +28,10 @@ SQUARES_VANISH = 1e-140
 class DepthScores(Metric):
     """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
 
-    ``update(prediction_mm, target_mm)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background, on any
-    device. ``compute()`` gives a dict of float64 scalars, NaN where no sample has the pixels for a score. Samples
-    without these pixels are left out of the mean and never count as 0.
+    ``update(prediction_mm, target_mm, void=None)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background,
+    on any device, and bool (B, H, W), true for pixels in no set. ``compute()`` gives a dict of float64 scalars, NaN
+    where no sample has the pixels for a score. Samples without these pixels are left out of the mean and never count as
+    0.
 
     The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
     tolerance. ``half()`` and ``float()`` leave the state in float64."""
@@ -47,11 +48,14 @@ class DepthScores(Metric):
         self.add_state("sums", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
 
-    def update(self, prediction_mm: Tensor, target_mm: Tensor) -> None:
+    def update(self, prediction_mm: Tensor, target_mm: Tensor, void: Tensor | None = None) -> None:
         """Add a batch. Raises PredictionError for other shapes or dtypes, and for errors that are not finite."""
         prediction, target = _maps(prediction_mm, target_mm)
-        for predicted, truth in zip(prediction, target, strict=True):
-            scores = _sample_scores(predicted, truth)
+        scored = torch.ones(target.shape, dtype=torch.bool) if void is None else ~void
+        if scored.shape != target.shape:
+            raise PredictionError(f"void: expected {tuple(target.shape)} (B, H, W), got {tuple(scored.shape)}")
+        for predicted, truth, pixels in zip(prediction, target, scored.to(target.device), strict=True):
+            scores = _sample_scores(predicted[pixels], truth[pixels])
             values = [predicted.new_zeros(()) if (score := scores[key]) is None else score for key in KEYS]
             self.sums += torch.stack(values).to(self.sums.device)
             self.counts += torch.tensor([scores[key] is not None for key in KEYS], device=self.counts.device)
@@ -79,8 +83,10 @@ def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:
-    """Scores of one sample, float64 (H, W) in mm each: the keys of `KEYS`, None for an empty pixel set."""
+    """Scores of one sample, float64 (n,) in mm each: the keys of `KEYS`, None for an empty pixel set."""
     error = prediction - target
+    if not error.numel():
+        return dict.fromkeys(KEYS)
     if not bool(torch.isfinite(error.square().sum())):
         raise PredictionError(NOT_FINITE)
     inside = target > 0

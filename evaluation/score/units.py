@@ -64,16 +64,27 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, ta
     return None
 
 
+def unit_note(largest: float, units: Units) -> str | None:
+    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value of all samples."""
+    suspicious = {
+        "mm": (0 < largest < protocol.METRES_BELOW, "are these metres or normalised depth?"),
+        "m": (largest > protocol.METRES_AT_MOST, "are these mm?"),
+        "normalised": (largest > protocol.METRES_BELOW, "are these m or mm?"),
+    }
+    wrong, question = suspicious[units]
+    return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
+
+
 def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str) -> tuple[Depth, Depth]:
     """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
 
     ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
     D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
 
-    ``paper-individual`` (paper Section 5.3.2, individual normalisation): the target is normalised first, its mask is
-    D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in every difference,
-    so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding and subtracting
-    1.7 m. Only for normalised values.
+    ``paper`` differs for normalised values (paper Section 5.3.2, individual normalisation): the target is normalised
+    first, its mask is D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in
+    every difference, so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding
+    and subtracting 1.7 m.
 
     Raises DatasetError where the target has no range to normalise by."""
     if units == "mm":

@@ -1,3 +1,4 @@
+from .description import LearnedFrom as LearnedFrom
 from .description import Submission as Submission
 from .description import check_submission as check_submission
 from .description import read_submission as read_submission
@@ -9,5 +10,9 @@ from .prediction_files import Reader as Reader
 from .prediction_files import list_folder as list_folder
 from .prediction_files import read_plain as read_plain
 from .prediction_files import read_plain_file as read_plain_file
+from .prediction_files import read_sigma as read_sigma
 from .prediction_files import reader_for as reader_for
-from .prediction_files import sigma_problems as sigma_problems
+from .prediction_files import samples_in as samples_in
+from .sample_files import declared_size as declared_size
+from .template import TEMPLATE as TEMPLATE
+from .template import write_template as write_template

@@ -9,7 +9,24 @@ from pydantic import Field, model_validator
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
-from fpp_ml_bench.schema import Count, Positive, Scalar, SparseModel, Text, validate
+from fpp_ml_bench.schema import Count, Positive, Scalar, SparseModel, StrictModel, Text, validate
+
+
+class LearnedFrom(StrictModel):
+    """What data a method learned from: the training split of benchmarks of this package (``train-split``), other data
+    that its renderer made (``generated``), any other data, or none. ``versions`` name them, like ``fpp-bench-full
+    version 1``."""
+
+    data: Literal["train-split", "generated", "other", "none"]
+    versions: list[Text] = Field(default_factory=list, max_length=50)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "LearnedFrom":
+        if self.data == "none" and self.versions:
+            raise ValueError("a method that learned from no data has no versions of it; remove them")
+        if self.data == "train-split" and not self.versions:
+            raise ValueError("data: train-split needs versions, like [fpp-bench-full version 1]")
+        return self
 
 
 class Submission(SparseModel):
@@ -19,9 +36,10 @@ class Submission(SparseModel):
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
     on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
     black outside the object); false is never written, so that files without this key stay as they are.
+    ``learned_from`` is absent where it is unknown.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
-    SPARSE = ("uses_ground_truth_mask",)
+    SPARSE = ("uses_ground_truth_mask", "learned_from")
 
     name: Text
     method: Text
@@ -30,6 +48,7 @@ class Submission(SparseModel):
     frames_used: list[Count]
     uses_ground_truth_range: bool
     uses_ground_truth_mask: bool = False
+    learned_from: LearnedFrom | None = None
     seconds_per_sample: Positive | None
     seconds_source: Literal["measured", "self-reported"] | None = None
     hardware: HardwareInfo | None = None

@@ -105,17 +105,25 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     return Listing(form, problems, present, sigmas)
 
 
-def sigma_problems(folder: Path, sample: str, size: tuple[int, int]) -> list[str]:
-    """What is wrong with the `SIGMA` file of a sample; usually an empty list."""
-    name = f"{sample}{SIGMA}"
+def samples_in(folder: Path) -> list[str]:
+    """The samples that a folder holds a file of its own for, by the files' names, ascending."""
     try:
-        sigma_mm = parse_npy(read_bounded(folder / name, size[0] * size[1] * 8 + HEADER_BYTES), size)
-    except PredictionError as error:
-        return [f"{name}: {error}"]
+        names = sorted(path.name for path in folder.iterdir())
+    except OSError as error:
+        raise PredictionError(f"{printable(str(folder), 500)} can't be read: {error.strerror}") from None
+    stems = (name.removesuffix(suffix) for name in names for suffix in PER_SAMPLE if name.endswith(suffix))
+    return list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
+
+
+def read_sigma(folder: Path, sample: str, size: tuple[int, int]) -> NDArray[Any]:
+    """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the file's name, for any other
+    content."""
+    sigma_mm = parse_npy(read_bounded(folder / f"{sample}{SIGMA}", size[0] * size[1] * 8 + HEADER_BYTES), size)
     low, high = float(sigma_mm.min()), float(sigma_mm.max())
     if low >= 0 and high <= LARGEST_MM:  # False for NaN
-        return []
-    return [f"{name}: expected finite mm of 0 and more, found {low:g} to {high:g}; write 0 where none is stated"]
+        return sigma_mm
+    found = f"found {low:g} to {high:g}"
+    raise PredictionError(f"expected finite mm of 0 and more, {found}; write 0 where none is stated")
 
 
 MapAndHash = tuple[NDArray[Any], str]

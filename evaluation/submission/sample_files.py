@@ -5,6 +5,7 @@ import io
 import struct
 import zipfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock, local
 from tokenize import TokenError
@@ -47,6 +48,24 @@ def read_npy(path: Path, size: tuple[int, int], memory: local) -> tuple[NDArray[
 def _largest_npy(size: tuple[int, int]) -> int:
     """Bytes of the largest accepted .npy of an (H, W) map: float64 and its header."""
     return HEADER_BYTES + size[0] * size[1] * 8
+
+
+def declared_size(path: Path) -> tuple[int, int] | None:
+    """The size (H, W) that a .npy, .npz or .png file states; None where it states none. Nothing else is checked."""
+    with suppress(OSError, zipfile.BadZipFile, IndexError, struct.error, *_NO_HEADER):
+        with opened(path) as (stream, length):
+            head = stream.read(min(HEADER_BYTES, length))
+        if head.startswith(_PNG_SIGNATURE):
+            width, height = struct.unpack(">II", head[16:24])
+            return height, width
+        if head.startswith(b"PK"):
+            with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as member:
+                head = member.read(HEADER_BYTES)
+        content = io.BytesIO(head)
+        with _PARSING:
+            shape, _, _ = _HEADERS[npy.read_magic(content)](content)
+        return (int(shape[0]), int(shape[1])) if len(shape) == 2 else None
+    return None
 
 
 def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:

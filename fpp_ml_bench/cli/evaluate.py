@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from fpp_ml_bench.cli import CHECK_FAILED, OK, SPLITS, run_command
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation import report, result, score
+from fpp_ml_bench.evaluation import report, result, score, submission
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders import storage
@@ -20,6 +20,8 @@ SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid,
 EXAMPLES = (
     "fpp-eval predictions --dataset data/mini --split test --json result.json",
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact --report report",
+    "fpp-eval init predictions",
+    "fpp-eval check predictions",
     "fpp-eval compare a.json b.json",
     "fpp-eval verify result.json predictions --dataset data/mini",
     "fpp-eval schema",
@@ -41,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--edge-band", type=_band, default=EDGE_BAND_PX, metavar="PX",
         help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})")  # fmt: skip
     add("--mode", choices=MODES, default=MODES[0],
-        help="standard: mm, object where depth is above 0 (default); paper-individual: the paper's rule for its "
-        "individually normalised rows, for units: normalised only, never ranked with the others")  # fmt: skip
+        help="standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, "
+        "and its rule for normalised depth; never ranked with the others")  # fmt: skip
     add("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
     add("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
     add_explain_options(parser)
@@ -155,7 +157,55 @@ def _verify(args: argparse.Namespace) -> int:
     return CHECK_FAILED
 
 
+def _init_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the predictions, made if absent")
+
+
+def _init(args: argparse.Namespace) -> int:
+    print(f"Written: {submission.write_template(args.folder)}")
+    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {args.folder}")
+    return OK
+
+
+def _check_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR", help="folder of predictions and submission.yaml")
+    add("--dataset", type=Path, metavar="DATASET", help="check names, sizes and frames against this dataset, too")
+    add("--split", choices=SPLITS, default="test", help="samples expected with --dataset (default: test)")
+
+
+def _check(args: argparse.Namespace) -> int:
+    """Say whether a submission would be scored, as far as its own files tell. Raises FppBenchError for no folder."""
+    dataset = None if args.dataset is None else storage.DatasetFolder(args.dataset)
+    checked = score.check_folder(args.folder, dataset, args.split)
+    folder = printable(str(args.folder), 500)
+    for note in checked.notes:
+        print(f"fpp-eval: note: {note}", file=sys.stderr)
+    if checked.problems:
+        print(f"{folder} would be refused, {len(checked.problems)} problem{'s' * (len(checked.problems) > 1)}:")
+        for line in checked.problems:
+            print(f"  {line}")
+        return CHECK_FAILED
+    height, width = checked.size
+    sigma = ", with an uncertainty" if checked.sigmas else ""
+    against = "" if dataset is None else f" of split {args.split}"
+    print(f"{folder}: {len(checked.samples)} samples{against}, {checked.form}, {width}x{height} px{sigma}; sound")
+    if checked.description is not None:
+        frames, track = len(checked.description.frames_used), checked.description.track
+        print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")
+    return OK
+
+
 SUBCOMMANDS = {
+    "init": SimpleNamespace(
+        SUMMARY="Write a submission.yaml to fill in; one that is there is not overwritten.",
+        EXAMPLES=("fpp-eval init predictions",), add_arguments=_init_arguments, run=_init,
+    ),
+    "check": SimpleNamespace(
+        SUMMARY="Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.",
+        EXAMPLES=("fpp-eval check predictions", "fpp-eval check predictions --dataset data/mini --split test"),
+        add_arguments=_check_arguments, run=_check,
+    ),
     "compare": SimpleNamespace(
         SUMMARY="Compare two results of the same samples: paired differences, their 95% intervals, and a plain "
         "sentence.",

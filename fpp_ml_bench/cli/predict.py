@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("method", metavar="METHOD", help=METHOD_HELP)
     add("dataset", type=Path, metavar="DATASET", help="dataset folder")
     add("--split", default="test", choices=SPLITS, help="default: test")
-    add("--out", type=Path, required=True, metavar="DIR", help="new or empty folder, or one that a stopped run left")
+    add("--out", type=Path, required=True, metavar="DIR", help="new or empty folder; a run that was stopped continues")
     add_method_options(parser)
     add_explain_options(parser)
 

@@ -16,7 +16,7 @@ from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pi
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
 from fpp_ml_bench.loaders.render.sensor import Exposure
-from fpp_ml_bench.loaders.sample import VOID, Flag, Row, stored_frames
+from fpp_ml_bench.loaders.sample import Flag, Row, stored_frames, void_pixels
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
@@ -230,7 +230,7 @@ def ground_truth_error(
     pixels without a decoded depth, which are background in ``depth``; the others pixels by their `Flag`.
     """
     seen, decoded = object_mask(exact_mm), object_mask(depth_mm)
-    void = (flags & VOID) > 0
+    void = void_pixels(flags)
     both = seen & decoded & ~void
     error = depth_mm[both].astype(np.float64) - exact_mm[both]
     inside = error[~object_near_edge(exact_mm, INTERIOR_PX)[both]]

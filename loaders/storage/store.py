@@ -19,7 +19,17 @@ from fpp_ml_bench.constants import CONFIGS, SPLITS
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import sample as layout
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, config_columns, stored_groups
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    DEPTH,
+    DEPTH_EXACT,
+    DEPTHS,
+    FLAGS,
+    Flag,
+    config_columns,
+    stored_groups,
+    void_pixels,
+)
 from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
 from fpp_ml_bench.optics import AnySequence, Rig, rig_from_dict
 
@@ -145,6 +155,16 @@ class DatasetFolder:
         if not self.has_exact:
             raise DatasetError(f"{self.path}: has no {FLAGS} ({self.manifest.origin} data)")
         return self._image(sample, DATA_GROUP, FLAGS)
+
+    def void(self, sample: str) -> NDArray[np.bool_]:
+        """Pixels that count in no score, bool (H, W); see `loaders.sample.VOID`. None are in data without flags."""
+        return void_pixels(self.flags(sample)) if self.has_exact else np.zeros(self.size, dtype=bool)
+
+    def unlit_mm(self, sample: str) -> NDArray[np.float32]:
+        """Exact depth of the pixels that the camera sees and the projector does not light, float32 (H, W) in mm, 0
+        everywhere else. Raises `DatasetError` for data without flags."""
+        unlit = (self.flags(sample) & np.uint8(Flag.UNLIT)) != 0
+        return np.where(unlit, self.depth_mm(sample, DEPTH_EXACT), np.float32(0))
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
         """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""

@@ -211,9 +211,12 @@ def test_methods_by_name(opened):
     assert tuple(METHODS) == ("classical", "phase", "phase-net", "constant")
     assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
     network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
-    assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper-individual")
+    assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")
     with pytest.raises(FppBenchError, match="there are classical"):
         load_method("magic", opened.rig)
+    assert network.learned_from == {"data": "train-split", "versions": ["dataset c5f61ca7"]}
+    learned = [load_method("constant", opened.rig, at=at).learned_from["data"] for at in ("standoff", "training-mean")]
+    assert learned == ["none", "train-split"] and load_method("phase", opened.rig).learned_from == {"data": "none"}
 
 
 # ---- predictions
@@ -273,15 +276,14 @@ def test_faulty_methods_are_caught(opened, tmp_path, depth, says):
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_unfinished_runs_are_taken_over_and_foreign_folders_are_not(opened, tmp_path):
+def test_foreign_folders_are_not_taken_over(opened, tmp_path):
     classical = ClassicalMethod(opened.rig, "vertical", 3)
     out = tmp_path / "out"
     predict_split(opened, classical, "validation", out)
-    (out / "submission.yaml").unlink()
-    (out / "mug_A0.npy").write_bytes(b"half")
-    predict_split(opened, classical, "validation", out)
-    assert np.load(out / "mug_A0.npy").shape == (TINY_SIZE, TINY_SIZE)
     with pytest.raises(PredictionError, match=r"already holds submission.yaml"):
+        predict_split(opened, classical, "validation", out)
+    (out / "submission.yaml").unlink()  # predictions of whatever run
+    with pytest.raises(PredictionError, match=r"already holds mug_A0.npy and more"):
         predict_split(opened, classical, "validation", out)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("mine")

@@ -74,12 +74,12 @@ def method(weights, name, *args, **options):
     [
         ("raw", None, "mm", "metric", "standard", "UNet raw"),
         ("global", None, "mm", "metric", "standard", "UNet global"),
-        ("bare", None, "normalised", "oracle range", "paper-individual", "UNet bare, oracle range"),
+        ("bare", None, "normalised", "oracle range", "paper", "UNet bare, oracle range"),
         ("full", None, "mm", "metric", "standard", "UNet full, predicted range"),
         ("full", "predicted", "mm", "metric", "standard", "UNet full, predicted range"),
         ("full", "mean", "mm", "metric", "standard", "UNet full, mean range"),
-        ("full", "oracle", "normalised", "oracle range", "paper-individual", "UNet full, oracle range"),
-        ("removed", "oracle", "normalised", "oracle range + mask", "paper-individual", "UNet removed, oracle range"),
+        ("full", "oracle", "normalised", "oracle range", "paper", "UNet full, oracle range"),
+        ("removed", "oracle", "normalised", "oracle range + mask", "paper", "UNet removed, oracle range"),
         ("removed", "mean", "mm", "oracle mask", "standard", "UNet removed, mean range"),
         ("global-removed", None, "mm", "oracle mask", "standard", "UNet global-removed"),
     ],
@@ -163,7 +163,7 @@ def test_the_frame_is_the_first_it_was_trained_on(tmp_path, dataset):
 
 def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, capsys):
     out, data, path = str(tmp_path / "p"), str(dataset.path), str(weights / "full.safetensors")
-    for depth_range, words in (("oracle", " --mode paper-individual --json"), ("predicted", "--split test --json")):
+    for depth_range, words in (("oracle", " --mode paper --json"), ("predicted", "--split test --json")):
         assert main(["predict", path, data, "--range", depth_range, "--out", f"{out}-{depth_range}"]) == 0
         printed = capsys.readouterr().out.splitlines()[-1]
         assert words in printed and "depth_exact" not in printed
@@ -238,7 +238,7 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
 def test_the_key_changes_no_file_without_it(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset)
     result = evaluate(folder, dataset)
-    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.2.0"
+    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.3.0"
     # A result that hides the mask, and one that claims it, both differ from their predictions.
     masked = result.model_copy(
         update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}

@@ -125,7 +125,7 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
     assert {entry.provenance for entry in entries.values()} == {"measured here"}
     tracks = {name: (entry.result.track, entry.result.mode, entry.result.target) for name, entry in entries.items()}
-    assert tracks[NAMES[2]] == ("oracle range", "paper-individual", "depth")
+    assert tracks[NAMES[2]] == ("oracle range", "paper", "depth")
     assert {tracks[name] for name in (*NAMES[:2], *TWINS)} == {("metric", "standard", "depth")}
     assert all(entry.name.endswith("(cpu preset)") for entry in entries.values())
     assert [len(group.rows) for group in rank(entries.values())] == [4, 1]
@@ -291,8 +291,8 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     write_description(folder, units="normalised", uses_ground_truth_range=True)
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
-    result = evaluate(folder, opened, mode="paper-individual")
-    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper-individual"), ABOUT)
+    result = evaluate(folder, opened, mode="paper")
+    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper"), ABOUT)
     for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 

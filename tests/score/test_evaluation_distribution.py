@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED
+from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED, SINCE_2
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 LONG = np.longdouble
@@ -28,10 +28,10 @@ def edges_of(target):
     return marked
 
 
-def reference(prediction, target, band):
+def reference(prediction, target, band, void, unlit):
     """All scores in float128 by sorting and masking; None for an empty set."""
     error = prediction.astype(LONG) - target.astype(LONG)
-    inside, edges = target > 0, edges_of(target)
+    inside, outside, edges = (target > 0) & ~void, (target == 0) & ~void, edges_of(target)
     distance = ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
     valid = inside & (prediction > 0)
 
@@ -47,9 +47,9 @@ def reference(prediction, target, band):
     core, near = inside & (distance >= band), inside & (distance < band)
     wide, deep = inside & (distance < 8), inside & (distance >= 8)
     scores = {
-        "overall_mae_mm": mae(np.ones_like(inside)), "overall_rmse_mm": rmse(np.ones_like(inside)),
+        "overall_mae_mm": mae(~void), "overall_rmse_mm": rmse(~void),
         "object_mae_mm": mae(inside), "object_rmse_mm": rmse(inside),
-        "background_mae_mm": mae(~inside), "background_rmse_mm": rmse(~inside),
+        "background_mae_mm": mae(outside), "background_rmse_mm": rmse(outside),
         "object_interior_mae_mm": mae(core), "object_interior_rmse_mm": rmse(core),
         "object_edge_mae_mm": mae(near), "object_edge_rmse_mm": rmse(near),
         "object_valid_mae_mm": mae(valid), "object_interior_valid_mae_mm": mae(valid & core),
@@ -60,6 +60,15 @@ def reference(prediction, target, band):
         "object_bias_mm": error[inside].mean() if inside.any() else None,
         "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
     }  # fmt: skip
+    dark = unlit > 0
+    far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
+    lit = dark & (prediction > 0)
+    scores["void_share"] = LONG(np.count_nonzero(void)) / void.size
+    if dark.any():
+        scores |= {"unlit_mae_mm": far[dark].mean(), "unlit_rmse_mm": np.sqrt((far[dark] ** 2).mean())}
+        scores["unlit_missing_share"] = share(dark & ~lit, dark)
+    if lit.any():
+        scores["unlit_valid_mae_mm"] = far[lit].mean()
     ordered, signed = np.sort(np.abs(error[inside])), np.sort(error[inside])
 
     def quantile(values, level):
@@ -80,7 +89,8 @@ def reference(prediction, target, band):
 
 @st.composite
 def cases(draw):
-    """A prediction and target of any small shape, cover, scale from 1e-30 to 1e30, dtype and memory order."""
+    """A prediction and target of any small shape, cover, scale from 1e-30 to 1e30, dtype and memory order; void pixels
+    and the depth of those of them that are unlit."""
     shape = draw(st.tuples(st.integers(1, 36), st.integers(1, 36)))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     kind = draw(st.sampled_from([np.float16, np.float32, np.float64]))
@@ -94,16 +104,18 @@ def cases(draw):
     prediction = (target + noise) * (rng.random(shape) < draw(st.sampled_from([1.0, 0.8])))
     prediction = prediction.astype(kind)
     target = target.astype(draw(st.sampled_from([kind, np.float64])))
-    return np.asarray(prediction, order=draw(st.sampled_from("CF"))), target, draw(st.sampled_from([0, 1, 3, 8, 50]))
+    void = rng.random(shape) < draw(st.sampled_from([0.0, 0.2, 1.0]))
+    unlit = np.where(void & (rng.random(shape) < 0.5), rng.uniform(0.5, 1.0, shape), 0.0) * scale
+    order, band = draw(st.sampled_from("CF")), draw(st.sampled_from([0, 1, 3, 8, 50]))
+    return np.asarray(prediction, order=order), target, band, void, unlit
 
 
 @given(cases())
 @settings(max_examples=200, deadline=None)
 def test_every_score_agrees_with_float128_to_1e_minus_10(case):
-    prediction, target, band = case
-    scores = score_sample(prediction, target, band).metrics()
-    expected = reference(prediction, target, band)
-    assert set(scores) == set(expected) == set(METRICS)
+    scores = score_sample(*case).metrics()
+    expected = reference(*case)
+    assert set(scores) == set(expected) and {*METRICS} - {*SINCE_2} <= set(scores) <= set(METRICS)
     scale = float(expected["object_mae_mm"] or 0)
     for key, value in expected.items():
         if value is None:
@@ -117,9 +129,12 @@ def test_every_score_agrees_with_float128_to_1e_minus_10(case):
 @given(cases())
 @settings(max_examples=150, deadline=None)
 def test_identity_of_the_three_sets(case):
-    prediction, target, band = case
-    scores = score_sample(prediction, target, band).metrics()
-    share = np.count_nonzero(target > 0) / target.size
+    prediction, target, band, void, _ = case
+    scores = score_sample(prediction, target, band, void).metrics()
+    if void.all():
+        assert scores["overall_mae_mm"] is None
+        return
+    share = np.count_nonzero(target[~void] > 0) / np.count_nonzero(~void)
     composed = share * (scores["object_mae_mm"] or 0.0) + (1 - share) * (scores["background_mae_mm"] or 0.0)
     assert scores["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
 

@@ -130,7 +130,9 @@ def test_one_object_has_no_interval(dataset, tmp_path):
         (["per_sample", 0, "object_bias_mm"], -99.0, "bias or shift-free MAE is above the MAE"),
         (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
         (["per_sample", 0, "object_p95_mm"], None, "null all together"),
+        (["mode"], "paper", "void_pixels is extra by these rules"),
         (["mode"], "paper-individual", "its track is oracle range"),
+        (["protocol_version"], "1.1.0", "void_pixels is extra by these rules"),
         (["environment", "code_sha256"], "x", "code_sha256"),
     ],
 )

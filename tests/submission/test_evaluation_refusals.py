@@ -221,6 +221,10 @@ DESCRIPTIONS = {
     "unknown source": ({"seconds_source": "guessed"}, "seconds_source: .*measured"),
     "hardware as text": ({"hardware": "fast"}, "hardware: "),
     "unknown hardware key": ({"hardware": {"cpu": "x", "ghz": 3}}, r"hardware\.ghz: is not a key"),
+    "unknown data": ({"learned_from": {"data": "everything"}}, r"learned_from\.data: .*'train-split'"),
+    "data as text": ({"learned_from": "train-split"}, "learned_from: "),
+    "train split of what": ({"learned_from": {"data": "train-split"}}, "data: train-split needs versions"),
+    "versions of nothing": ({"learned_from": {"data": "none", "versions": ["x"]}}, "from no data has no versions"),
     "nested settings": ({"settings": {"a": {"b": 1}}}, r"settings\.a"),
 }  # fmt: skip
 

@@ -108,7 +108,8 @@ def validation_of(weights, dataset, recipe):
             target = np.where(inside, target - low, 0.0)
         else:
             prediction = denormalise(values, recipe.normalisation, low, high)
-        rows.append(score_sample(prediction, target).metrics())
+        void = None if recipe.normalisation == "individual" else data.source.void(data.samples[int(item.row)])
+        rows.append(score_sample(prediction, target, void=void).metrics())
         losses.append(math.sqrt(float(((values - item.depth[0].numpy()).astype(np.float64) ** 2).mean()) + 1e-8))
     return np.mean(losses), over_samples(rows)
 

@@ -1,0 +1,111 @@
+"""`predict_split` continues a stopped run behind its last finished sample, and refuses to continue another one."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.baselines.method import Answer, Method
+from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.score import evaluate
+
+SPLIT = "test"
+
+
+class Counting(Method):
+    """Answers the number of its answer, states a sigma, reports, and is stopped after so many samples."""
+
+    name, title, frames_used, settings = "counting", "Counting", (0,), {"level": 1}
+    reports = True
+
+    def __init__(self, stop_after=None):
+        self.answers, self.stop_after = 0, stop_after
+
+    def predict(self, frames):
+        return np.ones((32, 40), np.float32)
+
+    def answer(self, frames):
+        if self.answers == self.stop_after:
+            raise KeyboardInterrupt
+        self.answers += 1
+        maps = (np.full((32, 40), value, np.float32) for value in (1800 + self.answers, 1))
+        return Answer(*maps, {"number": self.answers})
+
+    def summary(self, reports):
+        return {"mean_number": float(np.mean([report["number"] for report in reports]))}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture
+def stopped(dataset, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        predict_split(dataset, Counting(2), SPLIT, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
+    names = [f"{sample}{suffix}" for sample in dataset.samples(SPLIT)[:2] for suffix in (".npy", ".sigma.npy")]
+    assert sorted(path.name for path in stopped.iterdir()) == sorted([*names, "unfinished.jsonl"])
+    written = {name: (stopped / name).stat().st_mtime_ns for name in names}
+    (stopped / "wooden_boards_A0.tmp").write_bytes(b"half")
+    method, advanced = Counting(), []
+    assert predict_split(dataset, method, SPLIT, stopped, advanced.append).samples == 4
+    assert method.answers == 2 and advanced == [1] * 4
+    assert {name: (stopped / name).stat().st_mtime_ns for name in names} == written
+    assert {path.name for path in stopped.iterdir()} >= {"submission.yaml", "per_sample.json"}
+    assert not list(stopped.glob("*.jsonl")) + list(stopped.glob("*.tmp"))
+    reports = json.loads((stopped / "per_sample.json").read_text())
+    assert [report["number"] for report in reports.values()] == [1, 2, 1, 2]
+    submission = yaml.safe_load((stopped / "submission.yaml").read_text())
+    assert submission["settings"] == {"level": 1, "mean_number": 1.5} and submission["learned_from"] == {"data": "none"}
+    assert evaluate(stopped, dataset).uncertainty is not None
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:200])])
+def test_a_finished_sample_whose_file_is_gone_or_cut_is_predicted_again(damage, dataset, stopped):
+    damage(stopped / f"{dataset.samples(SPLIT)[0]}.npy")
+    method = Counting()
+    predict_split(dataset, method, SPLIT, stopped)
+    assert method.answers == 3
+
+
+def test_a_line_that_was_cut_off_does_not_count(dataset, stopped):
+    journal = stopped / "unfinished.jsonl"
+    journal.write_text(journal.read_text()[:-10])
+    with pytest.raises(KeyboardInterrupt):
+        predict_split(dataset, Counting(1), SPLIT, stopped)
+    method = Counting()
+    predict_split(dataset, method, SPLIT, stopped)
+    assert method.answers == 2
+
+
+def test_another_run_is_refused_and_keeps_its_files(dataset, stopped, tmp_path):
+    before = {path.name: path.read_bytes() for path in stopped.iterdir()}
+    other = Counting()
+    other.settings = {"level": 2}
+    with pytest.raises(
+        PredictionError, match=r'differs in settings \(settings: {"level": 1} there, {"level": 2} now\)'
+    ):
+        predict_split(dataset, other, SPLIT, stopped)
+    with pytest.raises(PredictionError, match="differs in split"):
+        predict_split(dataset, Counting(), "validation", stopped)
+    (stopped / "notes.txt").write_text("mine")
+    with pytest.raises(PredictionError, match=r"already holds notes\.txt"):
+        predict_split(dataset, Counting(), SPLIT, stopped)
+    (stopped / "notes.txt").unlink()
+    assert {path.name: path.read_bytes() for path in stopped.iterdir()} == before
+
+
+def test_stopped_between_the_description_and_the_end(dataset, stopped):
+    journal = (stopped / "unfinished.jsonl").read_text()
+    predict_split(dataset, Counting(), SPLIT, stopped)
+    (stopped / "unfinished.jsonl").write_text(journal)
+    predict_split(dataset, Counting(), SPLIT, stopped)
+    assert not (stopped / "unfinished.jsonl").exists()

@@ -1,0 +1,83 @@
+"""Arrays in memory are scored as a folder with the same content."""
+
+import numpy as np
+import pytest
+from scored_dataset import make_dataset, write_description
+
+import fpp_ml_bench
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.sample import Flag
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory):
+    """Dataset, folder, and its content as arrays."""
+    folder = tmp_path_factory.mktemp("scored")
+
+    def flagged(depth):
+        flags = np.zeros(depth.shape, np.uint8)
+        flags[14:16] = Flag.MIXED
+        return flags
+
+    dataset, predictions = make_dataset(folder / "data", flagged=flagged), folder / "p"
+    predictions.mkdir()
+    columns = {"predictions": [], "targets": [], "flags": [], "sigma": [], "objects": []}
+    for number, sample in enumerate(dataset.samples("test")):
+        rng, depth = np.random.default_rng(number), dataset.depth_mm(sample)
+        sigma = rng.uniform(0, 2, depth.shape).astype(np.float32)
+        predicted = (depth + sigma * rng.normal(size=depth.shape)).astype(np.float32)
+        np.save(predictions / f"{sample}.npy", predicted)
+        np.save(predictions / f"{sample}.sigma.npy", sigma)
+        values = predicted, depth, dataset.flags(sample), sigma, sample.rpartition("_")[0]
+        for column, value in zip(columns.values(), values, strict=True):
+            column.append(value)
+    write_description(predictions)
+    return dataset, predictions, columns
+
+
+@pytest.mark.parametrize("form", [list, np.array])
+def test_the_same_scores_as_a_folder(form, scored):
+    dataset, folder, columns = scored
+    of_folder = fpp_ml_bench.evaluate(folder, dataset)
+    arrays = {name: values if name == "objects" else form(values) for name, values in columns.items()}
+    of_arrays = fpp_ml_bench.evaluate(arrays.pop("predictions"), arrays.pop("targets"), **arrays)
+    for name in ("metrics", "intervals", "median", "pooled", "bootstrap", "seeds"):
+        assert getattr(of_arrays, name) == getattr(of_folder, name), name
+    assert [(row.object, row.metrics) for row in of_arrays.per_object] == [
+        (row.object, row.metrics) for row in of_folder.per_object
+    ]
+    assert of_arrays.uncertainty.metrics == of_folder.uncertainty.metrics
+    assert of_arrays.uncertainty.per_object == of_folder.uncertainty.per_object
+    plain = fpp_ml_bench.evaluate(columns["predictions"], columns["targets"])
+    assert plain.metrics.void_share == 0 and plain.uncertainty is None and len(plain.per_object) == 4
+
+
+def test_a_perfect_prediction_and_maps_of_different_sizes():
+    truth = [np.full((4, 5), 1800.0), np.full((3, 2), 1700.0, np.float32)]
+    assert fpp_ml_bench.evaluate(truth, truth).metrics.object_rmse_mm == 0.0
+
+
+TRUE = np.full((2, 4, 5), 1800.0)
+REFUSED = {
+    "number": ((TRUE[:1], TRUE), {}, "predictions: expected 2, one for each target, got 1"),
+    "one map": ((TRUE[0], TRUE[0]), {}, r"targets: expected an array \(N, H, W\) .* got one map \(4, 5\)"),
+    "no map": (([], []), {}, "expected one depth map or more"),
+    "size": ((TRUE[:, :3], TRUE), {}, "sample 0: predictions: expected a map .* got .3, 5."),
+    "whole numbers": ((TRUE.astype(int), TRUE), {}, "sample 0: predictions: expected real floats, got int64"),
+    "NaN": ((TRUE * np.nan, TRUE), {}, "sample 0: the prediction holds 20 NaN"),
+    "metres": ((TRUE / 1000, TRUE), {}, "sample 0: the prediction looks like metres"),
+    "bad target": ((TRUE, -TRUE), {}, "sample 0: targets: expected finite mm of 0 and more"),
+    "bad sigma": ((TRUE, TRUE), {"sigma": TRUE * np.nan}, "sample 0: sigma: expected finite mm"),
+    "flags": ((TRUE, TRUE), {"flags": TRUE}, "sample 0: flags: expected uint8"),
+    "objects": ((TRUE, TRUE), {"objects": ["mug"]}, "objects: expected 2"),
+    "objects as text": ((TRUE, TRUE), {"objects": "ab"}, "objects: expected .* got str"),
+    "a dataset": ((TRUE, "data"), {}, "need the targets as arrays"),
+    "a folder": (("folder", "data"), {"sigma": TRUE}, "sigma: belongs to arrays"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_refused(case):
+    arguments, options, message = REFUSED[case]
+    with pytest.raises(PredictionError, match=message):
+        fpp_ml_bench.evaluate(*arguments, **options)

@@ -1,0 +1,201 @@
+"""Scores of a stated uncertainty: against an independent computation in extended precision, and on known predictors."""
+
+import json
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+from scored_dataset import make_dataset, write_description
+
+from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.errors import PredictionError, SubmissionError
+from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL, UNCERTAINTY
+from fpp_ml_bench.evaluation.report import write_report
+from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
+from fpp_ml_bench.evaluation.score import evaluate, score_sigma
+
+LONG = np.longdouble
+
+
+def case(number, pixels=(23, 31)):
+    """Prediction, target, sigma and void of a small image: missing pixels, pixels without sigma, equal sigmas."""
+    rng = np.random.default_rng(number)
+    target = np.where(rng.random(pixels) < 0.6, rng.uniform(1500, 2100, pixels), 0)
+    sigma = rng.choice([0.0, 0.001, 0.5, 2.0], pixels) if number % 2 else rng.uniform(0, 3, pixels)
+    wrong = rng.random(pixels) < 0.05
+    prediction = (target + rng.normal(0, 2, pixels) + 300 * wrong) * (rng.random(pixels) < 0.9)
+    return prediction.astype(np.float32), target.astype(np.float32), sigma.astype(np.float32), rng.random(pixels) < 0.1
+
+
+def quantile(coverage):
+    return LONG(mpmath.nstr(mpmath.sqrt(2) * mpmath.erfinv(mpmath.mpf(str(coverage))), 25))
+
+
+def left_out(values, order, share):
+    """Mean of ``values`` once ``share`` of them is left out, largest ``order`` first, equals in equal parts."""
+    weights, budget = np.zeros(values.size, LONG), share * values.size
+    for key in sorted(set(order), reverse=True):
+        group = order == key
+        count = int(np.count_nonzero(group))
+        taken = min(budget, Fraction(count))
+        budget -= taken
+        kept = 1 - taken / count
+        weights[group] = LONG(kept.numerator) / LONG(kept.denominator)
+    return (weights * values).sum() / weights.sum()
+
+
+def reference(prediction, target, sigma, void):
+    """Every score in extended precision, from PROTOCOL.md."""
+    inside = (target > 0) & ~void
+    depth, true, spread = (values[inside].astype(LONG) for values in (prediction, target, sigma))
+    error = np.abs(depth - true)
+    stated = (depth > 0) & (spread > 0)
+    scores = {"unstated_share": LONG(np.count_nonzero(~stated)) / stated.size}
+    unsure = np.where(stated, spread, np.inf)
+    for name, values, finish in (("mae_mm", error, lambda mean: mean), ("rmse_mm", error**2, np.sqrt)):
+        gaps = []
+        for step in range(20):
+            pair = [finish(left_out(values, order, Fraction(step, 20))) for order in (unsure, error)]
+            gaps.append(pair[0] - pair[1])
+            if step == 1:
+                scores[f"sure_{name}"] = pair[0]
+        scores[f"ause_{name}"] = sum(gaps) / 20
+    error, spread = error[stated], spread[stated]
+    for percent in COVERED:
+        scores[f"coverage_{percent}"] = LONG(np.count_nonzero(error <= quantile(percent / 100) * spread)) / error.size
+    ordered = np.sort(spread)
+    scores["sigma_mean_mm"] = spread.mean()
+    scores["sigma_median_mm"] = (ordered[(error.size - 1) // 2] + ordered[error.size // 2]) / 2
+    floored = np.maximum(spread, LONG("0.01"))
+    ratio = np.minimum(error / floored, LONG(10))
+    scores["nll"] = (np.log(floored) + np.log(2 * LONG("3.14159265358979323846")) / 2 + ratio**2 / 2).mean()
+    return scores
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_every_score_agrees_with_extended_precision(number):
+    expected, computed = reference(*case(number)), score_sigma(*case(number)).scores
+    assert set(expected) == set(computed) == set(UNCERTAINTY)
+    for key, value in expected.items():
+        assert computed[key] == pytest.approx(float(value), rel=1e-9), key
+
+
+def test_the_order_of_the_pixels_does_not_matter():
+    maps = case(1)
+    shuffled = np.random.default_rng(0).permutation(maps[0].size)
+    first, second = (
+        score_sigma(*maps),
+        score_sigma(*(values.ravel()[shuffled].reshape(maps[0].shape) for values in maps)),
+    )
+    for key, value in first.scores.items():
+        assert second.scores[key] == pytest.approx(value, rel=1e-12), key
+
+
+def gaussian(stated=1.0, pixels=(300, 400)):
+    """A target, and a prediction whose errors are Gaussian with the sigma that it states, times ``stated``."""
+    rng = np.random.default_rng(5)
+    target, sigma = np.full(pixels, 1800.0), rng.uniform(0.5, 4.0, pixels)
+    return target + sigma * rng.normal(size=pixels), target, stated * sigma
+
+
+def test_a_calibrated_predictor_gets_its_nominal_coverage_and_a_lying_one_does_not():
+    honest, lying = score_sigma(*gaussian()), score_sigma(*gaussian(0.25))
+    assert honest.observed == pytest.approx(NOMINAL, abs=0.005)
+    assert lying.scores["coverage_68"] < 0.25 and lying.scores["coverage_95"] < 0.45
+    assert lying.scores["nll"] > honest.scores["nll"] + 1
+    # Sparsification asks for the order of the sigmas only, and the lie does not change it.
+    assert lying.scores["ause_mae_mm"] == pytest.approx(honest.scores["ause_mae_mm"], rel=1e-12)
+    assert 0 < honest.scores["ause_mae_mm"] < score_sigma(*gaussian()[:2], np.ones((300, 400))).scores["ause_mae_mm"]
+    assert honest.scores["sure_rmse_mm"] < honest.curves["rmse_mm"][0]
+
+
+def test_a_perfect_predictor_scores_0_and_knowing_its_errors_leaves_no_area():
+    target = gaussian()[1]
+    perfect = score_sigma(target, target, np.ones_like(target)).scores
+    assert {perfect[key] for key in ("ause_mae_mm", "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm")} == {0.0}
+    assert {perfect[f"coverage_{percent}"] for percent in COVERED} == {1.0} and perfect["unstated_share"] == 0.0
+    prediction, target, _ = gaussian()
+    knowing = score_sigma(prediction, target, np.abs(prediction - target)).scores
+    assert knowing["ause_mae_mm"] == knowing["ause_rmse_mm"] == 0.0
+
+
+def test_nothing_stated_and_no_object_have_no_score():
+    prediction, target, sigma = gaussian(pixels=(20, 20))
+    silent = score_sigma(prediction, target, 0 * sigma)
+    assert silent.observed is None and silent.scores["coverage_68"] is None and silent.scores["unstated_share"] == 1.0
+    assert score_sigma(0 * prediction, target, sigma).scores["unstated_share"] == 1.0  # no depth, so nothing is stated
+    assert {*score_sigma(prediction, 0 * target, sigma).scores.values()} == {None}
+    with pytest.raises(PredictionError, match="sigma: expected a map of"):
+        score_sigma(prediction, target, sigma.T[:5])
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scored")
+    dataset, predictions = make_dataset(folder / "data"), folder / "p"
+    predictions.mkdir()
+    for number, sample in enumerate(dataset.samples("test")):
+        rng, depth = np.random.default_rng(number), dataset.depth_mm(sample)
+        sigma = rng.uniform(0.5, 4, depth.shape).astype(np.float32)
+        np.save(predictions / f"{sample}.npy", np.where(depth > 0, depth + sigma * rng.normal(size=depth.shape), 0.0))
+        np.save(predictions / f"{sample}.sigma.npy", sigma)
+    write_description(predictions)
+    return dataset, predictions, evaluate(predictions, dataset)
+
+
+def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
+    dataset, predictions, result = scored
+    block = result.uncertainty
+    for sample, scores in block.per_sample.items():
+        depth, sigma = (np.load(predictions / f"{sample}{suffix}") for suffix in (".npy", ".sigma.npy"))
+        assert scores.model_dump() == score_sigma(depth, dataset.depth_mm(sample), sigma).scores
+    views = [block.per_sample[f"power_drill_{view}"].coverage_68 for view in ("A0", "A60")]
+    assert block.per_object["power_drill"].coverage_68 == pytest.approx(np.mean(views), rel=1e-12)
+    write_result(result, tmp_path / "r.json")
+    assert read_result(tmp_path / "r.json") == result
+    assert main(["verify", str(tmp_path / "r.json"), str(predictions), "--dataset", str(dataset.path)]) == 0
+    assert main([str(predictions), "--dataset", str(dataset.path)]) == 0
+    assert "Stated uncertainty" in capsys.readouterr().out
+    page = write_report(result, dataset, predictions, tmp_path / "report").read_text()
+    assert page.count("<polyline") == 4 and "AUSE, RMSE" in page
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (["metrics", "coverage_68"], 0.68, r"metrics\.coverage_68 does not follow"),
+        (["metrics", "ause_mae_mm"], 0.0, r"metrics\.ause_mae_mm does not follow"),
+        (["per_object", "power_drill", "nll"], 0.0, r"per_object\.power_drill\.nll does not follow"),
+        (["per_sample", "power_drill_A0", "coverage_99"], 0.1, "a wider interval holds less"),
+        (["reliability", "observed", 6], 0.68, "reliability at 68% does not follow"),
+        (["reliability", "nominal", 6], 0.69, "reliability.nominal: expected 0.1, 0.2"),
+        (["sparsification", "mae_mm", 0], 0.0, r"sparsification\.mae_mm\.0 does not follow"),
+        (["sparsification", "rmse_mm", 5], 0.0, r"metrics\.ause_rmse_mm does not follow"),
+        (["sparsification"], None, "sparsification must be there"),
+        (["per_object"], {}, "other objects than per_sample"),
+    ],
+)
+def test_an_edited_block_contradicts_itself(path, value, message, scored, tmp_path):
+    content = json.loads(json.dumps(result_content(scored[2])))
+    place = content["uncertainty"]
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    with pytest.raises(SubmissionError, match=message):
+        parse_result(content, tmp_path / "r.json")
+
+
+def test_a_result_that_hides_or_improves_its_uncertainty_is_not_verified(scored):
+    from fpp_ml_bench.evaluation.score import differences
+
+    dataset, predictions, result = scored
+    hidden = result.model_copy(update={"uncertainty": None})
+    assert differences(hidden, predictions, dataset) == [
+        "uncertainty: there is none in the result, there is one recomputed"
+    ]
+    better = {**result.uncertainty.per_sample}
+    better["power_drill_A0"] = better["power_drill_A0"].model_copy(update={"nll": 0.0})
+    block = result.uncertainty.model_copy(update={"per_sample": better})
+    changed = result.model_copy(update={"uncertainty": block})
+    assert len(differences(changed, predictions, dataset)) == 1

@@ -1,0 +1,120 @@
+"""Void pixels count in no set, unlit ones are a set of their own, and results of protocol 1 are read as they are."""
+
+import numpy as np
+import pytest
+from scored_dataset import make_dataset, write_predictions
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE, SINCE_2
+from fpp_ml_bench.evaluation.report import compare, result_table, score_table
+from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
+from fpp_ml_bench.evaluation.score import DepthScores, evaluate, score_sample
+from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
+
+
+def flagged(depth):
+    """Unlit: four rows through the disk. Mixed: its left border and the background beside it. The other flags: all."""
+    flags = np.full(depth.shape, Flag.SATURATED | Flag.INTERREFLECTION, np.uint8)
+    flags[14:18][depth[14:18] > 0] |= np.uint8(Flag.UNLIT)
+    border = (depth > 0) != np.roll(depth > 0, 1, axis=1)
+    flags[border] |= np.uint8(Flag.MIXED)
+    return flags
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", flagged=flagged)
+
+
+def test_only_unlit_and_mixed_are_void():
+    flags = np.arange(16, dtype=np.uint8).reshape(4, 4)
+    assert np.array_equal(void_pixels(flags), [[(value & 3) > 0 for value in row] for row in flags])
+    assert Flag.UNLIT | Flag.MIXED == VOID
+
+
+def test_they_count_in_no_set_and_their_share_is_reported(dataset, tmp_path):
+    folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
+    for sample in dataset.samples("test"):  # whatever is predicted there
+        path = folder / f"{sample}.npy"
+        np.save(path, np.where(dataset.void(sample), np.float32(9999), np.load(path)))
+    result = evaluate(folder, dataset)
+    for row in result.per_sample:
+        target, void = dataset.depth_mm(row.sample), void_pixels(dataset.flags(row.sample))
+        error = np.abs(np.load(folder / f"{row.sample}.npy").astype(np.float64) - target)
+        assert row.void_pixels == np.count_nonzero(void) > 0 and row.void_share == void.mean()
+        sets = {"object": (target > 0) & ~void, "background": (target == 0) & ~void, "overall": ~void}
+        for name, pixels in sets.items():
+            assert getattr(row, f"{name}_mae_mm") == pytest.approx(error[pixels].mean(), rel=1e-12)
+        assert row.object_pixels + row.background_pixels + row.void_pixels == target.size
+        assert row.unlit_pixels is None and row.unlit_mae_mm is None
+    write_result(result, tmp_path / "r.json")
+    assert read_result(tmp_path / "r.json") == result
+
+
+def test_the_papers_sets_know_no_void(dataset, tmp_path):
+    folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
+    result = evaluate(folder, dataset, mode="paper")
+    for row in result.per_sample:
+        scores = score_sample(np.load(folder / f"{row.sample}.npy"), dataset.depth_mm(row.sample)).metrics()
+        assert [getattr(row, key) for key in HEADLINE] == [scores[key] for key in HEADLINE]
+        assert row.void_pixels is None and row.void_share is None
+    assert not set(SINCE_2) & set(result.metrics.model_dump())
+
+
+def test_unlit_pixels_are_scored_against_their_exact_depth(dataset, tmp_path):
+    folder = write_predictions(tmp_path / "p", dataset)  # predicts 0 there: not measured
+    result = evaluate(folder, dataset, target="depth_exact")
+    assert result.metrics.unlit_missing_share == 1.0 and result.metrics.unlit_valid_mae_mm is None
+    for row in result.per_sample:
+        exact = dataset.unlit_mm(row.sample)
+        assert row.unlit_pixels == np.count_nonzero(exact) and row.unlit_mae_mm == pytest.approx(
+            exact[exact > 0].mean()
+        )
+        path = folder / f"{row.sample}.npy"
+        np.save(path, np.where(exact > 0, exact + np.float32(3), np.load(path)))
+    result = evaluate(folder, dataset, target="depth_exact")
+    metrics = result.metrics
+    assert (metrics.unlit_mae_mm, metrics.unlit_rmse_mm, metrics.unlit_valid_mae_mm) == (3.0, 3.0, 3.0)
+    assert metrics.unlit_missing_share == 0.0 and metrics.object_mae_mm == 0.5
+    assert (
+        "Unlit, RMSE" in score_table(result) and "Unlit pixels: MAE 3.000" in result_table(result).renderables[2].plain
+    )
+
+
+def test_data_without_flags_have_none(tmp_path):
+    data = make_dataset(tmp_path / "data", exact=False)
+    result = evaluate(write_predictions(tmp_path / "p", data), data)
+    assert result.metrics.void_share == 0.0 and {row.void_pixels for row in result.per_sample} == {0}
+
+
+def test_a_view_that_is_void_all_over_has_no_score():
+    target = np.full((4, 5), 1800.0)
+    scores = score_sample(target + 1, target, void=np.ones((4, 5), bool)).metrics()
+    assert scores["void_share"] == 1.0 and {scores[key] for key in HEADLINE} == {None}
+
+
+def test_the_torch_metric_leaves_them_out_too(dataset):
+    import torch
+
+    sample = dataset.samples("test")[0]
+    target, void = dataset.depth_mm(sample), dataset.void(sample)
+    prediction = target + np.random.default_rng(0).normal(0, 2, target.shape).astype(np.float32)
+    metric = DepthScores()
+    metric.update(*(torch.tensor(pixels)[None] for pixels in (prediction, target, void)))
+    expected = score_sample(prediction, target, void=void).metrics()
+    for key, value in metric.compute().items():
+        assert float(value) == pytest.approx(expected[key], rel=1e-12), key
+
+
+def test_results_of_protocol_1_are_read_and_keep_their_rules(dataset, tmp_path):
+    result = evaluate(write_predictions(tmp_path / "p", dataset, noise_mm=1.0), dataset, mode="paper")
+    content = {**result_content(result), "protocol_version": "1.1.0", "mode": "standard", "schema_version": "2.2.0"}
+    first = parse_result(content, tmp_path / "r.json")
+    assert first.protocol_version == "1.1.0" and first.metrics == result.metrics
+    assert result_content(first) == content
+    with pytest.raises(SubmissionError, match=r"protocol: 1\.1\.0 against 2\.0\.0"):
+        compare(first, evaluate(tmp_path / "p", dataset))
+    with pytest.raises(SubmissionError, match=r"protocol 1\.1\.0 has no mode paper"):
+        parse_result({**content, "mode": "paper"}, tmp_path / "r.json")
+    with pytest.raises(SubmissionError, match="void_pixels is missing"):
+        parse_result({**content, "protocol_version": "2.0.0"}, tmp_path / "r.json")
