@@ -8,6 +8,8 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
 
+TRIVIAL = "constant", "nearest"
+"""The methods of this module by name: what a method's error is worth is how far it is from theirs."""
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM = 1743.75
 """Mean exact depth over the object pixels of the training split of ``fpp-bench-full`` version 1."""

@@ -1,14 +1,15 @@
 from . import publish as publish
+from .data_files import table_csv as table_csv
+from .data_files import table_json as table_json
 from .ranking import discover as discover
 from .ranking import expand as expand
 from .ranking import rank as rank
 from .ranking import read_entries as read_entries
 from .ranking import shipped_rows as shipped_rows
+from .readme import update_readme as update_readme
 from .rows import chosen_tables as chosen_tables
 from .rows import read_entry as read_entry
 from .rows import write_row as write_row
 from .tables import group_tables as group_tables
 from .tables import markdown as markdown
 from .tables import paper_rich_tables as paper_rich_tables
-from .tables import table_json as table_json
-from .tables import update_readme as update_readme

@@ -23,12 +23,13 @@ ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
 
 Provenance = Literal["measured here", "verified", "self-reported"]
 PROVENANCES: tuple[str, ...] = get_args(Provenance)
+MEASURED_HERE: Provenance = "measured here"
 LOCAL = "local file"
 """Of a result on this machine that is in no leaderboard."""
 BY_THE_PAPER = "reported by the paper"
 
 MEANING = {
-    "measured here": "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
+    MEASURED_HERE: "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
     "verified": "The author sent the predictions, and fpp-eval verify gave the same scores. Run time is the author's.",
     "self-reported": "The author ran fpp-eval and sent the result. Its numbers are consistent; nobody checked them.",
     LOCAL: "A result on this machine that is in no leaderboard.",
@@ -77,7 +78,7 @@ class Entry:
         """Whether this package measured the time and the provenance allows that claim; else it is self-reported."""
         timing, submission = self.result.timing, self.result.submission
         source = timing.provenance if timing is not None else submission.seconds_source
-        return source == "measured" and self.provenance in ("measured here", LOCAL)
+        return source == "measured" and self.provenance in (MEASURED_HERE, LOCAL)
 
     def value(self, key: str) -> float | None:
         """Value of a sort key; None for an empty pixel set or an unknown time."""

@@ -1,12 +1,14 @@
 """Rows for the leaderboard's tests: results of real scoring with errors, times and names that the test chooses."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.evaluation.result import write_result
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result import result_from_rows, write_result
+from fpp_ml_bench.evaluation.score import ErrorStats, combine, evaluate
+from fpp_ml_bench.leaderboard.rows import Entry
 
 HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 
@@ -48,3 +50,25 @@ def some_rows(folder: Path, dataset: Any) -> list[Path]:
             timing=timing(10.0),
         ),
     ]  # fmt: skip
+
+
+def entry_with_errors(
+    base: Entry, errors: Mapping[str, float], name: str, fingerprint: str = "", **about: Any
+) -> Entry:
+    """A sound entry made of ``base``, scored on two views of each object of ``errors``, off by so many mm everywhere on
+    the object and by nothing behind it. ``about`` goes into its description."""
+    first, rows = base.result.per_sample[0].model_dump(), []
+    inside, outside = first["object_pixels"], first["background_pixels"]
+    for name_of_object, error in errors.items():
+        whole = combine(ErrorStats(inside, error, error), ErrorStats(outside, 0.0, 0.0))
+        row = {key: error if key.startswith("object_") and key.endswith("_mm") else first[key] for key in first}
+        row |= {"object_shift_free_mae_mm": 0.0, "background_mae_mm": 0.0, "background_rmse_mm": 0.0}
+        row |= {"overall_mae_mm": whole.mae_mm, "overall_rmse_mm": whole.rmse_mm, "object": name_of_object}
+        rows += [{**row, "sample": f"{name_of_object}_{view}"} for view in ("A0", "A60")]
+    data = {"samples": len(rows), "fingerprint": fingerprint or base.result.dataset.fingerprint}
+    kept = ("protocol_version", "created", "target", "mode", "edge_band_px", "edge_jump_mm", "environment")
+    result = result_from_rows(
+        rows, submission=base.result.submission.model_copy(update={"name": name, **about}),
+        dataset=base.result.dataset.model_copy(update=data), **{key: getattr(base.result, key) for key in kept},
+    )  # fmt: skip
+    return Entry(base.path.with_name(f"{name}.json"), result, base.provenance)

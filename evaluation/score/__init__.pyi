@@ -10,9 +10,12 @@ from .sample_scores import mean_of as mean_of
 from .sample_scores import score_sample as score_sample
 from .sample_scores import stats_of as stats_of
 from .torch_metric import DepthScores as DepthScores
+from .uncertainty import FEWEST_OBJECTS as FEWEST_OBJECTS
+from .uncertainty import SIGNIFICANT as SIGNIFICANT
 from .uncertainty import Interval as Interval
 from .uncertainty import caution as caution
+from .uncertainty import holm as holm
 from .uncertainty import intervals_over_objects as intervals_over_objects
 from .uncertainty import object_interval as object_interval
-from .uncertainty import ranks_with_ties as ranks_with_ties
+from .uncertainty import sign_flip_p as sign_flip_p
 from .units import scored_pair as scored_pair

@@ -17,8 +17,10 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.report import data_uri, millimetres, page, render, sample_table, score_table
 from fpp_ml_bench.evaluation.result import PART_TITLES, result_json
 from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.leaderboard import tables
-from fpp_ml_bench.leaderboard.groups import LEGACY_NOTE, TOLD, Group, Ranked, assumption, assumption_sentences
+from fpp_ml_bench.leaderboard import columns, tables
+from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences, told
+from fpp_ml_bench.leaderboard.data_files import table_json
+from fpp_ml_bench.leaderboard.groups import Group, Ranked
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEANING, Entry, PaperTable, picture_of, read_entry
 from fpp_ml_bench.loaders.storage import benchmark_of
@@ -61,17 +63,17 @@ def page_files(groups: Sequence[Group], papers: Sequence[PaperTable], run: Trade
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
     present = {row.entry.provenance for group in groups for row in group.rows}
-    shared = {"meaning": MEANING, "legacy_note": LEGACY_NOTE, "milliseconds": milliseconds}
+    shared = {"meaning": MEANING, "milliseconds": milliseconds}
     body = render(
-        _PACKAGE, "index.html", **shared, tables=tables, told=TOLD, assumption=assumption, search=_search,
-        slug=lambda entry: slugs[id(entry)], rankings=_rankings(groups), by_the_paper=BY_THE_PAPER,
+        _PACKAGE, "index.html", **shared, tables=tables, columns=columns, told=told, assumption=assumption,
+        search=_search, slug=lambda entry: slugs[id(entry)], rankings=_rankings(groups), by_the_paper=BY_THE_PAPER,
         sections=[_section(group, slugs) for group in groups], tradeoff=_tradeoff(run),
         provenances=[name for name in MEANING if name in present],
         papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), tables.paper_note(p)) for p in papers],
     )  # fmt: skip
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
-    files = {INDEX: index, DATA: tables.table_json(groups, papers, DEFAULT_SORT)}
+    files = {INDEX: index, DATA: table_json(groups, papers, DEFAULT_SORT)}
     for group in groups:
         for row in group.rows:
             body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row))
@@ -91,7 +93,7 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     changes = result.reliance.parts if result.reliance else None
     parts = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
     return {
-        "row": row, "key": group.key, "rows": len(group.rows), "assumption_sentences": assumption_sentences,
+        "row": row, "group": group, "rows": len(group.rows), "assumption_sentences": assumption_sentences,
         "picture": picture and data_uri(picture), "scores": score_table(result), "samples": sample_table(result),
         "bars": sorted(bars, key=lambda bar: (-bar[0], bar[2])),
         "longest_mm": max((mean + (spread or 0.0) for mean, spread, _ in bars), default=0.0),
@@ -114,7 +116,7 @@ def slug(entry: Entry) -> str:
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    words = row.entry.name, row.short_name, row.entry.result.submission.method, tables.device(row.entry)
+    words = row.entry.name, row.short_name, row.entry.result.submission.method, columns.device(row.entry)
     return " ".join(words).casefold()
 
 
@@ -134,7 +136,7 @@ def _rankings(groups: Sequence[Group]) -> list[tuple[str, list[tuple[int, str, i
 
 def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
     """What the template needs of a group: its rows' intervals, pictures and objects."""
-    key, machines = group.key, sorted({tables.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
+    machines = sorted({columns.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
     per_object = [{p.object: p.metrics.object_mae_mm for p in row.entry.result.per_object} for row in group.rows]
     objects = sorted({name for errors in per_object for name in errors})
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
@@ -143,7 +145,7 @@ def _section(group: Group, slugs: dict[int, str]) -> dict[str, Any]:
     front = [mark.name for mark in picture.front] if picture else []
     description = (
         "Object MAE in mm against milliseconds per image, both logarithmic. On the front, fastest first: "
-        f"{', '.join(front)}. {key.title}"
+        f"{', '.join(front)}. {group.title}"
     )
     drawn = [_drawn(picture, f"{css} scatter", w, h, description) for css, w, h in _PICTURES] if picture else []
     cells = [[(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object]
