@@ -7,7 +7,7 @@ from .ranking import rank as rank
 from .ranking import read_entries as read_entries
 from .ranking import shipped_rows as shipped_rows
 from .readme import update_readme as update_readme
-from .rows import chosen_tables as chosen_tables
+from .reported import chosen_tables as chosen_tables
 from .rows import read_entry as read_entry
 from .rows import write_row as write_row
 from .tables import group_tables as group_tables

@@ -151,7 +151,7 @@ def _says_learned(row: Ranked) -> bool:
     return bool(learned_from(row.entry.result))
 
 
-RANK = Column("Rank", lambda row: row.ranks)
+RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
 METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 PARTS = tuple(

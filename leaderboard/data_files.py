@@ -11,14 +11,14 @@ from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.leaderboard.assumptions import assumption_sentences, learned_from, told
 from fpp_ml_bench.leaderboard.columns import device, uncertainty
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Group, Ranked
-from fpp_ml_bench.leaderboard.rows import PaperTable
+from fpp_ml_bench.leaderboard.reported import ReportedTable
 
 _MAIN = "object_mae_mm"
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
-def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
-    """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the paper's tables apart."""
+def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
+    """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the tables of others apart."""
     of_groups = [
         {
             **asdict(group.key), "title": group.title, "legacy": group.key.is_legacy,
@@ -27,7 +27,7 @@ def table_json(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str)
         }
         for group in groups
     ]  # fmt: skip
-    content = {"sorted_by": sort, "groups": of_groups, "reported_by_the_paper": list(map(asdict, papers))}
+    content = {"sorted_by": sort, "groups": of_groups, "reported_by_others": list(map(asdict, papers))}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 

@@ -25,7 +25,8 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.rows import chosen_tables, read_entry
+from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head

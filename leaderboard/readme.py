@@ -10,7 +10,7 @@ from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.assumptions import ASSUMED, assumption, told
 from fpp_ml_bench.leaderboard.columns import RANK_NOTE, RATIO_NOTE, SELF_REPORTED, Column, device, error, interval
 from fpp_ml_bench.leaderboard.groups import Group
-from fpp_ml_bench.leaderboard.rows import paper_tables
+from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
@@ -48,18 +48,18 @@ def readme_block(groups: Sequence[Group]) -> str:
         lines += [*markdown_columns(_COLUMNS, group.rows[:SHOWN]), ""]
         more = len(group.rows) - SHOWN
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
-        lines += [group.unranked, ""] if group.unranked else []
     results = [row.entry.result for group in groups for row in group.rows]
     assuming = sorted({result.submission.method for result in results if assumption(result)})
     notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ASSUMED}."] if assuming else [])
-    notes += dict.fromkeys(note for group in groups for note in group.key.notes)
+    notes += dict.fromkeys(note for group in groups for note in (group.unranked, *group.key.notes) if note)
     keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
-    paper = [
-        [row.label, *(f"{row.errors_mm[key]:.2f}" for key in keys), f"told {told(row.track)}"]
-        for row in paper_tables()["architecture"].rows
-    ]
-    rows = [list(map(markdown_text, cells)) for cells in paper]
-    lines += ["**Reported by the paper on other data, not measured here and not ranked with the rows above**", ""]
+    reported = [
+        [row.label, *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
+         f"{table.source}, told {told(row.track)}"]
+        for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order")) for row in table.rows
+    ]  # fmt: skip
+    rows = [list(map(markdown_text, cells)) for cells in reported]
+    lines += [f"**{REPORTED_HEADING}, not ranked with the rows above**", ""]
     lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]
     return "\n".join([*lines, " ".join(notes)]) + "\n"
 

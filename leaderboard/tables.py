@@ -9,11 +9,10 @@ from rich.text import Text
 
 from fpp_ml_bench.evaluation.report import interval_text, millimetres
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.columns import NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import Group, Ranked
 from fpp_ml_bench.leaderboard.pairs import Pair
-from fpp_ml_bench.leaderboard.rows import PAPER_HEADING, PaperRow, PaperTable
+from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, ReportedRow, ReportedTable
 
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
@@ -32,17 +31,11 @@ PAIR_TEXT_COLUMNS = 2
 _PLAIN = frozenset(" -,+()/%=.")
 
 
-def paper_cells(row: PaperRow) -> list[str]:
-    """Cells under `PAPER_TITLES`, errors with the paper's two decimals."""
+def paper_cells(row: ReportedRow) -> list[str]:
+    """Cells under `PAPER_TITLES`, errors with the two decimals of their tables."""
     keys = (f"{pixels}_{error}_mm" for pixels in ("object", "overall", "background") for error in ("mae", "rmse"))
-    return [row.label, row.track, str(row.test_samples), *(f"{row.errors_mm[key]:.2f}" for key in keys)]
-
-
-def paper_note(paper: PaperTable) -> str:
-    """Below a table of the paper: other data, and what the methods of its tracks were told."""
-    tracks = sorted({row.track for row in paper.rows})
-    given = [f"{track}: told {told(track)}." for track in tracks if told(track)]
-    return " ".join(["Other data, not ranked with the rows above.", *given])
+    errors = [f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys]
+    return [row.label, row.track, "-" if row.test_samples is None else str(row.test_samples), *errors]
 
 
 def pair_cells(pair: Pair) -> list[str]:
@@ -86,16 +79,16 @@ def _rich_table(title: str, titles: Sequence[str], right: Sequence[bool], rows: 
     return table
 
 
-def paper_rich_tables(tables: Sequence[PaperTable]) -> list[Table | Text]:
-    """The paper's tables under their heading."""
-    parts: list[Table | Text] = [Text(PAPER_HEADING, style="bold")] if tables else []
+def paper_rich_tables(tables: Sequence[ReportedTable]) -> list[Table | Text]:
+    """The tables of others under their heading."""
+    parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if tables else []
     for paper in tables:
         table = Table(title=f"{paper.name}: {paper.title}, mm", title_justify="left")
         for number, title in enumerate(PAPER_TITLES):
             table.add_column(title, justify="left" if number < PAPER_TEXT_COLUMNS else "right")
         for row in paper.rows:
             table.add_row(*paper_cells(row))
-        parts += [table, Text(f"{paper_note(paper)}\n")]
+        parts += [table, Text(f"{paper.note}\n")]
     return parts
 
 
@@ -120,7 +113,7 @@ def markdown_columns(shown: Sequence[Column], rows: Sequence[Ranked]) -> list[st
     return markdown_rows([column.title for column in shown], [column.right for column in shown], cells)
 
 
-def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -> str:
+def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
     """The whole leaderboard as Markdown, ending in a newline."""
     lines: list[str] = []
     for group in groups:
@@ -128,10 +121,10 @@ def markdown(groups: Sequence[Group], papers: Sequence[PaperTable], sort: str) -
         for note in (group.unranked, *group.key.notes):
             lines += [note, ""] if note else []
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
-    lines += [f"### {PAPER_HEADING}", ""] if papers else []
+    lines += [f"### {REPORTED_HEADING}", ""] if papers else []
     right = [number >= PAPER_TEXT_COLUMNS for number in range(len(PAPER_TITLES))]
     for paper in papers:
         rows = [list(map(markdown_text, paper_cells(row))) for row in paper.rows]
         lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), "", *markdown_rows(PAPER_TITLES, right, rows), ""]
-        lines += [paper_note(paper), ""]
+        lines += [paper.note, ""]
     return "\n".join(lines).rstrip("\n") + "\n"

@@ -24,7 +24,7 @@ EXAMPLES = (
     "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json --provenance verified",
 )
 _PROVENANCES = ("measured here", "verified", "self-reported")
-_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "all", "none")
+_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--pairs", action="store_true",
         help="also print every pair of ranked rows: difference, interval, p value, who is behind")  # fmt: skip
     add("--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
-        help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
+        help=f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, normalization, "
+             "oracle_order; without TABLE: all)",
     )  # fmt: skip
     add("--page", type=Path, metavar="DIR",
         help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",

@@ -15,7 +15,7 @@ from fpp_ml_bench.leaderboard.names import LONGEST_NAME, cut_at_word, short_name
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.readme import readme_block
-from fpp_ml_bench.leaderboard.rows import chosen_tables
+from fpp_ml_bench.leaderboard.reported import chosen_tables
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
 
 
@@ -48,7 +48,7 @@ def test_groups_are_headed_by_their_benchmark_and_legacy_comes_last(files, monke
     groups = rank([with_fingerprint(entry, legacy), entry, with_fingerprint(entry, named)])
     titles = [group.title for group in groups]
     rest = "40 x 32 px"
-    words = ": one frame, metric track, test split, against decoded depth"
+    words = ": few frames, no code, metric track, test split, against decoded depth"
     assert titles == [
         f"fpp-bench-full version 0, {rest}{words}",
         f"{rest}, data {entry.result.dataset.fingerprint[:8]}{words}",
@@ -176,9 +176,9 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
 def test_the_papers_errors_are_shown_apart(shipped):
     groups = rank(shipped)
     block = readme_block(groups)
-    line = "| UNet | 14.54 | 17.88 | 3.31 | told the test sample&#39;s depth range |"
-    assert block.index("Reported by the paper on other data") < block.index(line)
+    line = "| UNet | 14.54 | 17.88 | 3.31 | reported by the paper, told the test sample&#39;s depth range |"
+    assert block.index("Reported by others on other data") < block.index(line)
     index = page_files(groups, chosen_tables(None))["index.html"].decode()
-    paper = index[index.index('<section id="paper">') :]
+    paper = index[index.index('<section id="reported">') :]
     assert "14.54" in paper and "told the test sample" in paper and "Other data, not ranked" in paper
-    assert "14.54" not in index[: index.index('<section id="paper">')]
+    assert "14.54" not in index[: index.index('<section id="reported">')]
