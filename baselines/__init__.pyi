@@ -12,3 +12,4 @@ from .timing import time_method as time_method
 from .timing import write_timing as write_timing
 from .trivial import TRIVIAL as TRIVIAL
 from .trivial import ConstantMethod as ConstantMethod
+from .trivial import NearestMethod as NearestMethod

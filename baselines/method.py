@@ -97,6 +97,7 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     ),
     "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **_fringe_options("phase-net", rig, options)),
     "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
+    "nearest": lambda rig, **options: baselines.NearestMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
 `NetworkMethod`."""

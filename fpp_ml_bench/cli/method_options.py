@@ -12,7 +12,8 @@ from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
-    "(single-shot phase; order, mask and correction learned), constant (looks at nothing), the name of weights that "
+    "(single-shot phase; order, mask and correction learned), constant (looks at nothing), nearest (depth of the "
+    "training sample with the nearest image), the name of weights that "
     "come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
@@ -30,6 +31,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     ),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
     "constant": ("at",),
+    "nearest": ("training",),
     "trained networks": ("depth_range", "frame", "device"),
 }
 """Options that belong to one kind of method only, by their name in the parsed arguments."""
@@ -77,6 +79,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument_group("constant").add_argument
     add("--at", metavar="DEPTH", help="standoff, middle (of the range), training-mean, or mm (default: standoff)")
+    add = parser.add_argument_group("nearest").add_argument
+    add("--training", type=Path, metavar="FOLDER", help="dataset with the training split (default: DATASET itself)")
     add = parser.add_argument_group("trained networks").add_argument
     add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
@@ -213,4 +217,11 @@ def _constant(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     return _given(at=args.at)
 
 
-_MAKERS = {"classical": _classical, "phase": _phase, "phase-net": _phase_net, "constant": _constant}
+def _nearest(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    own = opened if isinstance(opened, storage.DatasetFolder) else None
+    return {"training": args.training or own}
+
+
+_MAKERS = {
+    "classical": _classical, "phase": _phase, "phase-net": _phase_net, "constant": _constant, "nearest": _nearest,
+}  # fmt: skip
