@@ -7,7 +7,8 @@
 
 Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
 machine. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
-decoded from the full sequence, and the phase routes against ``depth``, as the paper's networks are.
+decoded from the full sequence, the phase routes against ``depth``, as the paper's networks are, the trivial ones
+against both.
 """
 
 import argparse
@@ -39,10 +40,19 @@ METHODS: dict[str, tuple[object, ...]] = {
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
     },
     **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
-    **{f"constant-{depth}": ("constant", "--at", depth) for depth in ("standoff", "training-mean")},
+    **{
+        f"{name}{against}": words
+        for against in ("", "-exact")
+        for name, words in {
+            "constant-standoff": ("constant", "--at", "standoff"),
+            "constant-training-mean": ("constant", "--at", "training-mean"),
+            "nearest": ("nearest",),
+        }.items()
+    },
     "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
-"""File name of a row: method and options."""
+"""File name of a row: method and options. The trivial methods are scored against both depths, so that every table is
+compared with them. The middle of the range is the standoff, so it is no row of its own."""
 
 
 def run(command: str, *words: object) -> None:
@@ -61,7 +71,7 @@ def make_row(dataset: Path, work: Path, out: Path, name: str, repeats: int) -> N
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
-    target = "depth_exact" if method == "classical" else "depth"
+    target = "depth_exact" if method == "classical" or name.endswith("-exact") else "depth"
     run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--json", result)
     run("fpp-bench", "leaderboard", result, "--row", out / f"{name}.json", "--provenance", "measured here")
     write_sheet(read_result(result), DatasetFolder(dataset), predictions, out / f"{name}.png")

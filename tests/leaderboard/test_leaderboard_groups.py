@@ -169,7 +169,10 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
     assuming = [row for row in group.rows if assumption(row.entry.result)]
     assert assuming and sum("a lit background" in text for text in own) == len(assuming)
-    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {"constant"}
+    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {
+        "constant",
+        "nearest",
+    }
     assert "phase and phase-net assume one albedo, a lit background." in readme_block([group])
 
 
