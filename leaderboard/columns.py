@@ -102,7 +102,7 @@ def ratio(row: Ranked) -> str:
 def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
     """Share of object pixels within the stated 95% interval, and AUSE in mm; None where no uncertainty was scored."""
     block = getattr(entry.result, "uncertainty", None)
-    return (None, None) if block is None else (block.coverage["0.95"], block.ause_mae_mm)
+    return (None, None) if block is None else (block.metrics.coverage_95, block.metrics.ause_mae_mm)
 
 
 def _seconds(row: Ranked) -> str:
