@@ -44,12 +44,11 @@ Scene = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.float32]]]
 
 def make_dataset(
     folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True, views: Sequence[str] = VIEWS,
-    scene: Scene | None = None, rig_px: int = 960,
+    scene: Scene | None = None,
 ) -> DatasetFolder:  # fmt: skip
     """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more than ``depth``.
 
-    The rig is one of ``rig_px``, whatever the images' size. ``scene`` gives frame and depth of a number that no other
-    sample has; by default a flat frame and a `disk_depth`.
+    ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
     """
     scratch = folder / ".build"
     scratch.mkdir(parents=True)
@@ -83,7 +82,7 @@ def make_dataset(
             samples.setdefault(split, []).extend(described)
     scratch.rmdir()
     Manifest(
-        origin="generated", generator={}, settings={}, rig=paper_rig(rig_px).to_dict(), size=size, stored="single_shot",
+        origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=size, stored="single_shot",
         exact=exact, samples=samples, shards=shards,
     ).write(folder)  # fmt: skip
     return DatasetFolder(folder)

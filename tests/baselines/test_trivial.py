@@ -1,5 +1,7 @@
 """The predictors that look at nothing, or only for the nearest training image."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scored_dataset import disk_depth, make_dataset
@@ -8,6 +10,7 @@ from fpp_ml_bench.baselines import ConstantMethod, NearestMethod, predict_split
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import paper_rig
 
 SIZE = (96, 96)
@@ -20,7 +23,9 @@ def dataset(tmp_path_factory):
         return frame, disk_depth(SIZE, seed)
 
     views = ("A0", "A60", "A120", "A180")
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE, views=views, scene=scene, rig_px=96)
+    made = make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE, views=views, scene=scene)
+    replace(made.manifest, rig=paper_rig(96).to_dict()).write(made.path)  # the rig of such images
+    return DatasetFolder(made.path)
 
 
 def stack(frame):
