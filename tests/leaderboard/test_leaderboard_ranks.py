@@ -5,6 +5,8 @@ import io
 import json
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,7 +16,11 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.result import write_result
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.leaderboard.assumptions import learned_from, told
+from fpp_ml_bench.leaderboard.columns import columns, uncertainty
 from fpp_ml_bench.leaderboard.groups import CLASSES, frames_class
 from fpp_ml_bench.leaderboard.pairs import pairs
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
@@ -212,3 +218,54 @@ def test_pairs_over_the_objects_that_both_have():
     assert (pair.first, pair.second, pair.objects, pair.difference, pair.p) == ("b", "a", 1, 1.0, 1.0)
     (pair,) = pairs({"a": {"x": 1.0}, "b": {"z": 5.0}})
     assert (pair.objects, pair.p, pair.interval, pair.behind) == (0, 1.0, None, False)
+
+
+def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
+    """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
+    (row,) = rank([base])[0].rows
+    assert learned_from(base.result) == "" and uncertainty(base) == (None, None)
+    shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
+    assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
+    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5)
+    stated = SimpleNamespace(
+        uncertainty=SimpleNamespace(metrics=scores),
+        submission=SimpleNamespace(learned_from=SimpleNamespace(data="train-split")),
+    )
+    assert learned_from(stated) == "train-split"
+    assert uncertainty(SimpleNamespace(result=stated)) == (0.9, 1.5)
+
+
+def test_a_submission_may_say_that_it_was_given_the_order(base):
+    about = base.result.submission.model_dump(mode="json")
+    assert "uses_ground_truth_order" not in about
+    tracks = {}
+    for given in range(8):
+        flags = {
+            f"uses_ground_truth_{name}": bool(given >> bit & 1) for bit, name in enumerate(("range", "mask", "order"))
+        }
+        tracks[given] = Submission.model_validate({**about, **flags}).track
+    assert tracks == {
+        0: "metric", 1: "oracle range", 2: "oracle mask", 3: "oracle range + mask", 4: "oracle order",
+        5: "oracle range + order", 6: "oracle mask + order", 7: "oracle range + mask + order",
+    }  # fmt: skip
+    assert set(tracks.values()) == set(get_args(Track))
+    assert told(tracks[7]) == "the test sample's depth range, object mask and fringe order" and told("metric") == ""
+
+
+def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["leaderboard", "--paper", "oracle_order"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
+    assert "Reported by its authors (arXiv 2607.11928)" in printed
+    assert "oracle order: told the test sample's fringe order." in printed
+
+
+def test_results_of_an_earlier_protocol_keep_their_own_table(base):
+    errors = dict.fromkeys(EIGHT, 1.0)
+    entry = entry_with_errors(base, errors, "new")
+    old = replace(entry, result=entry.result.model_copy(update={"protocol_version": "0.9.0"}))
+    now, earlier = rank([old, entry])
+    assert (now.key.notes, len(earlier.key.notes)) == ([], 1) and "protocol 0.9.0" in earlier.title
+    assert "protocol" not in now.title
