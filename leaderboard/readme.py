@@ -12,7 +12,7 @@ from fpp_ml_bench.leaderboard.columns import RANK_NOTE, RATIO_NOTE, SELF_REPORTE
 from fpp_ml_bench.leaderboard.groups import Group
 from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
-from fpp_ml_bench.leaderboard.trivial import is_trivial
+from fpp_ml_bench.leaderboard.trivial import more_than_trivial
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 SHOWN = 5
@@ -42,7 +42,7 @@ def readme_block(groups: Sequence[Group]) -> str:
     if not groups:
         return f"No row yet. {_MADE_BY}\n"
     lines: list[str] = []
-    for group in [group for group in groups if not all(map(is_trivial, group.rows))] or groups:
+    for group in more_than_trivial(groups):
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
         lines += [f"**{markdown_text(group.title + timed)}**", ""]

@@ -16,6 +16,11 @@ def is_trivial(row: Ranked) -> bool:
     return row.entry.result.submission.method in TRIVIAL and row.entry.provenance in (MEASURED_HERE, LOCAL)
 
 
+def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
+    """The groups that hold more than trivial rows, whose errors the others' ratios show; all where none does."""
+    return [group for group in groups if not all(map(is_trivial, group.rows))] or list(groups)
+
+
 def with_ratios(groups: Sequence[Group]) -> list[Group]:
     """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row on the same data has
     on the row's objects. Trivial rows need at most one frame and are told nothing, so they count in all classes and

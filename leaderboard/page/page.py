@@ -31,6 +31,7 @@ from fpp_ml_bench.leaderboard.page.sections import blocks, tradeoff_section
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
 from fpp_ml_bench.leaderboard.reported import ReportedTable
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry, picture_of, read_entry
+from fpp_ml_bench.leaderboard.trivial import more_than_trivial
 from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, TABLE, SUBMISSIONS = "index.html", "data.json", "data.csv", "submissions"
@@ -63,7 +64,9 @@ def write_page(
 def page_files(
     groups: Sequence[Group], papers: Sequence[ReportedTable], run: Tradeoff | None = None
 ) -> dict[str, bytes]:
-    """Relative name -> content of every file of the page."""
+    """Relative name -> content of every file of the page. Tables of trivial rows alone are in the data files only."""
+    data = {DATA: table_json(groups, papers, DEFAULT_SORT), TABLE: table_csv(groups)}
+    groups = more_than_trivial(groups)
     style, script = (_HERE / "page.css").read_text("utf-8"), (_HERE / "page.js").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
     rows = [(group, row) for group in groups for row in group.rows]
@@ -85,7 +88,7 @@ def page_files(
     )  # fmt: skip
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
-    files = {INDEX: index, DATA: table_json(groups, papers, DEFAULT_SORT), TABLE: table_csv(groups)}
+    files = {INDEX: index, **data}
     for group in groups:
         for row in group.rows:
             body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row))
