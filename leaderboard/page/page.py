@@ -108,7 +108,8 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     changes = result.reliance.parts if result.reliance else None
     changed = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
     return {
-        "row": row, "group": group, "rows": len(group.rows), "assumption_sentences": assumption_sentences,
+        "row": row, "group": group, "rows": sum(other.best_rank is not None for other in group.rows),
+        "assumption_sentences": assumption_sentences,
         "columns": columns, "picture": picture and data_uri(picture),
         "scored": [(_data_words(part), score_table(part), sample_table(part)) for part in parts],
         "bars": sorted(bars, key=lambda bar: (-bar[0], bar[2])),
