@@ -10,4 +10,6 @@ from .run import predict_split as predict_split
 from .timing import check_target as check_target
 from .timing import time_method as time_method
 from .timing import write_timing as write_timing
+from .trivial import TRIVIAL as TRIVIAL
 from .trivial import ConstantMethod as ConstantMethod
+from .trivial import NearestMethod as NearestMethod

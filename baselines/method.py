@@ -108,6 +108,7 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     "crossed": lambda rig, **options: crossed_route.CrossedMethod(rig, **options),
     "crossed-net": lambda rig, **options: crossed_network.CrossedNetMethod(rig, **options),
     "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
+    "nearest": lambda rig, **options: baselines.NearestMethod(rig, **options),
 }
 """The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
 `NetworkMethod`."""

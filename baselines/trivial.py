@@ -1,5 +1,7 @@
-"""A predictor that looks at nothing: what a method's error is worth is how far it is from this one's."""
+"""Predictors that look at nothing, or only for the nearest training image: what a method's error is worth is how far it
+is from theirs."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,11 +10,16 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Rig
 
+TRIVIAL = "constant", "nearest"
+"""The methods of this module by name."""
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
 """Mean exact depth over the object pixels of the training split of that benchmark."""
+BLOCKS = 60
+"""Blocks along an image's shorter side, by whose means `NearestMethod` compares images."""
 
 
 class ConstantMethod(Method):
@@ -44,3 +51,61 @@ class ConstantMethod(Method):
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return np.full(self.shape, self.depth_mm, dtype=np.float32)
+
+
+class NearestMethod(Method):
+    """The decoded depth of the training sample whose single-shot frame is nearest to the image: least sum of squared
+    differences of block means, the first one of equals. ``training``: the dataset that holds the training split, opened
+    or its folder. Sums are of whole numbers, so the choice is the same on every machine.
+
+    Raises PredictionError for a dataset without a training split, or of another image size or sequence than ``rig``."""
+
+    name = "nearest"
+    title = "Nearest training image"
+    target = "depth"
+    packages = ("numpy",)
+
+    def __init__(self, rig: Rig, training: "DatasetFolder | str | Path | None" = None) -> None:
+        if training is None:
+            raise PredictionError(
+                "nearest needs the training split: give the dataset that holds it (--training FOLDER)"
+            )
+        self.training = training if isinstance(training, DatasetFolder) else DatasetFolder(Path(training))
+        size = rig.camera.height, rig.camera.width
+        if "train" not in self.training.splits:
+            raise PredictionError(
+                f"{self.training.path}: has no training split to choose from; give a dataset that has one "
+                "(--training FOLDER)"
+            )
+        if (self.training.size, self.training.sequence.to_dict()) != (size, rig.sequence.to_dict()):
+            (height, width), (other_height, other_width) = size, self.training.size
+            raise PredictionError(
+                f"{self.training.path}: expected training images of {height}x{width} px (H x W) of the same sequence "
+                f"as those to predict, this dataset has {other_height}x{other_width} px or another sequence"
+            )
+        self.frames_used = rig.sequence.config("single_shot")
+        self.samples = self.training.samples("train")
+        self.block_px = max(1, min(size) // BLOCKS)
+        sums = []
+        for sample in self.samples:
+            sums.append(self._block_sums(self.training.frame(sample, self.frames_used[0])))
+            self.training.release(sample)
+        self._sums = np.array(sums)
+        self.settings = {"training_fingerprint": self.training.fingerprint, "block_px": self.block_px}
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        frame = frames[self.frames_used[0]]
+        if frame is None:
+            raise PredictionError(f"nearest needs frame {self.frames_used[0]}, and it is missing")
+        distances = ((self._sums - self._block_sums(frame)) ** 2).sum(axis=(1, 2))
+        sample = self.samples[int(np.argmin(distances))]
+        depth_mm = self.training.depth_mm(sample).astype(np.float32)
+        self.training.release(sample)
+        return depth_mm
+
+    def _block_sums(self, frame: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Sums of grey levels over blocks, (H // block, W // block); what is left over at the ends is not looked at."""
+        side = self.block_px
+        height, width = (length // side for length in frame.shape)
+        blocks = frame[: height * side, : width * side].reshape(height, side, width, side)
+        return blocks.sum(axis=(1, 3), dtype=np.int64)

@@ -2,8 +2,8 @@
 
     python benchmarks/crossed_pairs.py [--pair P,Q,A,B ...] [--light NAME]
 
-P, Q: periods in projector px; A, B: angles in degrees. What `fpp-bench design` expects of a pair is for one pixel on its
-own; here neighbours help, and windows cover edges. Void pixels are left out.
+P, Q: periods in projector px; A, B: angles in degrees. What `fpp-bench design` expects of a pair is for one pixel on
+its own; here neighbours help, and windows cover edges. Void pixels are left out.
 """
 
 import argparse
@@ -18,7 +18,9 @@ from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics import crossed_rig, paper_rig
 
-PAIRS = ("18,18,0,90", "18,14,0,90", "18,18,144.6,54.6", "14,14,142.7,52.7", "16,18,25,105", "18,27,25,160", "10,12,30,75")
+PAIRS = (
+    "18,18,0,90", "18,14,0,90", "18,18,144.6,54.6", "14,14,142.7,52.7", "16,18,25,105", "18,27,25,160", "10,12,30,75",
+)  # fmt: skip
 WRONG_MM = 75.0  # an error that only another order explains
 
 

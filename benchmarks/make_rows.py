@@ -2,12 +2,17 @@
 
     fpp-bench build data/full --preset full
     python benchmarks/make_rows.py data/full --work rows-work
+    fpp-bench build data/unseen --preset unseen
+    python benchmarks/make_rows.py data/unseen --work rows-unseen --training data/full
     fpp-bench leaderboard --readme README.md
     fpp-bench leaderboard --page page
 
+A dataset without a training split is the set of unseen objects; its rows are called ``NAME-unseen.json``.
+
 Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
 machine. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
-decoded from the full sequence, and the phase routes against ``depth``, as the paper's networks are.
+decoded from the full sequence, the phase routes against ``depth``, as the paper's networks are, the trivial ones
+against both.
 """
 
 import argparse
@@ -39,10 +44,19 @@ METHODS: dict[str, tuple[object, ...]] = {
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
     },
     **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
-    **{f"constant-{depth}": ("constant", "--at", depth) for depth in ("standoff", "training-mean")},
+    **{
+        f"{name}{against}": words
+        for against in ("", "-exact")
+        for name, words in {
+            "constant-standoff": ("constant", "--at", "standoff"),
+            "constant-training-mean": ("constant", "--at", "training-mean"),
+            "nearest": ("nearest",),
+        }.items()
+    },
     "classical-03-both-fewest": ("classical", "--steps", 3, "--direction", "both", "--fewest"),
 }
-"""File name of a row: method and options."""
+"""File name of a row: method and options. The trivial methods are scored against both depths, so that every table is
+compared with them. The middle of the range is the standoff, so it is no row of its own."""
 
 
 def run(command: str, *words: object) -> None:
@@ -54,17 +68,18 @@ def run(command: str, *words: object) -> None:
         sys.exit(status)
 
 
-def make_row(dataset: Path, work: Path, out: Path, name: str, repeats: int) -> None:
+def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None) -> None:
     """Predictions, time, result, row and picture of a setting."""
     predictions, result = work / name, work / f"{name}.json"
     method, *options = METHODS[name]
+    options += ["--training", training] if training is not None and method == "nearest" else []
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
-    target = "depth_exact" if method == "classical" else "depth"
+    target = "depth_exact" if method == "classical" or name.endswith("-exact") else "depth"
     run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--json", result)
-    run("fpp-bench", "leaderboard", result, "--row", out / f"{name}.json", "--provenance", "measured here")
-    write_sheet(read_result(result), DatasetFolder(dataset), predictions, out / f"{name}.png")
+    run("fpp-bench", "leaderboard", result, "--row", row, "--provenance", "measured here")
+    write_sheet(read_result(result), DatasetFolder(dataset), predictions, row.with_suffix(".png"))
 
 
 def main() -> None:
@@ -75,14 +90,17 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
     parser.add_argument("--only", nargs="+", choices=METHODS, metavar="NAME", help="only these rows")
+    parser.add_argument("--training", type=Path, help="for nearest: the dataset with the training split")
     parser.add_argument("--repeats", type=int, default=40, help="timed runs of each method")
     args = parser.parse_args()
     if args.work.exists() and any(args.work.iterdir()):
         parser.error(f"{args.work} is not empty")
     args.work.mkdir(parents=True, exist_ok=True)
     args.out.mkdir(parents=True, exist_ok=True)
+    suffix = "" if "train" in DatasetFolder(args.dataset).splits else "-unseen"
     for name in args.only or METHODS:
-        make_row(args.dataset, args.work, args.out, name, args.repeats)
+        row = args.out / f"{name}{suffix}.json"
+        make_row(args.dataset, args.work, row, name, args.repeats, args.training)
 
 
 if __name__ == "__main__":

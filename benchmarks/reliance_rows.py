@@ -41,9 +41,10 @@ from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.report import millimetres
 from fpp_ml_bench.evaluation.result import RELIANCE_VERSION
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.leaderboard.columns import reliance_interval
 from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, reliance_interval
+from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 REFUSED = 2

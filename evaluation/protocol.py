@@ -11,7 +11,10 @@ RESULT_SCHEMA_VERSION: SchemaVersion = "2.3.0"
 protocol 2: void and unlit pixels, ``uncertainty`` and ``submission.learned_from``; every `SchemaVersion` is read."""
 
 Target = Literal["depth", "depth_exact"]
-Track = Literal["metric", "oracle mask", "oracle range", "oracle range + mask"]
+Track = Literal[
+    "metric", "oracle mask", "oracle order", "oracle range", "oracle mask + order", "oracle range + mask",
+    "oracle range + order", "oracle range + mask + order",
+]  # fmt: skip
 """What a method was given of the ground truth of the scored samples; see PROTOCOL.md."""
 Mode = Literal["standard", "paper", "paper-individual"]
 """By which rules; see PROTOCOL.md. ``paper-individual`` stands in results of protocol 1 only: ``paper`` for normalised

@@ -22,9 +22,11 @@ from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report import millimetres, percent
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.rows import chosen_tables, read_entry
+from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
@@ -106,13 +108,14 @@ def task_of(result: Result, name: str) -> Task:
             f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
             f"on {result.dataset.split} against {result.target} in {result.mode} mode; score the predictions so first"
         )
-    if result.submission.uses_ground_truth_mask:
-        raise PublishError(
-            f"{name}: the Hub's benchmark has no task for the {result.track} track (the method was given the object "
-            "mask of the test samples); publish a result of a method that finds the object itself"
-        )
     single = set(result.submission.frames_used) <= {SINGLE_SHOT_FRAME}
-    return next(task for task in TASKS if (task.single_shot, task.track) == (single, result.track))
+    task = next((task for task in TASKS if (task.single_shot, task.track) == (single, result.track)), None)
+    if task is None:
+        raise PublishError(
+            f"{name}: the Hub's benchmark has no task for the {result.track} track (the method was given "
+            f"{told(result.track)}); publish a result of a method that finds the object and the fringe order itself"
+        )
+    return task
 
 
 def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, str]:

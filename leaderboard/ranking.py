@@ -1,16 +1,21 @@
 """Result files into ranked groups. Results on different data or by different rules are never ranked together."""
 
+import math
 import operator
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS, SIGNED
-from fpp_ml_bench.evaluation.score import Interval, ranks_with_ties
+from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS
+from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked, short_names
+from fpp_ml_bench.leaderboard.groups import UNSEEN, Group, GroupKey, Ranked, joined
+from fpp_ml_bench.leaderboard.names import short_names
+from fpp_ml_bench.leaderboard.pairs import pairs, rank_ranges
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
+from fpp_ml_bench.leaderboard.trivial import with_ratios
 
 DEFAULT_SORT = "object_mae_mm"
 SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
@@ -48,58 +53,90 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in the order of `GroupKey.order`, their rows by ``sort``, the best value first, unknown values last. Equal
-    values are ordered by name, so the order of the files changes nothing. Raises SubmissionError where a group holds a
-    name twice."""
+    """Groups in the order of `GroupKey.order`, their rows by rank in ``sort``, then the best value first, unknown
+    values last. Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError
+    where a group holds a name twice."""
     if sort not in SORT_KEYS:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
         members.setdefault(GroupKey.of(entry.result), []).append(entry)
-    return [_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)]
-
-
-def rank_ranges(values: Sequence[float | None], intervals: Sequence[Interval | None]) -> list[tuple[int, int]]:
-    """Best and worst rank of each entry that the 95% intervals allow; smaller values are better.
-
-    Best: 1 and the number of entries whose whole interval is better. Worst: the number of all entries without those
-    whose whole interval is worse. An entry without interval counts as its bare value; entries without value (None)
-    share the last ranks.
-
-    >>> rank_ranges([1.0, 1.2, 3.0, None], [(0.8, 1.3), (1.1, 1.4), (2.5, 3.5), None])
-    [(1, 2), (1, 2), (3, 3), (4, 4)]
-    """
-    with_value = sum(value is not None for value in values)
-    best = ranks_with_ties(values, intervals)
-    # Worst ranks are best ranks counted from the other end.
-    from_end = ranks_with_ties(
-        [None if value is None else -value for value in values],
-        [None if interval is None else (-interval[1], -interval[0]) for interval in intervals],
-    )
-    return [
-        (with_value + 1, len(values)) if first is None or last is None else (first, with_value + 1 - last)
-        for first, last in zip(best, from_end, strict=True)
-    ]
+    return with_ratios([_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)])
 
 
 def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
-    named: dict[str, Entry] = {}
+    by_name: dict[str, list[Entry]] = {}
     for entry in entries:
-        if entry.name in named:
-            raise SubmissionError(
-                f"{printable(str(named[entry.name].path), 500)} and {printable(str(entry.path), 500)} both hold "
-                f"{printable(entry.name)!r} on the same data; leave one out, or give one another name"
-            )
-        named[entry.name] = entry
+        same_name = by_name.setdefault(entry.name, [])
+        for other in same_name:
+            _check_one_method(other, entry)
+        same_name.append(entry)
+    methods = [joined(parts) for parts in by_name.values()]
+    names = short_names([entry.result.submission for entry, _ in methods])
+    rows = [Ranked(entry, name, unseen) for (entry, unseen), name in zip(methods, names, strict=True)]
     # Smaller is better: a tolerance share with its sign turned, a bias without its sign.
     turned = operator.neg if sort in HIGHER_IS_BETTER else abs
-    values = [entry.value(sort) for entry in entries]
-    valued = [(None if v is None else turned(v), entry) for v, entry in zip(values, entries, strict=True)]
-    valued.sort(key=lambda pair: (pair[0] is None, pair[0] or 0.0, pair[1].name))
-    ordered = [entry for _, entry in valued]
-    without_interval = sort in HIGHER_IS_BETTER or sort in SIGNED
-    intervals = [None if without_interval else entry.interval(sort) for entry in ordered]
-    ranges = rank_ranges([value for value, _ in valued], intervals)
-    names = short_names([entry.result.submission for entry in ordered])
-    ranked = tuple(Ranked(*ends, entry, name) for ends, entry, name in zip(ranges, ordered, names, strict=True))
-    return Group(key, min(entry.result.dataset.name for entry in entries), ranked)
+
+    def by_rank(row: Ranked) -> tuple[object, ...]:
+        value = row.value(sort)
+        ranks = (row.best_rank, row.worst_rank) if row.best_rank is not None else (math.inf, 0)
+        return value is None, *ranks, 0.0 if value is None else turned(value), row.entry.name
+
+    rows.sort(key=by_rank)
+    name = min(entry.result.dataset.name for entry in entries)
+    ranked = [row for row in rows if _complete(key, row) and row.value(sort) is not None] if sort in METRICS else []
+    if why := _no_ranks(key, rows, ranked, sort):
+        return Group(key, name, tuple(rows), unranked=why)
+    tested = pairs({
+        row.short_name: {name: turned(value) for name, value in row.object_means(sort).items()} for row in ranked
+    })  # fmt: skip
+    ranges = rank_ranges([row.short_name for row in ranked], tested)
+    rows = [
+        replace(row, best_rank=ranges[row.short_name][0], worst_rank=ranges[row.short_name][1])
+        if row.short_name in ranges else row
+        for row in rows
+    ]  # fmt: skip
+    rows.sort(key=by_rank)
+    unranked = "" if len(ranked) == len(rows) else "Rows without a result on the unseen objects have no rank."
+    return Group(key, name, tuple(rows), tuple(tested), unranked)
+
+
+def _check_one_method(first: Entry, second: Entry) -> None:
+    """Refuse (SubmissionError) two results of one name that are not a method's results on the two test sets."""
+    files = [printable(str(entry.path), 500) for entry in (first, second)]
+    both = f"{files[0]} and {files[1]} both hold {printable(first.name)!r}"
+    if first.result.dataset.fingerprint == second.result.dataset.fingerprint:
+        raise SubmissionError(f"{both} on the same data; leave one out, or give one another name")
+    one, other = first.result.submission, second.result.submission
+    for what, a, b in (
+        ("method", one.method, other.method),
+        ("frames_used", sorted(one.frames_used), sorted(other.frames_used)),
+        ("settings.weights_sha256", one.settings.get("weights_sha256"), other.settings.get("weights_sha256")),
+    ):
+        if a != b:
+            raise SubmissionError(
+                f"{both}, on the test and on the unseen objects, but {what} is {printable(str(a))} and "
+                f"{printable(str(b))}; run both with the same method, or give one another name"
+            )
+
+
+def _complete(key: GroupKey, row: Ranked) -> bool:
+    return row.unseen is not None or not key.takes_unseen
+
+
+def _no_ranks(key: GroupKey, rows: Sequence[Ranked], ranked: Sequence[Ranked], sort: str) -> str:
+    """Why a table has no ranks; empty where it has."""
+    if sort not in METRICS:
+        return f"No ranks by {sort}: the order is that of the values."
+    objects = max(len(row.objects) for row in rows)
+    if not ranked and key.takes_unseen:
+        how = f"No ranks: they need the test objects and those of {UNSEEN}, and no row here has both."
+        reach = f" With {objects} objects alone the smallest p value of a test is {2.0 ** (1 - objects):g}, above 5%."
+        return how + (reach if objects < FEWEST_OBJECTS else "")
+    if objects < FEWEST_OBJECTS:
+        noun = "object" if objects == 1 else "objects"
+        return (
+            f"No ranks: with {objects} {noun} the smallest p value of a test is {2.0 ** (1 - objects):g}, above 5%. "
+            "Each row's interval is its own."
+        )
+    return "" if len(ranked) > 1 else "No ranks: there are not two rows to compare."

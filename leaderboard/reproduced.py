@@ -25,11 +25,12 @@ from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.report import percent
 from fpp_ml_bench.evaluation.result import Headline, Result, write_file
 from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, Entry, paper_tables, read_entry, write_row
-from fpp_ml_bench.leaderboard.tables import device, markdown_rows, markdown_text
+from fpp_ml_bench.leaderboard.columns import device
+from fpp_ml_bench.leaderboard.reported import paper_tables
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry, write_row
+from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
-MEASURED_HERE = "measured here"
 _NOT_IN_THE_PAPER = {"hformer": "Hformer"}
 _TRACKS_DIFFER = "*"
 

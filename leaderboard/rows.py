@@ -2,17 +2,13 @@
 
 A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which counts as
 self-reported, or a row file: a result and a ``provenance``, which the maintainers set. A PNG of the same name beside it
-is shown on the submission's page. The paper's own rows, as typed in from its tables, are in ``paper_rows.json``; this
-package did not measure them, and they are never ranked with measured rows.
+is shown on the submission's page.
 """
 
-import json
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
 
-from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, result_content, write_json
 from fpp_ml_bench.files import printable
@@ -23,20 +19,20 @@ ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
 
 Provenance = Literal["measured here", "verified", "self-reported"]
 PROVENANCES: tuple[str, ...] = get_args(Provenance)
+MEASURED_HERE: Provenance = "measured here"
 LOCAL = "local file"
 """Of a result on this machine that is in no leaderboard."""
 BY_THE_PAPER = "reported by the paper"
+BY_ITS_AUTHORS = "reported by its authors"
 
 MEANING = {
-    "measured here": "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
+    MEASURED_HERE: "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
     "verified": "The author sent the predictions, and fpp-eval verify gave the same scores. Run time is the author's.",
     "self-reported": "The author ran fpp-eval and sent the result. Its numbers are consistent; nobody checked them.",
     LOCAL: "A result on this machine that is in no leaderboard.",
     BY_THE_PAPER: "Typed in from the paper's tables, measured by its authors on other data with other code.",
+    BY_ITS_AUTHORS: "Typed in from another publication, measured by its authors on other data with other code.",
 }
-
-PAPER_HEADING = "Reported by the paper on other data (not measured here)"
-SHOWN_BY_DEFAULT = ("architecture", "normalization")
 
 LARGEST_PICTURE_BYTES = 2_000_000
 LARGEST_PICTURE_PX = 4096
@@ -77,7 +73,7 @@ class Entry:
         """Whether this package measured the time and the provenance allows that claim; else it is self-reported."""
         timing, submission = self.result.timing, self.result.submission
         source = timing.provenance if timing is not None else submission.seconds_source
-        return source == "measured" and self.provenance in ("measured here", LOCAL)
+        return source == "measured" and self.provenance in (MEASURED_HERE, LOCAL)
 
     def value(self, key: str) -> float | None:
         """Value of a sort key; None for an empty pixel set or an unknown time."""
@@ -131,42 +127,3 @@ def picture_of(entry: Entry) -> bytes | None:
     if data[:8] != _PNG or data[12:16] != b"IHDR" or not all(0 < side <= LARGEST_PICTURE_PX for side in sides):
         raise SubmissionError(f"{shown}: expected a PNG of at most {LARGEST_PICTURE_PX} px a side")
     return data
-
-
-@dataclass(frozen=True)
-class PaperRow:
-    """A row of a table: errors in mm by the keys of `HEADLINE`, on ``test_samples`` (view, frame) pairs."""
-
-    row: str
-    label: str
-    track: str
-    test_samples: int
-    errors_mm: dict[str, float]
-
-
-@dataclass(frozen=True)
-class PaperTable:
-    """A table of the paper, its rows in the paper's order."""
-
-    name: str
-    title: str
-    rows: tuple[PaperRow, ...]
-
-
-@cache
-def paper_tables() -> dict[str, PaperTable]:
-    """Every table of the paper by name, in the order of `TABLES`."""
-    content = json.loads(Path(__file__).with_name("paper_rows.json").read_text(encoding="utf-8"))
-    tables = {}
-    for table in content["tables"]:
-        for row in table["rows"]:
-            row["errors_mm"] = dict(zip(content["columns"], row["errors_mm"], strict=True))
-        rows = tuple(PaperRow(**row) for row in table["rows"])
-        tables[table["name"]] = PaperTable(table["name"], table["title"], rows)
-    return {name: tables[name] for name in TABLES}
-
-
-def chosen_tables(choice: str | None) -> list[PaperTable]:
-    """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
-    several = {None: SHOWN_BY_DEFAULT, "all": TABLES, "none": ()}
-    return [paper_tables()[name] for name in several.get(choice, (str(choice),))]

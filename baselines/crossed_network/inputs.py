@@ -71,8 +71,9 @@ class Scene:
         plane = np.arcsinh(background.residual / np.float32(background.noise_grey)) / 4 * np.float32(shown)
         return cls(
             crop=carriers.crop, light=(seen.grey - np.float32(background.ambient_grey)) / level,
-            plane_misfit=plane.astype(np.float32), shown=shown, inside=seen.inside, nearness=fit.nearness, bright=bright,
-            share=fit.weight, window_rad=wrapped(seen.phase_rad - carriers.phases(fit.nearness)).astype(np.float32),
+            plane_misfit=plane.astype(np.float32), shown=shown, inside=seen.inside, nearness=fit.nearness,
+            bright=bright, share=fit.weight,
+            window_rad=wrapped(seen.phase_rad - carriers.phases(fit.nearness)).astype(np.float32),
             modulation=np.clip(np.stack(modulation), 0, 4).astype(np.float32), step_rad=steps.astype(np.float32),
             misfit_rad=found.misfit_rad, exists=found.exists, contrast=seen.contrast,
         )  # fmt: skip

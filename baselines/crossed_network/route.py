@@ -9,9 +9,24 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
-from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedMeasurement, CrossedObservation, CrossedRoute, Settings
+from fpp_ml_bench.baselines.crossed_route import (
+    Carriers,
+    CrossedMeasurement,
+    CrossedObservation,
+    CrossedRoute,
+    Settings,
+)
 from fpp_ml_bench.baselines.phase_network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, Periods, least_energy, links_between, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route import (
+    LARGE,
+    Image,
+    Mask,
+    Periods,
+    least_energy,
+    links_between,
+    of_choice,
+    repeated,
+)
 from fpp_ml_bench.optics import Rig
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders

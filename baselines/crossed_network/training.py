@@ -36,7 +36,7 @@ VALIDATED_SHARE = 3  # every so many-th validation view is scored during trainin
 @dataclass(frozen=True)
 class CrossedRecipe(WindowRecipe):
     """``lights`` that are drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see
-    `views` and `samples`); ``weight_scale``: of the loss of the stated uncertainty; ``vary``: how windows are varied."""
+    `views` and `samples`); ``weight_scale``: of the loss of the stated uncertainty; ``vary``: how windows vary."""
 
     name: str = "crossed-net"
     steps: int = 6000
@@ -144,8 +144,8 @@ def with_lead(answers: Answers, lead: float) -> Answers:
 def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float]:
     """Scores of a view, each pixel's likeliest order taken. ``object_mae_mm`` counts a missed pixel with its whole
     depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``: shares of the
-    object; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``: errors of the joint phase
-    within the stated standard uncertainty, 68 of a normal distribution."""
+    object; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``: errors of the joint
+    phase within the stated standard uncertainty, 68 of a normal distribution."""
     scene, target = sample.scene.single(), sample.target
     part = carriers.at(scene.crop)
     joint = part.joint_gain
@@ -182,11 +182,11 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
 
 def chosen_lead(answers: list[Answers], samples: list[Sample], carriers: Carriers) -> float:
     """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
-    wrong = [
-        np.mean([score(with_lead(one, lead), s, carriers)["wrong_percent"] for one, s in zip(answers, samples, strict=True)])
+    of_leads = [
+        _mean([score(with_lead(one, lead), s, carriers) for one, s in zip(answers, samples, strict=True)])
         for lead in LEADS
-    ]  # fmt: skip
-    return LEADS[int(np.argmin(wrong))]
+    ]
+    return LEADS[int(np.argmin([means["wrong_percent"] for means in of_leads]))]
 
 
 def _mean(rows: list[dict[str, float]]) -> dict[str, float]:

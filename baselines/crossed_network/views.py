@@ -152,7 +152,8 @@ def read(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
                 with np.load(file, allow_pickle=False) as arrays:
                     maps = arrays["grey"], arrays["depth_mm"], arrays["void"]
             except (OSError, ValueError, KeyError, EOFError) as error:
-                raise TrainingError(f"{file}: can't be read ({error}); delete it and run the same command again") from None
+                words = f"can't be read ({error}); delete it and run the same command again"
+                raise TrainingError(f"{file}: {words}") from None
             yield View(f"{name}_{view}", name, group.name, *maps)
 
 

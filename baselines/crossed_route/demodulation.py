@@ -77,7 +77,7 @@ class Demodulator:
         """Wrapped phases float32 (2, h, w) of all pixels of ``carriers``, from those on the grid: the carrier itself
         is taken out before interpolating, and what is left changes slowly."""
         rows, columns = carriers.crop
-        y, x = np.arange(rows.start, rows.stop, dtype=np.float32), np.arange(columns.start, columns.stop, dtype=np.float32)
+        y, x = (np.arange(part.start, part.stop, dtype=np.float32) for part in (rows, columns))
         grid_y, grid_x = (self.stride * np.arange(n) for n in seen.mean_grey.shape)
         places = np.meshgrid(x / self.stride, y / self.stride)
         phases = []

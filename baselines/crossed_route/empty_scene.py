@@ -1,7 +1,7 @@
-"""The background plane in a crossed frame: where both phases are the plane's, and what grey levels it gives everywhere.
+"""The background plane in a crossed frame: where both phases are the plane's, and what grey levels it gives.
 
-The plane's phases are calibrated, its lamp is not: its light, the contrast of the fringes and the curve of projector and
-camera are fitted to the pixels that show the plane. So no absolute grey level is needed.
+The plane's phases are calibrated, its lamp is not: its light, the contrast of the fringes and the curve of projector
+and camera are fitted to the pixels that show the plane. So no absolute grey level is needed.
 """
 
 import cv2

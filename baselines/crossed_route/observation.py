@@ -15,8 +15,8 @@ from fpp_ml_bench.errors import PredictionError
 
 @dataclass(frozen=True)
 class Settings:
-    """``min_confidence``: pixels below it are 0 (0: dense); ``slack_mm`` widens the working range for noise at its ends.
-    Raises `PredictionError`."""
+    """``min_confidence``: pixels below it are 0 (0: dense); ``slack_mm`` widens the working range for noise at its
+    ends. Raises `PredictionError`."""
 
     min_confidence: float = 0.0
     slack_mm: float = 15.0

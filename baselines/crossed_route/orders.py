@@ -1,8 +1,8 @@
 """The nearness at every grid point: the turn at which both phases agree, by least energy over pairs of neighbours.
 
-The carrier with the larger gain proposes: each of its orders in the working range is a candidate, whose nearness is the
-best for both phases. Its cost is the distance, in rad, at which both phases miss it. A single point is wrong where noise
-or a depth edge reaches the nearest rival; the energy lets neighbours decide (`phase_route.least_energy`).
+The carrier with the larger gain proposes: each of its orders in the working range is a candidate, whose nearness is
+the best for both phases. Its cost is the distance, in rad, at which both phases miss it. A single point is wrong where
+noise or a depth edge reaches the nearest rival; the energy lets neighbours decide (`phase_route.least_energy`).
 """
 
 from dataclasses import dataclass
@@ -81,9 +81,11 @@ def neighbours(found: Candidates, index: NDArray[np.int32]) -> Candidates:
     count = len(found.nearness)
     places = [np.clip(index + step, 0, count - 1) for step in (-1, 0, 1)]
     inside = [(index > 0), np.ones(index.shape, bool), (index < count - 1)]
-    return Candidates(*(
+    nearness, misfit_rad = (
         np.stack([of_choice(maps, place) for place in places]) for maps in (found.nearness, found.misfit_rad)
-    ), np.stack([of_choice(found.exists, place) & is_one for place, is_one in zip(places, inside, strict=True)]))  # fmt: skip
+    )
+    pairs = zip(places, inside, strict=True)
+    return Candidates(nearness, misfit_rad, np.stack([of_choice(found.exists, place) & one for place, one in pairs]))
 
 
 def _without(cost: Image, index: NDArray[np.int32]) -> Image:

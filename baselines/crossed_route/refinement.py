@@ -1,7 +1,7 @@
 """The depth of every pixel: one unknown, the nearness, fitted to the frame itself under a Gaussian window.
 
-The frame is ``I - ambient = g (1 + c_1 cos phase_1(q) + c_2 cos phase_2(q))``. Starting from the nearness of the grid, g
-(a quadratic) and one change of q are solved for around each pixel. Depth jumps inside a window are in the start
+The frame is ``I - ambient = g (1 + c_1 cos phase_1(q) + c_2 cos phase_2(q))``. Starting from the nearness of the grid,
+g (a quadratic) and one change of q are solved for around each pixel. Depth jumps inside a window are in the start
 already. A second round, or less weight for pixels that the first does not explain, makes it worse.
 """
 
@@ -48,8 +48,8 @@ def fringes(carriers: Carriers, nearness: NDArray, contrast: tuple[float, float]
 def refined(
     carriers: Carriers, light: Image, inside: Mask, nearness: NDArray, contrast: tuple[float, float], noise_grey: float
 ) -> Fit:
-    """The fit to ``light`` (h, w), grey levels less ambient light, on the pixels ``inside``, from a first ``nearness``.
-    """
+    """The fit to ``light`` (h, w), grey levels less ambient light, on the pixels ``inside``, from a first
+    ``nearness``."""
     window = Window(WINDOW_PERIODS * carriers.period_px)
     m, terms = window.moment, CURVED
     raised, slope = fringes(carriers, nearness, contrast)

@@ -269,4 +269,3 @@ def _lost(seen: CrossedObservation) -> Mask:
     pairs = zip(seen.modulation, seen.carriers.weights, strict=True)
     shares = [modulation / (weight * bright) for modulation, weight in pairs]
     return np.minimum(*shares) < LOST_SHARE * max(seen.contrast) / max(seen.carriers.weights)  # type: ignore[no-any-return]
-

@@ -46,8 +46,8 @@ def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
 
 
 def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, shipped: Path = SHIPPED) -> NetFile:
-    """Configuration and network of weights in the folder ``shipped`` or of a file, float32; ``folded``: for inference alone
-    (`PhaseNet.folded`), False to train on. `WeightsError` for a file that is absent, damaged, of another kind or
+    """Configuration and network of weights in the folder ``shipped`` or of a file, float32; ``folded``: for inference
+    alone (`PhaseNet.folded`), False to train on. `WeightsError` for a file that is absent, damaged, of another kind or
     version, or whose tensors do not fit its configuration."""
     path = weights_path(name_or_path, shipped)
     shown = printable(str(path), 500)

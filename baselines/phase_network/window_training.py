@@ -30,8 +30,8 @@ LARGEST_GRADIENT = 50.0
 @dataclass(frozen=True)
 class WindowRecipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
-    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses; ``averaged``: decay of the weights' moving
-    average, which is what the weights file holds. Raises `RecipeError` for values that train nothing."""
+    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses; ``averaged``: decay of the moving average
+    of the weights, which is what the weights file holds. Raises `RecipeError` for values that train nothing."""
 
     name: str = "phase-net"
     steps: int = 5000

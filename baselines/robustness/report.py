@@ -146,7 +146,8 @@ def write_worst(setup: Setup, rows: dict[str, list[View]], out: Path, cache: Pat
     images, clean = FrameCache(cache), setup.conditions(CLEAN)[0]
     for column, row in zip(plots.T, worst, strict=True):
         name, view = row["object"], row["sample"].removeprefix(f"{row['object']}_")
-        condition = Condition(row["axis"], row["severity"], setup.conditions(row["axis"])[0].objects, setup.size, setup.rig)
+        objects = setup.conditions(row["axis"])[0].objects
+        condition = Condition(row["axis"], row["severity"], objects, setup.size, setup.rig)
         frames, truth = images.frames(condition, name, view, setup.method.frames_used), images.truth(clean, name, view)
         depth_mm = setup.method.predict(frames)
         fringe = next(frame for frame in frames if frame is not None)

@@ -68,8 +68,8 @@ def lost(weight: float) -> Outcome:
 
 @CROSSED.family("a rival on the truth", "mm", expects="either", ratio=(0.5, 1 / 3, 0.25, 0.2))
 def rival(ratio: float) -> Outcome:
-    """depth of a plane by periods of 12 px whose gains have this ratio, over four and more periods: with 1 / 2 and 1 / 3
-    another order fits exactly"""
+    """depth of a plane by periods of 12 px whose gains have this ratio, over four and more periods: with 1 / 2 and
+    1 / 3 another order fits exactly"""
     turn_deg = math.degrees(math.atan(ratio))
     along_deg = 128.66  # of the paper's epipolar lines
     return seen(Crossed((12.0, 12.0), (along_deg + turn_deg, along_deg - 90 + turn_deg)))

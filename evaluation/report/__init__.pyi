@@ -9,6 +9,7 @@ from .html import page as page
 from .html import percent as percent
 from .html import render as render
 from .html import seconds as seconds
+from .html import signed as signed
 from .report_page import html_table as html_table
 from .report_page import sample_table as sample_table
 from .report_page import score_table as score_table

@@ -1,4 +1,4 @@
-"""Two results of the same samples, sample by sample: the paired difference, its interval, and a sentence about it.
+"""Two results of the same samples, sample by sample: the paired difference, its interval, a test, and a sentence.
 Samples that are hard for both methods cancel in the difference. A comparison can therefore tell two methods apart whose
 own intervals overlap."""
 
@@ -12,9 +12,9 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.evaluation.result import Interval, Result, ends
-from fpp_ml_bench.evaluation.score import caution, object_interval
+from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS, SIGNIFICANT, caution, object_interval, sign_flip_p
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.schema import Count, StrictModel, Text
+from fpp_ml_bench.schema import Count, Share, StrictModel, Text
 
 MAIN_KEY = "object_mae_mm"
 
@@ -28,12 +28,14 @@ class PairedSample(StrictModel):
 
 
 class Difference(StrictModel):
-    """Mean of second minus first in mm over the ``samples`` that both have, its 95% interval over ``objects``.
+    """Mean of second minus first in mm over the ``samples`` that both have, its 95% interval over ``objects``, and the
+    p value of a sign-flip test of the objects' mean differences (null without any).
 
     ``lower`` and ``higher`` count the samples in which the second's error is smaller and larger."""
 
     mean_mm: float | None
     interval_mm: Interval
+    sign_flip_p: Share | None
     samples: Count
     objects: Count
     lower: Count
@@ -113,11 +115,16 @@ def _summary(paired: list[PairedSample], key: str) -> Difference:
     values = [row.differences[key] for row in paired]
     differences = [value for value in values if value is not None]
     interval = object_interval(values, [row.object for row in paired])
+    by_object: dict[str, list[float]] = {}
+    for row, value in zip(paired, values, strict=True):
+        if value is not None:
+            by_object.setdefault(row.object, []).append(value)
     return Difference(
         mean_mm=statistics.fmean(differences) if differences else None,
         interval_mm=[None, None] if interval is None else list(interval),
+        sign_flip_p=sign_flip_p([statistics.fmean(views) for views in by_object.values()]) if by_object else None,
         samples=len(differences),
-        objects=len({row.object for row, value in zip(paired, values, strict=True) if value is not None}),
+        objects=len(by_object),
         lower=sum(value < 0 for value in differences),
         higher=sum(value > 0 for value in differences),
     )
@@ -135,12 +142,17 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     if difference.interval is None:
         no_interval = "with one object there is no interval, so nothing can be said beyond it"
         return f"{second} has an object MAE {size} {word} than {first} on average, {views}; {no_interval}."
-    between = f"{interval_text(difference.interval)} mm over {difference.objects} objects"
+    p = 1.0 if difference.sign_flip_p is None else difference.sign_flip_p
+    between = f"{interval_text(difference.interval)} mm over {difference.objects} objects; sign-flip test p = {p:.3g}"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
+    if difference.told_apart and p > SIGNIFICANT:
+        level = f"{100 * SIGNIFICANT:.0f}%"
+        reach = f": {difference.objects} objects never reach {level}" if difference.objects < FEWEST_OBJECTS else ""
+        few_objects = f" The test does not confirm it at {level}{reach}.{few_objects}"
     if difference.told_apart:
         by = f"by {size} on average (95% interval {between})"
         return f"{second} has a {word} object MAE than {first}, {by}, {views}.{few_objects}"
     return (
         f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
-        f"but the 95% interval, {between}, holds 0.{few_objects}"
+        f"but the 95% interval holds 0 ({between}).{few_objects}"
     )

@@ -11,7 +11,7 @@ from fpp_ml_bench.evaluation import report
 from fpp_ml_bench.evaluation.protocol import COVERED, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, percent, seconds, signed
 from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.score import caution
+from fpp_ml_bench.evaluation.score import SIGNIFICANT, caution
 from fpp_ml_bench.files import printable
 
 WORST = 5
@@ -96,6 +96,8 @@ def _notes(result: Result) -> Text:
         lines.append("Oracle range: the method was given depth_min and depth_max of the scored samples.")
     if submission.uses_ground_truth_mask:
         lines.append("Oracle mask: the method was given which pixels of the scored samples are object.")
+    if submission.uses_ground_truth_order:
+        lines.append("Oracle order: the method was given the true fringe orders of the scored samples.")
     if few_objects := caution(len(result.per_object)):
         lines.append(few_objects)
     known = submission.seconds_per_sample is not None
@@ -137,14 +139,16 @@ def _worst(result: Result) -> Table | None:
 
 def comparison_table(compared: report.Comparison) -> Group:
     """The comparison as rich tables."""
-    titles = ["Second - first", "95% interval", "Second lower in", "Second higher in", "Samples", "Objects"]
-    table = _table("Error", titles, caption="mm; mean of second - first over samples, 95% interval over objects")
+    titles = ["Second - first", "95% interval", "p", "Second lower in", "Second higher in", "Samples", "Objects"]
+    about = "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test over objects"
+    table = _table("Error", titles, caption=about)
     for key, row in compared.differences.items():
         pixels, error = key.removesuffix("_mm").split("_")
         counts = (row.lower, row.higher, row.samples, row.objects)
+        p = "-" if row.sign_flip_p is None else f"{row.sign_flip_p:.3g}"
         table.add_row(
-            f"{pixels} {error.upper()}", signed(row.mean_mm), interval_text(row.interval, ".."), *map(str, counts),
-            style="bold" if row.told_apart else None,
+            f"{pixels} {error.upper()}", signed(row.mean_mm), interval_text(row.interval, ".."), p, *map(str, counts),
+            style="bold" if row.told_apart and (row.sign_flip_p or 1.0) <= SIGNIFICANT else None,
         )  # fmt: skip
     title = Text(
         f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"

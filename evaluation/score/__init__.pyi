@@ -22,9 +22,12 @@ from .sigma_scores import gaussian_quantile as gaussian_quantile
 from .sigma_scores import score_sigma as score_sigma
 from .sigma_scores import states_sigma as states_sigma
 from .torch_metric import DepthScores as DepthScores
+from .uncertainty import FEWEST_OBJECTS as FEWEST_OBJECTS
+from .uncertainty import SIGNIFICANT as SIGNIFICANT
 from .uncertainty import Interval as Interval
 from .uncertainty import caution as caution
+from .uncertainty import holm as holm
 from .uncertainty import intervals_over_objects as intervals_over_objects
 from .uncertainty import object_interval as object_interval
-from .uncertainty import ranks_with_ties as ranks_with_ties
+from .uncertainty import sign_flip_p as sign_flip_p
 from .units import scored_pair as scored_pair

@@ -1,7 +1,7 @@
 """``submission.yaml``: the description of a submission, read into a strict model and written from it."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import yaml
 from pydantic import Field, model_validator
@@ -35,11 +35,12 @@ class Submission(SparseModel):
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
     on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
-    black outside the object); false is never written, so that files without this key stay as they are.
-    ``learned_from`` is absent where it is unknown.
+    black outside the object), ``uses_ground_truth_order`` when it was given their true fringe orders; false is never
+    written of these two, so that files without the keys stay as they are. ``learned_from`` is absent where it is
+    unknown.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
-    SPARSE = ("uses_ground_truth_mask", "learned_from")
+    SPARSE = ("uses_ground_truth_mask", "uses_ground_truth_order", "learned_from")
 
     name: Text
     method: Text
@@ -48,6 +49,7 @@ class Submission(SparseModel):
     frames_used: list[Count]
     uses_ground_truth_range: bool
     uses_ground_truth_mask: bool = False
+    uses_ground_truth_order: bool = False
     learned_from: LearnedFrom | None = None
     seconds_per_sample: Positive | None
     seconds_source: Literal["measured", "self-reported"] | None = None
@@ -75,10 +77,9 @@ class Submission(SparseModel):
 
     @property
     def track(self) -> Track:
-        """``metric``, or what of the test samples' ground truth the method was given: range, object mask or both."""
-        if self.uses_ground_truth_range:
-            return "oracle range + mask" if self.uses_ground_truth_mask else "oracle range"
-        return "oracle mask" if self.uses_ground_truth_mask else "metric"
+        """``metric``, or what of the scored samples' ground truth the method was given: range, mask, fringe order."""
+        given = [name for name in ("range", "mask", "order") if getattr(self, f"uses_ground_truth_{name}")]
+        return cast(Track, f"oracle {' + '.join(given)}" if given else "metric")
 
     def to_yaml(self) -> str:
         """The file's text: the keys that were given, in the model's order."""

@@ -16,13 +16,15 @@ SUMMARY = "Rank result files: error and run time side by side, as a table, a sta
 EXAMPLES = (
     "fpp-bench leaderboard result.json second.json",
     "fpp-bench leaderboard results/ --sort object_rmse_mm --markdown table.md",
+    "fpp-bench leaderboard --pairs --paper none",
+    "fpp-bench leaderboard --csv leaderboard.csv",
     "fpp-bench leaderboard --paper loss",
     "fpp-bench leaderboard --page page",
     "fpp-bench leaderboard --readme README.md --check",
     "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json --provenance verified",
 )
 _PROVENANCES = ("measured here", "verified", "self-reported")
-_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "all", "none")
+_TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,9 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     one_file: dict[str, Any] = {"type": Path, "metavar": "FILE"}
     add("--markdown", **one_file, help="also write the tables as Markdown")
-    add("--json", **one_file, help="also write the ranking as JSON")
+    add("--json", **one_file, help="also write the ranking as JSON, with the tests of all pairs")
+    add("--csv", **one_file, help="also write a line for each row, with all digits")
+    add("--pairs", action="store_true",
+        help="also print every pair of ranked rows: difference, interval, p value, who is behind")  # fmt: skip
     add("--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
-        help=f"tables of the paper: {', '.join(_TABLES)} (default: architecture, normalization; without TABLE: all)",
+        help=f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, normalization, "
+             "oracle_order; without TABLE: all)",
     )  # fmt: skip
     add("--page", type=Path, metavar="DIR",
         help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
@@ -88,11 +94,14 @@ def run(args: argparse.Namespace) -> int:
     for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
         if path is not None:
             result.write_file(text(groups, papers, args.sort).encode("utf-8"), path)
+    if args.csv is not None:
+        result.write_file(leaderboard.table_csv(groups).encode("utf-8"), args.csv)
     if args.page is not None:
         shipped = None if args.results else tradeoff.shipped_tradeoff()
         settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)
         written = page.write_page(leaderboard.rank(entries), papers, args.page, settings)
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
-    show(*leaderboard.group_tables(groups, args.sort, output_width()), *leaderboard.paper_rich_tables(papers))
+    tables = leaderboard.group_tables(groups, args.sort, output_width(), args.pairs)
+    show(*tables, *leaderboard.paper_rich_tables(papers))
     return 0

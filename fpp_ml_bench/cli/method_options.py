@@ -13,8 +13,9 @@ from fpp_ml_bench.loaders import render, storage
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
     "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, nothing "
-    "learned), crossed-net (the same, with order, mask and correction learned), constant (looks at nothing), the name "
-    "of weights that come with the package, a .safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
+    "learned), crossed-net (the same, with order, mask and correction learned), constant (looks at nothing), nearest "
+    "(depth of the training sample with the nearest image), the name of weights that come with the package, a "
+    ".safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
@@ -33,6 +34,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     "crossed": ("min_confidence", "mask"),
     "crossed-net": ("min_confidence", "weights"),
     "constant": ("at",),
+    "nearest": ("training",),
     "trained networks": ("depth_range", "frame", "device"),
 }
 """Options that belong to one kind of method only, by their name in the parsed arguments."""
@@ -71,15 +73,15 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
              "image's darkest)")  # fmt: skip
     add("--mask", metavar="FILE",
-        help="object mask of phase or crossed: an image of the frames' size, above 0 on the object in every sample (default: "
-             "found in each image)")  # fmt: skip
-    add(
-        "--weights",
-        metavar="FILE",
-        help="weights of phase-net or crossed-net: a file, such as training writes (default: those that come with the package)",
-    )
+        help="object mask of phase or crossed: an image of the frames' size, above 0 on the object in every sample "
+             "(default: found in each image)")  # fmt: skip
+    add("--weights", metavar="FILE",
+        help="weights of phase-net or crossed-net: a file, such as training writes (default: those that come with the "
+             "package)")  # fmt: skip
     add = parser.add_argument_group("constant").add_argument
     add("--at", metavar="DEPTH", help="standoff, middle (of the range), training-mean, or mm (default: standoff)")
+    add = parser.add_argument_group("nearest").add_argument
+    add("--training", type=Path, metavar="FOLDER", help="dataset with the training split (default: DATASET itself)")
     add = parser.add_argument_group("trained networks").add_argument
     add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
@@ -224,7 +226,12 @@ def _constant(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     return _given(at=args.at)
 
 
+def _nearest(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    own = opened if isinstance(opened, storage.DatasetFolder) else None
+    return {"training": args.training or own}
+
+
 _MAKERS = {
     "classical": _classical, "phase": _phase, "phase-net": _phase_net, "crossed": _crossed, "crossed-net": _crossed_net,
-    "constant": _constant,
+    "constant": _constant, "nearest": _nearest,
 }  # fmt: skip

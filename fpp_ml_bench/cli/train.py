@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, metavar="M",
         help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
     add("--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added")
-    add("--steps", type=int, metavar="N", help="phase-net and crossed-net: training steps (default: as the shipped weights)")
+    add("--steps", type=int, metavar="N",
+        help="phase-net and crossed-net: training steps (default: as the shipped weights)")  # fmt: skip
     add("--unions", type=int, metavar="N",
         help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
     )  # fmt: skip

@@ -3,6 +3,7 @@
 (() => {
   const all = (selector, within = document) => [...within.querySelectorAll(selector)];
   const form = document.getElementById("filters");
+  const selects = form ? all("select", form) : [];
   const tables = all("table.ranking");
   const state = new URLSearchParams();
 
@@ -45,28 +46,31 @@
     remember();
   }));
 
+  // Filters: the search field, a select for each name in a row's data, and boxes for the provenance.
   function filter() {
     const search = document.getElementById("q").value.trim().toLowerCase();
-    const maxFrames = Number(document.getElementById("frames").value) || Infinity;
+    const chosen = selects.filter((select) => select.value);
     const boxes = all("input[name=provenance]", form);
     const allowed = new Set(boxes.filter((box) => box.checked).map((box) => box.value));
     const shown = new Set();
-    tables.forEach((table, number) => {
+    let count = 0;
+    tables.forEach((table) => {
       const rows = all("tbody tr", table);
       rows.forEach((row) => {
         const data = row.dataset;
-        const visible = data.search.includes(search) && Number(data.frames) <= maxFrames && allowed.has(data.provenance);
-        row.hidden = !visible;
-        if (visible) shown.add(row.id);
+        row.hidden = !(data.search.includes(search) && allowed.has(data.provenance)
+          && chosen.every((select) => data[select.name] === select.value));
+        if (!row.hidden) shown.add(row.id);
       });
-      const count = rows.filter((row) => !row.hidden).length;
-      const message = count === rows.length ? "" : count + " of " + rows.length + " rows shown";
-      document.getElementById("c" + number).textContent = message;
+      count += rows.length;
+      table.closest(".board").hidden = rows.every((row) => row.hidden);
     });
     all("[data-row]").forEach((part) => { part.style.display = shown.has(part.dataset.row) ? "" : "none"; });
     all("[data-of]").forEach((row) => { row.hidden = !shown.has(row.dataset.of); });
-    const entries = { q: search, frames: maxFrames === Infinity ? "" : String(maxFrames) };
-    entries.hide = boxes.filter((box) => !box.checked).map((box) => box.value).join(",");
+    const message = shown.size === count ? "" : shown.size + " of " + count + " rows shown";
+    document.getElementById("shown").textContent = message;
+    const entries = { q: search, hide: boxes.filter((box) => !box.checked).map((box) => box.value).join(",") };
+    for (const select of selects) entries[select.name] = select.value;
     for (const [key, value] of Object.entries(entries)) value ? state.set(key, value) : state.delete(key);
   }
 
@@ -80,9 +84,10 @@
     });
     if (!form) return;
     document.getElementById("q").value = (state.get("q") || "").slice(0, 100);
-    const select = document.getElementById("frames");
-    select.value = state.get("frames") || "";
-    if (select.selectedIndex < 0) select.value = "";
+    for (const select of selects) {
+      select.value = state.get(select.name) || "";
+      if (select.selectedIndex < 0) select.value = "";
+    }
     const hidden = (state.get("hide") || "").split(",");
     all("input[name=provenance]", form).forEach((box) => { box.checked = !hidden.includes(box.value); });
     filter();

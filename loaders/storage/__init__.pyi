@@ -6,6 +6,7 @@ from .benchmark import EARLIER as EARLIER
 from .benchmark import Benchmark as Benchmark
 from .benchmark import benchmark_of as benchmark_of
 from .benchmark import benchmark_sentence as benchmark_sentence
+from .benchmark import current_benchmark as current_benchmark
 from .benchmark import intended_benchmark as intended_benchmark
 from .card import RIG_FILE as RIG_FILE
 from .card import ground_truth_summary as ground_truth_summary

@@ -74,6 +74,11 @@ def benchmark_of(fingerprint: str) -> Benchmark | None:
     return next((benchmark for benchmark in (*BENCHMARKS, *EARLIER) if benchmark.fingerprint == fingerprint), None)
 
 
+def current_benchmark(name: str) -> Benchmark | None:
+    """The version of the benchmark ``name`` that this package builds; None for no such name."""
+    return next((benchmark for benchmark in BENCHMARKS if benchmark.name == name), None)
+
+
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     """The benchmark whose settings a dataset was built with, whatever its bytes are; None for settings of its own."""
     if manifest.origin != GENERATED:

@@ -1,4 +1,4 @@
-"""crossed-net: views in drawn lights, samples with truth, windows in all orientations, a training in small, its method."""
+"""crossed-net: views in drawn lights, samples with truth, windows in all orientations, a small training, its method."""
 
 from dataclasses import replace
 from functools import cache
@@ -55,7 +55,8 @@ def test_drawn_lights_differ_and_repeat() -> None:
 
 def test_groups_keep_the_splits_apart() -> None:
     groups = views.groups_of(lights=3, views_a_light=4, seed=0)
-    shown = {split: {name for g in groups if g.split == split for name, _ in g.views} for split in ("train", "validation")}
+    splits = "train", "validation"
+    shown = {split: {name for g in groups if g.split == split for name, _ in g.views} for split in splits}
     assert len(shown["train"]) == 40 and len(shown["validation"]) == 5
     assert not shown["train"] & shown["validation"]
     assert all(len({name for name, _ in g.views}) == 4 for g in groups if g.name.startswith("drawn"))

@@ -193,7 +193,7 @@ def test_the_stated_uncertainty_is_about_right() -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(DecodeError, match="float64"):
         route().measure(np.zeros((RIG.camera.height, RIG.camera.width)))
-    with pytest.raises(DecodeError, match="rig.scaled"):
+    with pytest.raises(DecodeError, match=r"rig\.scaled"):
         route().measure(np.zeros((10, 10), np.uint8))
     with pytest.raises(PredictionError, match="min_confidence"):
         load_method("crossed", RIG, min_confidence=2)

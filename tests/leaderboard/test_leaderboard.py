@@ -12,8 +12,8 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
-from fpp_ml_bench.leaderboard.groups import cut_at_word
-from fpp_ml_bench.leaderboard.rows import SHOWN_BY_DEFAULT, paper_tables
+from fpp_ml_bench.leaderboard.names import cut_at_word
+from fpp_ml_bench.leaderboard.reported import SHOWN_BY_DEFAULT, paper_tables
 from fpp_ml_bench.leaderboard.tables import markdown_text
 
 
@@ -56,12 +56,12 @@ def ranked(tmp_path, *arguments: object) -> list[dict]:
 
 
 def test_ranks_by_object_error_with_time_beside_it(make, capsys, tmp_path):
-    worse = make("a.json", 4.0, name="Worse", seconds_per_sample=0.001)
+    worse = make("a.json", 4.0, name="Worse", seconds_per_sample=0.001, frames_used=[0, 1])
     better = make("b.json", 1.0, name="Better", frames_used=[0, 1, 2], seconds_source="self-reported")
     out = board(capsys, worse, better)
     lines = [line for line in out.splitlines() if "Worse" in line or "Better" in line]
-    assert re.search(r"1 .*Better.* 1\.000 .* 0\.25\* .* 3 ", lines[0])
-    assert re.search(r"2 .*Worse.* 4\.000 .* 0\.001 .* 1 ", lines[1])
+    assert re.search(r"Better.* 1\.000 .* 0\.25\* .* 3 ", lines[0])
+    assert re.search(r"Worse.* 4\.000 .* 0\.001 .* 2 ", lines[1])
     assert [row["name"] for row in ranked(tmp_path, worse, better)[0]["rows"]] == ["Better", "Worse"]
     by_time = ranked(tmp_path, worse, better, "--sort", "seconds_per_sample")[0]["rows"]
     assert [row["name"] for row in by_time] == ["Worse", "Better"]
@@ -69,12 +69,11 @@ def test_ranks_by_object_error_with_time_beside_it(make, capsys, tmp_path):
     assert [row["name"] for row in by_frames] == ["Worse", "Better"]
 
 
-def test_order_of_files_changes_nothing_and_ties_share_ranks(make, tmp_path):
+def test_order_of_files_changes_nothing(make, tmp_path):
     files = [make(f"{n}.json", offset, name=n) for n, offset in (("d", 2.0), ("a", 2.0), ("c", 1.0), ("b", 3.0))]
     first, second = ranked(tmp_path, *files), ranked(tmp_path, *reversed(files))
     assert first == second
-    ranks = [(row["best_rank"], row["worst_rank"], row["name"]) for row in first[0]["rows"]]
-    assert ranks == [(1, 1, "c"), (2, 3, "a"), (2, 3, "d"), (4, 4, "b")]
+    assert [row["name"] for row in first[0]["rows"]] == ["c", "a", "d", "b"]
 
 
 def test_unknown_time_comes_last(make, tmp_path):
@@ -116,7 +115,7 @@ def test_results_of_the_current_folder_are_read(make, capsys):
 def test_new_user_is_told_what_to_do(capsys):
     out = board(capsys)
     assert "No results here yet" in out and "fpp-eval predictions --dataset" in out
-    assert "Reported by the paper on other data (not measured here)" in out and "TransUNet" in out
+    assert "Reported by others on other data (not measured here)" in out and "TransUNet" in out
     assert "oracle range: told the test sample's depth range." in out
 
 
@@ -163,7 +162,7 @@ def test_paper_tables_by_choice(choice, capsys, tmp_path):
     for name in TABLES:
         assert (f"{name}: " in out) == (name in expected)
         assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (name in expected)
-    assert SHOWN_BY_DEFAULT == ("architecture", "normalization")
+    assert SHOWN_BY_DEFAULT == ("architecture", "normalization", "oracle_order")
 
 
 def test_paper_rows_stay_out_of_the_ranking(make, tmp_path):
@@ -171,7 +170,7 @@ def test_paper_rows_stay_out_of_the_ranking(make, tmp_path):
     assert main(["leaderboard", str(path), "--json", str(tmp_path / "board")]) == 0
     content = json.loads((tmp_path / "board").read_text())
     assert [row["name"] for group in content["groups"] for row in group["rows"]] == ["A method"]
-    assert [table["name"] for table in content["reported_by_the_paper"]] == list(SHOWN_BY_DEFAULT)
+    assert [table["name"] for table in content["reported_by_others"]] == list(SHOWN_BY_DEFAULT)
 
 
 HOSTILE = "| a `b` <script>alert(1)</script> [x](http://e) ![i](y) **z** @me www.e.org &amp; \\| #1 [red]"
@@ -183,7 +182,7 @@ def test_submitted_text_is_only_text(make, capsys, tmp_path):
     line = next(line for line in (tmp_path / "t.md").read_text().splitlines() if "script" in line)
     head = (tmp_path / "t.md").read_text().splitlines()[2]
     assert line.count("|") == head.count("|")
-    short, *_, full = (cell.strip() for cell in line.split("|")[2:-1])
+    short, *_, full = (cell.strip() for cell in line.split("|")[1:-1])
     for cell in (short, full):
         assert not set("`<>[]!*@\\:") & set(cell) and "www." not in cell
     import html

@@ -1,7 +1,5 @@
 """Rank ranges, groups and their titles, legacy data, short names, and what a method assumes."""
 
-import json
-import re
 from dataclasses import replace
 
 import pytest
@@ -10,21 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.leaderboard.groups import (
-    LEGACY_FINGERPRINTS,
-    LEGACY_NOTE,
-    LONGEST_NAME,
-    assumption,
-    assumption_sentences,
-    cut_at_word,
-    short_names,
-)
+from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences
+from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE
+from fpp_ml_bench.leaderboard.names import LONGEST_NAME, cut_at_word, short_names
 from fpp_ml_bench.leaderboard.page import page_files
-from fpp_ml_bench.leaderboard.ranking import rank, rank_ranges, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.rows import chosen_tables
-from fpp_ml_bench.leaderboard.tables import readme_block
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.readme import readme_block
+from fpp_ml_bench.leaderboard.reported import chosen_tables
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
 
 
@@ -39,51 +30,10 @@ def shipped():
     return read_entries(shipped_rows())
 
 
-spans = st.lists(st.tuples(st.integers(0, 20), st.integers(0, 5), st.integers(0, 5)), max_size=10)
-
-
-@given(spans, st.integers(0, 3))
-@settings(max_examples=300, deadline=None)
-def test_rank_ranges_against_their_definition(drawn, without_value):
-    values = [float(value) for value, _, _ in drawn] + [None] * without_value
-    intervals = [(float(value - low), float(value + high)) for value, low, high in drawn] + [None] * without_value
-    ranges = rank_ranges(values, intervals)
-    for (best, worst), interval in zip(ranges, intervals, strict=True):
-        if interval is None:
-            assert (best, worst) == (len(drawn) + 1, len(values))
-            continue
-        with_value = intervals[: len(drawn)]
-        assert best == 1 + sum(rival[1] < interval[0] for rival in with_value)
-        assert worst == len(values) - without_value - sum(rival[0] > interval[1] for rival in with_value)
-    # Sorted by value, each row is within its range.
-    order = sorted(range(len(drawn)), key=lambda index: values[index])
-    assert all(ranges[index][0] <= place <= ranges[index][1] for place, index in enumerate(order, start=1))
-
-
-def test_the_same_ranks_everywhere(tmp_path, capsys, monkeypatch):
-    files = [path for path in shipped_rows() if path.stem.startswith("phase")]
-    (group,) = groups = rank(read_entries(files))
-    ranks = [row.ranks for row in group.rows]
-    assert any("-" in text for text in ranks)
-    cells = re.findall(r"<td data-v=[^>]*>([\d-]+)</td>\s*<th", page_files(groups, [])["index.html"].decode())
-    assert cells == ranks
-    shown = re.findall(r"^\| ([\d-]*\d) ", readme_block(groups), flags=re.MULTILINE)
-    assert shown == ranks[:5]
-    monkeypatch.setenv("COLUMNS", "120")
-    assert main(["leaderboard", *map(str, files), "--paper", "none"]) == 0
-    assert re.findall(r"^│ +([\d-]+) │", capsys.readouterr().out, flags=re.MULTILINE) == ranks
-    assert main(["leaderboard", *map(str, files), "--json", str(tmp_path / "board.json")]) == 0
-    rows = json.loads((tmp_path / "board.json").read_text())["groups"][0]["rows"]
-    assert [(row["best_rank"], row["worst_rank"]) for row in rows] == [
-        (row.best_rank, row.worst_rank) for row in group.rows
-    ]
-
-
-def test_shipped_rows_stay_sorted_by_error_with_ranks_that_hold_their_place(shipped):
+def test_shipped_rows_stay_sorted_by_error(shipped):
     for group in rank(shipped):
-        errors = [row.entry.value("object_mae_mm") for row in group.rows]
+        errors = [row.value("object_mae_mm") for row in group.rows]
         assert errors == sorted(errors)
-        assert all(row.best_rank <= place <= row.worst_rank for place, row in enumerate(group.rows, start=1))
 
 
 def with_fingerprint(entry, fingerprint):
@@ -96,9 +46,9 @@ def test_groups_are_headed_by_their_benchmark_and_legacy_comes_last(files, monke
     monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full", 0, "full", 960, named),))
     entry = read_entries(files[:1])[0]
     groups = rank([with_fingerprint(entry, legacy), entry, with_fingerprint(entry, named)])
-    titles = [group.key.title for group in groups]
+    titles = [group.title for group in groups]
     rest = "40 x 32 px"
-    words = ": metric track, test split, against decoded depth"
+    words = ": few frames, no code, metric track, test split, against decoded depth"
     assert titles == [
         f"fpp-bench-full version 0, {rest}{words}",
         f"{rest}, data {entry.result.dataset.fingerprint[:8]}{words}",
@@ -115,7 +65,7 @@ def test_data_of_a_named_benchmark_is_not_legacy(files, monkeypatch):
     fingerprint = min(LEGACY_FINGERPRINTS)
     monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full-224", 0, "full", 224, fingerprint),))
     (group,) = rank([with_fingerprint(read_entries(files[:1])[0], fingerprint)])
-    assert not group.key.is_legacy and group.key.title.startswith("fpp-bench-full-224 version 0")
+    assert not group.key.is_legacy and group.title.startswith("fpp-bench-full-224 version 0")
 
 
 def test_data_of_an_earlier_version_is_named_and_legacy(files):
@@ -123,7 +73,7 @@ def test_data_of_an_earlier_version_is_named_and_legacy(files):
     for earlier in benchmark.EARLIER:
         (group,) = rank([with_fingerprint(entry, earlier.fingerprint)])
         assert group.key.is_legacy
-        assert group.key.title.startswith(f"{earlier.title}, ") and ", legacy: " in group.key.title
+        assert group.title.startswith(f"{earlier.title}, ") and ", legacy: " in group.title
 
 
 def test_shipped_rows_are_of_a_benchmark_or_legacy(shipped):
@@ -219,16 +169,19 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
     assuming = [row for row in group.rows if assumption(row.entry.result)]
     assert assuming and sum("a lit background" in text for text in own) == len(assuming)
-    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {"constant"}
+    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {
+        "constant",
+        "nearest",
+    }
     assert "phase and phase-net assume one albedo, a lit background." in readme_block([group])
 
 
 def test_the_papers_errors_are_shown_apart(shipped):
     groups = rank(shipped)
     block = readme_block(groups)
-    line = "| UNet | 14.54 | 17.88 | 3.31 | told the test sample&#39;s depth range |"
-    assert block.index("Reported by the paper on other data") < block.index(line)
+    line = "| UNet | 14.54 | 17.88 | 3.31 | reported by the paper, told the test sample&#39;s depth range |"
+    assert block.index("Reported by others on other data") < block.index(line)
     index = page_files(groups, chosen_tables(None))["index.html"].decode()
-    paper = index[index.index('<section id="paper">') :]
+    paper = index[index.index('<section id="reported">') :]
     assert "14.54" in paper and "told the test sample" in paper and "Other data, not ranked" in paper
-    assert "14.54" not in index[: index.index('<section id="paper">')]
+    assert "14.54" not in index[: index.index('<section id="reported">')]

@@ -17,9 +17,10 @@ from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
 from fpp_ml_bench.baselines.tradeoff.drawing import free_box
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report import escaped, page
-from fpp_ml_bench.leaderboard.page.page import group_scatter, page_files, slug
+from fpp_ml_bench.leaderboard.page.page import page_files, slug
+from fpp_ml_bench.leaderboard.page.pictures import overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
-from fpp_ml_bench.leaderboard.rows import chosen_tables
+from fpp_ml_bench.leaderboard.reported import chosen_tables
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
         {str(p.relative_to(tmp_path / out)): p.read_bytes() for p in (tmp_path / out).rglob("*") if p.is_file()}
         for out in ("first", "second")
     )
-    assert first == second and len(first) == 2 + len(files)
+    assert first == second and len(first) == 3 + len(files)
 
 
 def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path):
@@ -77,9 +78,7 @@ def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path
 
 def test_groups_stay_apart_and_the_papers_rows_too(files):
     index = pages(files)["index.html"].decode()
-    sections = re.findall(r'<section id="s(\d)".*?</section>', index, flags=re.DOTALL)
-    assert sections == ["0", "1"]
-    metric, oracle = (re.search(rf'<section id="s{n}".*?</section>', index, flags=re.DOTALL)[0] for n in (0, 1))
+    metric, oracle = re.findall(r'<section id="[a-z0-9-]+" class="board">.*?</section>', index, flags=re.DOTALL)
     assert "Was told" in oracle and "Was told" not in metric and "Fast and rough" not in oracle
     assert "were told the test sample's depth range" in html.unescape(oracle)
     assert "TransUNet" not in metric + oracle and "TransUNet" in index
@@ -87,8 +86,11 @@ def test_groups_stay_apart_and_the_papers_rows_too(files):
 
 
 def test_front_is_those_nobody_beats(files):
-    metric = rank(read_entries(files))[0]
-    assert [mark.name for mark in group_scatter(metric, {}).front] == ["Fast and rough", "Slow and fine"]
+    groups = rank(read_entries(files))
+    for cost in ("seconds", "frames"):
+        picture = overview(groups, cost, {})
+        assert [mark.name for mark in picture.front] == ["Fast and rough", "Slow and fine"]
+        assert len(picture.marks) == 4  # the row that was told is drawn, and leads no front
 
 
 def test_links_lead_to_the_page_and_nowhere_else(files):
@@ -148,7 +150,7 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
 
     written, expected = pages_with(name), pages_with("p" * len(name))
     for file in written:
-        assert re.fullmatch(r"index\.html|data\.json|submissions/[a-z0-9-]+-[0-9a-f]{12}\.html", file)
+        assert re.fullmatch(r"index\.html|data\.json|data\.csv|submissions/[a-z0-9-]+-[0-9a-f]{12}\.html", file)
     index, plain = Parsed(written["index.html"].decode()), Parsed(expected["index.html"].decode())
     assert [tag for tag, _ in index.elements] == [tag for tag, _ in plain.elements]
     assert [tuple(attributes) for _, attributes in index.elements] == [tuple(a) for _, a in plain.elements]

@@ -14,6 +14,7 @@ from fpp_ml_bench.cli import reproduce as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.leaderboard.reported import paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
@@ -22,7 +23,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
     table_lines,
     table_markdown,
 )
-from fpp_ml_bench.leaderboard.rows import Entry, paper_tables
+from fpp_ml_bench.leaderboard.rows import Entry
 
 
 @pytest.fixture(scope="module")

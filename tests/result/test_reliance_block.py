@@ -21,8 +21,8 @@ from fpp_ml_bench.evaluation.result import (
 from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.readme import readme_block
 from fpp_ml_bench.leaderboard.rows import read_entry
-from fpp_ml_bench.leaderboard.tables import readme_block
 
 SHA = "a" * 64
 

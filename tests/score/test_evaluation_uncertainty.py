@@ -1,4 +1,4 @@
-"""Intervals over objects, ranks with ties, paired comparison and verification."""
+"""Intervals and tests over objects, paired comparison and verification."""
 
 import json
 
@@ -14,7 +14,7 @@ from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.result import read_result, write_result
 from fpp_ml_bench.evaluation.score import uncertainty
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.score.uncertainty import object_interval, ranks_with_ties
+from fpp_ml_bench.evaluation.score.uncertainty import holm, object_interval, sign_flip_p
 
 
 @pytest.fixture(scope="module")
@@ -89,13 +89,55 @@ def test_too_few_objects_for_95_percent_are_said():
         assert covered / 150 == pytest.approx(reach, abs=0.1)
 
 
-def test_ranks_with_ties():
-    spans = [(1.0, (0.8, 1.2)), (1.1, (0.9, 1.3)), (1.25, (1.21, 1.4)), (9.0, (8.0, 10.0))]
-    values, intervals = zip(*spans, strict=True)
-    # The third overlaps the second but not the first: a single entry is clearly better, so its rank is 2.
-    assert ranks_with_ties(values, intervals) == [1, 1, 2, 4]
-    assert ranks_with_ties(values[::-1], intervals[::-1]) == [4, 2, 1, 1]
-    assert ranks_with_ties([2.0, 1.0, 2.0, None], [None] * 4) == [2, 1, 2, None]
+def scipy_p(differences):
+    """All flips, by SciPy."""
+    answer = stats.permutation_test(
+        (differences, np.zeros(len(differences))), lambda a, b, axis: np.mean(a - b, axis=axis), vectorized=True,
+        permutation_type="samples", n_resamples=np.inf,
+    )  # fmt: skip
+    return answer.pvalue
+
+
+@pytest.mark.parametrize("objects", [2, 5, 6, 9, 12])
+def test_the_sign_flip_test_is_scipys(objects):
+    rng = np.random.default_rng(objects)
+    for differences in (rng.normal(0.5, 1, objects), rng.exponential(1, objects) - 0.3, np.full(objects, 0.1)):
+        assert sign_flip_p(differences.tolist()) == pytest.approx(scipy_p(differences), abs=1e-12)
+    ties = rng.integers(-2, 3, objects) / 10  # sums that are equal but for rounding
+    assert sign_flip_p(ties.tolist()) == pytest.approx(scipy_p(ties), abs=1e-12)
+
+
+def test_the_sign_flip_test_at_its_ends():
+    assert sign_flip_p([]) == sign_flip_p([0.0, 0.0]) == sign_flip_p([1.0, -1.0]) == 1.0
+    assert sign_flip_p([3.0] * 5) == 0.0625 > uncertainty.SIGNIFICANT > sign_flip_p([3.0] * 6) == 0.03125
+    assert sign_flip_p([1e30] * 25) == sign_flip_p([1e-30] * 25) == 2.0**-24
+    differences = np.random.default_rng(1).normal(0.4, 1, 25).tolist()
+    assert sign_flip_p([-value for value in differences]) == sign_flip_p(differences)
+
+
+@pytest.mark.parametrize("objects", [25, 70])
+def test_sampled_flips_agree_with_all_of_them(objects, monkeypatch):
+    """Objects without a difference change nothing; 70 of them need more than one word of random bits."""
+    differences = np.random.default_rng(objects).normal(0.3, 1, 25).tolist() + [0.0] * (objects - 25)
+    exact = sign_flip_p(differences[:25])
+    monkeypatch.setattr(uncertainty, "_EXACT_OBJECTS", 5)
+    sampled = sign_flip_p(differences)
+    assert sampled == sign_flip_p(differences) == pytest.approx(exact, abs=5 * (exact / 1e5) ** 0.5)
+    assert sign_flip_p([1.0] * objects) == 1 / 100_001
+
+
+def test_holm_against_its_step_down_procedure():
+    rng = np.random.default_rng(5)
+    for count in (0, 1, 2, 7):
+        for values in rng.uniform(0, 0.2, (20, count)).tolist():
+            adjusted = holm(values)
+            for level in (0.01, 0.05, 0.2, 0.7):
+                rejected = set()
+                for place, index in enumerate(np.argsort(values)):  # stop at the first that is not rejected
+                    if values[index] > level / (count - place):
+                        break
+                    rejected.add(int(index))
+                assert rejected == {index for index, value in enumerate(adjusted) if value <= level}
 
 
 def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
@@ -159,6 +201,9 @@ def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
     assert main_difference.told_apart
     assert comparison.sentence.startswith("Two has a lower object MAE than One, by 0.8")
     assert "lower in 4 of 4 samples" in comparison.sentence
+    assert main_difference.sign_flip_p == 0.5
+    assert "sign-flip test p = 0.5" in comparison.sentence
+    assert "does not confirm it at 5%: 2 objects never reach 5%" in comparison.sentence
     assert main(["compare", str(first), str(second), "--json", str(tmp_path / "d.json")]) == 0
     printed = capsys.readouterr().out
     assert "Two has a lower object MAE than One" in " ".join(printed.split())

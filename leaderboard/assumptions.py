@@ -1,0 +1,41 @@
+"""What a method assumes of the scene, what it was told of the scored samples, and what it learned from."""
+
+from fpp_ml_bench.evaluation.result import Result
+
+_TOLD_OF = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
+ASSUMED = "one albedo, a lit background"
+_ASSUMES = (
+    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
+    "the fringe image decides the fringe order."
+)
+"""What the phase route and the learned one assume, in a few words and as a sentence, unless ``shading`` is off."""
+
+
+def told(track: str) -> str:
+    """What the methods of a track are told about the very samples that they are scored on; empty for ``metric``.
+
+    >>> told("oracle range + order")
+    "the test sample's depth range and fringe order"
+    """
+    things = [_TOLD_OF[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TOLD_OF]
+    if not things:
+        return ""
+    return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
+
+
+def assumption(result: Result) -> str:
+    """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
+    method, shading = result.submission.method, result.submission.settings.get("shading")
+    return ASSUMED if method in ("phase", "phase-net") and shading is True else ""
+
+
+def assumption_sentences(result: Result) -> str:
+    """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
+    given = told(result.track)
+    return " ".join([*([_ASSUMES] if assumption(result) else []), *([f"Told {given}."] if given else [])])
+
+
+def learned_from(result: Result) -> str:
+    """What data the method learned from, as its submission says; empty where it does not say."""
+    said = getattr(result.submission, "learned_from", None)
+    return "" if said is None else str(said.data)

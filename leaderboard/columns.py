@@ -1,0 +1,170 @@
+"""The columns of the leaderboard's tables: what a cell says of a row, and where a column is shown."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
+from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
+from fpp_ml_bench.leaderboard.rows import Entry
+
+SELF_REPORTED = "*"
+NOT_MEASURED = "not measured"
+RANK_NOTE = (
+    "Rank: the best and the worst that the tests allow. Two rows are told apart by a sign-flip test of their paired "
+    "object means at 5%, by Holm's correction over all pairs of the table. Best: 1 + the rows that it is behind; "
+    "worst: all ranked rows without those behind it."
+)
+RATIO_NOTE = (
+    "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image."
+)
+NOTE = (
+    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {RATIO_NOTE} "
+    f"{SELF_REPORTED} time as reported by its author, not measured here."
+)
+MIDDLE, WIDE, WIDEST = 100, 140, 170
+"""Characters of a terminal from which on more columns fit."""
+ONLY_IN_FILES = 1_000_000
+_DEVICE_WIDTH, _LONGEST_NAME = 40, 90
+_ERRORS = {
+    "object_mae_mm": ("Object MAE", 0),
+    "object_rmse_mm": ("Object RMSE", 0),
+    "overall_mae_mm": ("Overall MAE", 0),
+    "background_mae_mm": ("Backgr. MAE", WIDE),
+    "object_missing_share": ("Missing", WIDE),
+    "object_interior_mae_mm": ("Interior MAE", WIDEST),
+    "object_edge_mae_mm": ("Edge MAE", WIDEST),
+}
+"""Title of each error's column, and the width from which on it is shown."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. A terminal of fewer than ``from_width``
+    characters leaves the column out. A table has it where ``present`` holds of any row."""
+
+    title: str
+    text: Callable[[Ranked], str]
+    right: bool = True
+    from_width: int = 0
+    present: Callable[[Ranked], bool] = lambda row: True
+
+    def shown_for(self, rows: Sequence[Ranked]) -> bool:
+        """Whether a table of ``rows`` has it."""
+        return any(map(self.present, rows))
+
+
+def columns(sort: str) -> list[Column]:
+    """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
+    named = {*_ERRORS, "seconds_per_sample", "frames_used"}
+    own = {} if sort in named else {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
+    errors = []
+    for key, (title, from_width) in {**own, **_ERRORS}.items():
+        errors.append(Column(title, partial(error, key), from_width=0 if key == sort else from_width))
+        if key == sort in HEADLINE:
+            ends = partial(interval, between="-", key=sort)
+            errors.append(Column("95% interval", ends, from_width=MIDDLE))
+        if key == "object_mae_mm":
+            errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
+    return [
+        RANK, METHOD, *errors, Column("s/sample", _seconds), FRAMES, replace(RELIANCE, from_width=WIDE),
+        replace(ROBUSTNESS, from_width=WIDEST), *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
+        replace(PROVENANCE, from_width=MIDDLE),
+        replace(LEARNED, from_width=WIDEST),
+        Column("Assumes", lambda row: assumption(row.entry.result) or "-", right=False, from_width=WIDEST),
+        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
+        Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
+    ]  # fmt: skip
+
+
+def error(key: str, row: Ranked) -> str:
+    return (percent if key.endswith("_share") else millimetres)(row.value(key))
+
+
+def error_on(benchmark: str, row: Ranked) -> str:
+    """Object MAE on the part of the row that is of ``benchmark``, `TEST` or `UNSEEN`; a dash without any."""
+    part = row.on(benchmark)
+    return "-" if part is None else millimetres(part.value("object_mae_mm"))
+
+
+def interval(row: Ranked, between: str, key: str = "object_mae_mm") -> str:
+    return between.join(map(millimetres, row.interval(key) or ())) or "-"
+
+
+def ratio(row: Ranked) -> str:
+    """The row's object MAE over that of the best trivial row, to two significant digits."""
+    return "-" if row.ratio is None else f"{row.ratio:.2g}" if row.ratio < 10 else f"{row.ratio:.0f}"
+
+
+def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
+    """Share of object pixels within the stated 95% interval, and AUSE in mm; None where no uncertainty was scored."""
+    block = getattr(entry.result, "uncertainty", None)
+    return (None, None) if block is None else (block.metrics.coverage_95, block.metrics.ause_mae_mm)
+
+
+def _seconds(row: Ranked) -> str:
+    value = row.entry.value("seconds_per_sample")
+    return seconds(value) + (SELF_REPORTED if value is not None and not row.entry.time_measured else "")
+
+
+def milliseconds_text(row: Ranked) -> str:
+    ms = row.entry.latency_ms
+    return "-" if ms is None else f"{ms:.3g}{'' if row.entry.time_measured else SELF_REPORTED}"
+
+
+def reliance(entry: Entry) -> str:
+    """The phase-reliance score with two decimals."""
+    measured = entry.result.reliance
+    return NOT_MEASURED if measured is None else f"{measured.score:.2f}"
+
+
+def reliance_interval(entry: Entry) -> str:
+    """The ends of its interval; empty without any."""
+    low, high = entry.result.reliance.interval if entry.result.reliance else (None, None)
+    return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
+
+
+def robustness(entry: Entry) -> str:
+    """Mean error over the disturbed scenes of the test set, mm with one decimal."""
+    measured = (entry.result.robustness or {}).get("test")
+    return NOT_MEASURED if measured is None else f"{measured.mae_mm:.1f}"
+
+
+def device(entry: Entry) -> str:
+    """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
+    timing = entry.result.timing
+    hardware = timing.hardware if timing is not None else entry.result.submission.hardware
+    if hardware is None:
+        return "-"
+    cores = "1 core" if hardware.cores == 1 else f"{hardware.cores} cores"
+    return printable(hardware.gpu or f"{hardware.cpu}, {cores}", _DEVICE_WIDTH)
+
+
+def _states_uncertainty(row: Ranked) -> bool:
+    return uncertainty(row.entry) != (None, None)
+
+
+def _says_learned(row: Ranked) -> bool:
+    return bool(learned_from(row.entry.result))
+
+
+RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
+METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
+FRAMES = Column("Frames", lambda row: str(row.entry.frames))
+PARTS = tuple(
+    Column(title, partial(error_on, part), present=lambda row: row.on(UNSEEN) is not None)
+    for title, part in (("On test", TEST), ("On unseen", UNSEEN))
+)
+"""Both errors of a row that joins the two sets."""
+RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
+RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
+ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))
+UNCERTAINTY = (
+    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), present=_states_uncertainty),
+    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), present=_states_uncertainty),
+)
+LEARNED = Column("Learned from", lambda row: learned_from(row.entry.result) or "-", False, present=_says_learned)
+PROVENANCE = Column("Provenance", lambda row: row.entry.provenance, right=False)

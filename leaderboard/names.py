@@ -1,0 +1,115 @@
+"""Short names of a table's rows. Rows of this package's methods get theirs from the method's settings; every other
+submission keeps its own name, cut at a word."""
+
+from collections.abc import Sequence
+from operator import index
+
+from fpp_ml_bench.constants import CONFIGS
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.files import printable
+
+LONGEST_NAME = 36
+"""Characters of a short name."""
+
+_DIRECTIONS = ("horizontal", "vertical", "both")
+_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD"}
+_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
+_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
+"""By the setting ``depth_range``. That the range was told is the group's track."""
+
+
+def short_names(submissions: Sequence[Submission]) -> list[str]:
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name. Where
+    two would get the same, the later by its own name has a number behind it."""
+    derived = {submission.name: _from_settings(submission) for submission in submissions}
+    chosen: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in sorted(derived, key=lambda name: (derived[name] is None, name)):
+        short, number = derived[name] or cut_at_word(printable(name)), 1
+        candidate = short
+        while candidate in taken:
+            number += 1
+            suffix = f" ({number})"
+            candidate = cut_at_word(short, LONGEST_NAME - len(suffix)) + suffix
+        taken.add(candidate)
+        chosen[name] = candidate
+    return [chosen[submission.name] for submission in submissions]
+
+
+def cut_at_word(text: str, longest: int = LONGEST_NAME) -> str:
+    """``text``, or as many of its words as fit into ``longest`` characters with an ellipsis behind them."""
+    if len(text) <= longest:
+        return text
+    words = text[:longest].rpartition(" ")[0].rstrip(" ,;:-+(")
+    return (words or text[: longest - 1]) + "…"
+
+
+def _from_settings(submission: Submission) -> str | None:
+    """A name made of the method's settings; None for a submission that is not one of this package's methods."""
+    try:
+        title, make = _METHODS.get(submission.method, ("", _network))
+        name = (make if submission.name.startswith(title) else _network)(submission)
+    except (KeyError, TypeError, ValueError):  # settings that the package's methods do not write
+        return None
+    return name if len(name) <= LONGEST_NAME else None
+
+
+def _direction(submission: Submission) -> str:
+    return _DIRECTIONS[_DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
+
+
+def _classical(submission: Submission) -> str:
+    steps, direction = index(submission.settings["steps"]), _direction(submission)  # type: ignore[arg-type]
+    if not submission.settings.get("fewest"):
+        return f"Classical {steps}+Gray, {direction}"
+    gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
+    return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
+
+
+def _phase(submission: Submission) -> str:
+    settings, direction = submission.settings, _direction(submission)
+    if "error_mm" in settings:
+        name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
+    else:
+        name = f"Phase, {index(settings['frames'])} {direction}"  # type: ignore[arg-type]
+    standoff = settings.get("prior") == "standoff"
+    if not settings["shading"]:
+        return f"{name}, standoff alone" if standoff else f"{name}, no shading"
+    return f"{name}, standoff" if standoff else name
+
+
+def _phase_net(submission: Submission) -> str:
+    shading = "" if submission.settings["shading"] else ", no shading"
+    return f"{printable(submission.settings['weights'])}, 1 {_direction(submission)}{shading}"
+
+
+def _network(submission: Submission) -> str:
+    settings = submission.settings
+    network = _NETWORKS[str(settings["network"])]
+    if not submission.name.startswith(f"{network}, "):
+        raise ValueError("a name of its own")
+    normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]
+    trained_frames = str(settings["trained_frames"])
+    if trained_frames not in CONFIGS:
+        raise ValueError("unknown frames")
+    frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
+    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}"]
+    parts += ["no background" if settings["background_removed"] else "", _RANGES[settings.get("depth_range")]]  # type: ignore[index]
+    return ", ".join(filter(None, parts))
+
+
+def _loss(label: str) -> str:
+    """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
+    kind, _, rest = label.partition("_")
+    if kind == "hybrid":
+        loss, _, weight = rest.partition("_")
+        return f"hybrid {_LOSSES[loss]} {float(weight):g}"
+    return f"masked {_LOSSES[rest]}" if kind == "masked" else _LOSSES[label]
+
+
+_METHODS = {
+    "classical": ("Classical ", _classical),
+    "phase": ("Phase route, ", _phase),
+    "phase-net": ("Phase route, ", _phase_net),
+}
+"""How the names of each method's submissions begin, and what makes the short name."""

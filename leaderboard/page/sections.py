@@ -1,0 +1,123 @@
+"""What the page's template needs of each dataset and its tables, and of a trade-off."""
+
+import hashlib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Tradeoff, scatter
+from fpp_ml_bench.evaluation.report import interval_text, millimetres, signed
+from fpp_ml_bench.leaderboard import columns
+from fpp_ml_bench.leaderboard.groups import Group
+from fpp_ml_bench.leaderboard.page.pictures import drawn, overview_figures
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
+from fpp_ml_bench.loaders.storage import benchmark_of
+
+_SPARSE = (*columns.PARTS, columns.RATIO, *columns.UNCERTAINTY)
+_TRADEOFF_PICTURE = 430, 380
+_SHADES = 6
+
+
+def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
+    """What the template needs of each dataset: its title, notes on earlier data or rules, the pictures of all its rows,
+    and its tables."""
+    found = []
+    for data, members in groupby(groups, key=lambda group: group.key.data_title):
+        of_data = list(members)
+        rows = [row for group in of_data for row in group.rows]
+        found.append({
+            "numbered": [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)],
+            "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
+            "title": data, "notes": of_data[0].key.notes, "figures": overview_figures(of_data, slugs),
+            "targets": sorted({group.key.against for group in of_data}),
+            "sections": [_section(group, _link(group, of_data)) for group in of_data],
+        })  # fmt: skip
+    return found
+
+
+def anchor(group: Group) -> str:
+    """The id of a table on the page, which stays when rows or other tables are added."""
+    key = group.key
+    words = re.sub(r"[^a-z]+", "-", f"{key.frames} {key.track} {key.target}")
+    return f"{words}-{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}"
+
+
+def _link(group: Group, of_data: Sequence[Group]) -> str:
+    """What is said of a table where it is one of those of its dataset: in which it differs from the others."""
+    parts = [group.key.frames]
+    parts += [group.key.track] if len({other.key.track for other in of_data}) > 1 else []
+    parts += [group.key.against.split()[0]] if len({other.key.target for other in of_data}) > 1 else []
+    return ", ".join(parts)
+
+
+def _section(group: Group, link: str) -> dict[str, Any]:
+    """What the template needs of a group: its heading, its rows' intervals, objects and pairs."""
+    key = group.key
+    mode = "" if key.mode == "standard" else f", mode {key.mode}"
+    machines = sorted({columns.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
+    per_object = [row.object_means(DEFAULT_SORT) for row in group.rows]
+    objects = sorted({name for errors in per_object for name in errors})
+    logs = [math.log(error) for errors in per_object for error in errors.values() if error]
+    ends = [(row.value(DEFAULT_SORT), *(row.interval(DEFAULT_SORT) or ())) for row in group.rows]
+    cells = [[(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object]
+    return {
+        "group": group, "id": anchor(group), "link": link, "machines": machines, "objects": objects,
+        "object_cells": cells,
+        "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{mode}",
+        "ranked": any(row.best_rank is not None for row in group.rows), "matrix": _matrix(group),
+        "with": [column.title for column in _SPARSE if column.shown_for(group.rows)],
+        "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
+    }  # fmt: skip
+
+
+def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]:
+    """For each ranked row and each of them: this row minus that in mm, interval and p value, and a verdict."""
+    names = [row.short_name for row in group.rows if row.best_rank is not None]
+    cells: dict[tuple[str, str], tuple[str, str, str]] = {}
+    for pair in group.pairs:
+        low, high = pair.interval or (pair.difference, pair.difference)
+        p = f"p {pair.p_holm:.2g}"
+        for first, second, sign, ends in (
+            (pair.second, pair.first, 1, (low, high)), (pair.first, pair.second, -1, (-high, -low))
+        ):  # fmt: skip
+            verdict = "" if not pair.behind else "behind" if sign > 0 else "ahead"
+            difference = signed(sign * pair.difference)
+            cells[first, second] = difference, f"{interval_text(ends)}; {p}", verdict
+    return [(name, [cells.get((name, other)) for other in names]) for name in names]
+
+
+def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
+    """The section of a trade-off; None without one, or where no setting has both an error and a time."""
+    if run is None or not run.comparable():
+        return None
+    pictures = []
+    for cost in COST_KEYS:
+        if picture := scatter(run, cost):
+            about = f"Object MAE in mm against {picture.across}, both logarithmic"
+            pictures.append(drawn(picture, "scatter", *_TRADEOFF_PICTURE, about))
+    by_time, by_frames = (run.front(cost) for cost in COST_KEYS)
+    rows = []
+    for point in sorted({p.key: p for p in (*by_time, *by_frames)}.values(), key=lambda p: p.object_mae_mm or 0):
+        fronts = " and ".join(name for name, front in (("time", by_time), ("frames", by_frames)) if point in front)
+        ms, low, high = point.ms
+        missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.2g}%"
+        rows.append((
+            point.title, fronts, millimetres(point.object_mae_mm), millimetres(point.measured_mae_mm), missing,
+            f"{ms:.3g}", f"{low:.3g} to {high:.3g}", str(point.frames),
+        ))  # fmt: skip
+    return {
+        "run": run, "benchmark": benchmark_of(run.fingerprint), "pictures": pictures, "rows": rows,
+        "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
+        "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
+    }  # fmt: skip
+
+
+def _shade(error: float | None, logs: Sequence[float]) -> int | None:
+    """The larger the error among all ``logs`` of a table, the darker its cell."""
+    if error is None or not logs:
+        return None
+    low, high = min(logs), max(logs)
+    share = 0.0 if error == 0 or high == low else (math.log(error) - low) / (high - low)
+    return min(_SHADES - 1, int(share * _SHADES))

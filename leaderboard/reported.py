@@ -1,0 +1,82 @@
+"""Rows that were typed in: the paper's own, in ``paper_rows.json``, and those of other publications on its dataset, in
+``reported_rows.json``. This package did not measure them, and they are never ranked with measured rows."""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench.baselines.training import TABLES
+from fpp_ml_bench.leaderboard.assumptions import told
+from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
+
+REPORTED_HEADING = "Reported by others on other data (not measured here)"
+SHOWN_BY_DEFAULT = ("architecture", "normalization", "oracle_order")
+
+
+@dataclass(frozen=True)
+class ReportedRow:
+    """A row of a table: errors in mm by the keys of `HEADLINE`, as far as they are reported, on ``test_samples`` (view,
+    frame) pairs, None where that is not said."""
+
+    row: str
+    label: str
+    track: str
+    test_samples: int | None
+    errors_mm: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ReportedTable:
+    """A table of the paper, its rows in the paper's order, or of another ``source``."""
+
+    name: str
+    title: str
+    rows: tuple[ReportedRow, ...]
+    source: str = BY_THE_PAPER
+
+    @property
+    def note(self) -> str:
+        """Below the table: who measured, on what, and what the methods of its tracks were told."""
+        given = [f"{track}: told {told(track)}." for track in sorted({row.track for row in self.rows}) if told(track)]
+        return " ".join(
+            [f"{self.source[0].upper()}{self.source[1:]}. Other data, not ranked with the rows above.", *given]
+        )
+
+
+def _read(file: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(Path(__file__).with_name(file).read_text(encoding="utf-8"))
+    return content
+
+
+@cache
+def paper_tables() -> dict[str, ReportedTable]:
+    """Every table of the paper by name, in the order of `TABLES`."""
+    content = _read("paper_rows.json")
+    tables = {}
+    for table in content["tables"]:
+        for row in table["rows"]:
+            row["errors_mm"] = dict(zip(content["columns"], row["errors_mm"], strict=True))
+        rows = tuple(ReportedRow(**row) for row in table["rows"])
+        tables[table["name"]] = ReportedTable(table["name"], table["title"], rows)
+    return {name: tables[name] for name in TABLES}
+
+
+@cache
+def other_tables() -> dict[str, ReportedTable]:
+    """The tables of other publications by name."""
+    return {
+        table["name"]: ReportedTable(
+            table["name"], table["title"], tuple(ReportedRow(**row) for row in table["rows"]),
+            f"{BY_ITS_AUTHORS} ({table['source']})",
+        )
+        for table in _read("reported_rows.json")["tables"]
+    }  # fmt: skip
+
+
+def chosen_tables(choice: str | None) -> list[ReportedTable]:
+    """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
+    tables = {**paper_tables(), **other_tables()}
+    several = {None: SHOWN_BY_DEFAULT, "all": tuple(tables), "none": ()}
+    return [tables[name] for name in several.get(choice, (str(choice),))]

@@ -1,0 +1,80 @@
+"""The predictors that look at nothing, or only for the nearest training image."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scored_dataset import disk_depth, make_dataset
+
+from fpp_ml_bench.baselines import ConstantMethod, NearestMethod, predict_split
+from fpp_ml_bench.baselines.method import load_method
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import paper_rig
+
+SIZE = (96, 96)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    def scene(seed):
+        frame = np.random.default_rng(seed).integers(0, 255, SIZE, dtype=np.uint8)
+        return frame, disk_depth(SIZE, seed)
+
+    views = ("A0", "A60", "A120", "A180")
+    made = make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE, views=views, scene=scene)
+    replace(made.manifest, rig=paper_rig(96).to_dict()).write(made.path)  # the rig of such images
+    return DatasetFolder(made.path)
+
+
+def stack(frame):
+    return [frame]
+
+
+def test_the_nearest_of_the_training_images_by_another_computation(dataset):
+    method = NearestMethod(paper_rig(96), dataset)
+    training = {sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")}
+    chosen = set()
+    for sample in dataset.samples("test"):
+        image = dataset.frame(sample, 0).astype(float)
+        nearest = min(training, key=lambda name: float(((training[name] - image) ** 2).mean()))
+        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(nearest))
+        chosen.add(nearest)
+    assert len(chosen) > 1
+    for sample in training:  # its own image is the nearest
+        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(sample))
+
+
+def test_blocks_are_means_over_their_pixels(dataset):
+    method = NearestMethod(paper_rig(96), dataset)
+    method.block_px = 7  # 96 = 13 * 7 + 5
+    frame = dataset.frame(dataset.samples("test")[0], 0)
+    sums = method._block_sums(frame)
+    assert sums.shape == (13, 13) and sums[2, 3] == int(frame[14:21, 21:28].astype(int).sum())
+
+
+def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
+    assert main(["predict", "nearest", str(dataset.path), "--out", str(tmp_path / "p")]) == 0
+    text = (tmp_path / "p" / "submission.yaml").read_text()
+    assert "method: nearest" in text and f"training_fingerprint: {dataset.fingerprint}" in text
+    assert predict_split(dataset, NearestMethod(dataset.rig, dataset.path), "test", tmp_path / "q").samples == 8
+
+
+def test_what_can_not_be_searched_is_refused(dataset, tmp_path, capsys):
+    with pytest.raises(PredictionError, match="needs the training split"):
+        load_method("nearest", paper_rig(96))
+    with pytest.raises(PredictionError, match=r"expected training images of 48x48 px"):
+        load_method("nearest", paper_rig(48), training=dataset)
+    assert main(["predict", "classical", str(dataset.path), "--training", "x", "--out", str(tmp_path / "p")]) == 2
+    assert "--training is an option of nearest" in capsys.readouterr().err
+    with pytest.raises(PredictionError, match="nearest needs frame 0"):
+        NearestMethod(paper_rig(96), dataset).predict([None])
+
+
+@pytest.mark.parametrize(
+    ("at", "depth_mm"), [("standoff", 1800.0), ("middle", 1800.0), ("training-mean", 1743.75), (5.0, 5.0)]
+)
+def test_a_constant_is_one_depth(at, depth_mm):
+    depth = ConstantMethod(paper_rig(16), at).predict([])
+    assert depth.shape == (16, 16) and depth.dtype == np.float32 and np.unique(depth).tolist() == [depth_mm]

@@ -1,0 +1,271 @@
+"""Ranks by paired tests, the rows that join two test sets, classes, and how far a row is from a trivial one."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from itertools import combinations
+from types import SimpleNamespace
+from typing import get_args
+
+import numpy as np
+import pytest
+from board_rows import entry_with_errors, write_result_file
+from scipy import stats
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import Track
+from fpp_ml_bench.evaluation.result import write_result
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.leaderboard.assumptions import learned_from, told
+from fpp_ml_bench.leaderboard.columns import columns, uncertainty
+from fpp_ml_bench.leaderboard.groups import CLASSES, frames_class
+from fpp_ml_bench.leaderboard.pairs import pairs
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.loaders.storage import Benchmark, benchmark
+
+EIGHT = [f"object {n}" for n in range(8)]
+FULL, UNSEEN = "f" * 64, "e" * 64
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    work = tmp_path_factory.mktemp("base")
+    return read_entries([write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0)])[0]
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    named = (Benchmark("fpp-bench-full", 1, "full", 960, FULL), Benchmark("fpp-bench-unseen", 1, "unseen", 960, UNSEEN))
+    monkeypatch.setattr(benchmark, "BENCHMARKS", named)
+
+
+def entries_of(base, errors, objects=EIGHT):
+    return [entry_with_errors(base, dict(zip(objects, values, strict=True)), name) for name, values in errors.items()]
+
+
+TEN = [f"object {n}" for n in range(10)]
+
+
+def random_errors(seed, rows=5):
+    rng = np.random.default_rng(seed)
+    hard = rng.exponential(1.0, 10)
+    return {f"row {n}": (hard * (1 + n / 2) + rng.uniform(0, 1.5, 10)).tolist() for n in range(rows)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ranks_follow_from_scipys_test_and_holms_procedure(seed, base):
+    errors = random_errors(seed)
+    (group,) = rank(entries_of(base, errors, TEN))
+    values = {}
+    for first, second in combinations(errors, 2):
+        difference = np.subtract(errors[first], errors[second])
+        tested = stats.permutation_test(
+            (difference,), np.mean, permutation_type="samples", n_resamples=np.inf, vectorized=True
+        )
+        values[first, second] = (tested.pvalue, difference.mean())
+    ordered, apart = sorted(values, key=lambda pair: values[pair][0]), set()
+    for place, pair in enumerate(ordered):
+        if values[pair][0] > 0.05 / (len(ordered) - place):
+            break
+        apart.add(pair)
+    assert 0 < len(apart) < len(values)  # or the test says nothing
+    behind = {pair if values[pair][1] > 0 else pair[::-1] for pair in apart}  # (the worse, the better)
+    for row in group.rows:
+        assert row.best_rank == 1 + sum(row.entry.name == worse for worse, _ in behind)
+        assert row.worst_rank == len(errors) - sum(row.entry.name == better for _, better in behind)
+    assert {(pair.second, pair.first) for pair in group.pairs if pair.behind} == behind
+    for pair in group.pairs:
+        p, mean = values.get((pair.first, pair.second)) or values[pair.second, pair.first]
+        assert pair.p == pytest.approx(p) and pair.difference == pytest.approx(abs(mean)) and pair.objects == 10
+        assert pair.interval[0] <= pair.difference <= pair.interval[1]
+
+
+def test_equal_rows_share_ranks_and_the_perfect_one_is_first(base):
+    some = random_errors(1, rows=1)["row 0"]
+    errors = {"zero": [0.0] * 10, "b": some, "a": some, "worst": [50.0 + n for n in range(10)]}
+    for order in (errors, dict(reversed(errors.items()))):
+        (group,) = rank(entries_of(base, order, TEN))
+        assert [(row.ranks, row.entry.name) for row in group.rows] == [
+            ("1", "zero"), ("2-3", "a"), ("2-3", "b"), ("4", "worst")
+        ]  # fmt: skip
+    twins = next(pair for pair in group.pairs if {pair.first, pair.second} == {"a", "b"})
+    assert twins.p == twins.p_holm == 1.0 and not twins.behind
+
+
+def test_hard_objects_cancel_in_a_pair(base):
+    """Intervals of the rows overlap widely, and yet one is behind the other on every object."""
+    hard = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0]
+    (group,) = rank(entries_of(base, {"a": hard, "b": [1.1 * error for error in hard]}))
+    first, second = (row.interval("object_mae_mm") for row in group.rows)
+    assert first[1] > second[0] and [row.ranks for row in group.rows] == ["1", "2"]
+
+
+def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
+    objects = EIGHT[:5]
+    (group,) = rank(entries_of(base, {"a": [1.0] * 5, "b": [9.0] * 5}, objects))
+    assert [row.ranks for row in group.rows] == ["-", "-"] and group.pairs == ()
+    assert "with 5 objects the smallest p value of a test is 0.0625" in group.unranked
+    (group,) = rank(entries_of(base, {"a": [1.0] * 6, "b": [9.0] * 6}, EIGHT[:6]))
+    assert [row.ranks for row in group.rows] == ["1", "2"] and group.unranked == ""
+
+
+def test_ranks_by_other_scores_and_none_by_cost(base):
+    entries = entries_of(base, {"a": [4.0] * 8, "b": [1.0] * 8})
+    for key in ("object_rmse_mm", "overall_mae_mm", "object_bias_mm"):
+        assert [(row.ranks, row.entry.name) for row in rank(entries, key)[0].rows] == [("1", "b"), ("2", "a")]
+    (group,) = rank(entries, "frames_used")
+    assert {row.ranks for row in group.rows} == {"-"} and "No ranks by frames_used" in group.unranked
+
+
+def two_sets(base, name, error, unseen_error):
+    test = {f"test {n}": error * (1 + n) for n in range(5)}
+    unseen = {f"unseen {n}": unseen_error * (1 + n) for n in range(20)}
+    entries = (entry_with_errors(base, test, name, FULL), entry_with_errors(base, unseen, name, UNSEEN))
+    return [entries[0], replace(entries[1], path=base.path.with_name(f"{name}-unseen.json"))]
+
+
+def test_test_and_unseen_objects_make_one_ranked_row(base, benchmarks):
+    first, second = two_sets(base, "first", 1.0, 1.0), two_sets(base, "second", 2.0, 1.5)
+    (group,) = rank([*second, *first])
+    assert group.title.endswith("one frame, metric track, test split + unseen, against decoded depth")
+    assert [(row.ranks, row.entry.name, len(row.objects)) for row in group.rows] == [
+        ("1", "first", 25), ("2", "second", 25)
+    ]  # fmt: skip
+    row = group.rows[1]
+    assert (row.on("fpp-bench-full").name, row.on("fpp-bench-unseen").name) == ("second", "second")
+    assert row.on("fpp-bench-full").value("object_mae_mm") == pytest.approx(2.0 * 3)
+    assert row.on("fpp-bench-unseen").value("object_mae_mm") == pytest.approx(1.5 * 10.5)
+    assert row.value("object_mae_mm") == pytest.approx((5 * 6.0 + 20 * 15.75) / 25)
+    assert row.interval("object_mae_mm")[0] < row.value("object_mae_mm") < row.interval("object_mae_mm")[1]
+    assert row.value("object_bias_mm") == pytest.approx(row.value("object_mae_mm"))
+    assert group.pairs[0].objects == 25 and group.pairs[0].p == 2.0**-24
+
+
+def test_a_row_without_the_unseen_objects_has_no_rank(base, benchmarks):
+    first, second, third, fourth = (two_sets(base, name, 1.0 + n, 1.0 + n) for n, name in enumerate("abcd"))
+    (group,) = rank([*first, *second, third[0], fourth[1]])
+    assert [(row.entry.name, row.ranks) for row in group.rows] == [("a", "1"), ("b", "2"), ("c", "-"), ("d", "-")]
+    assert "Rows without a result on the unseen objects have no rank" in group.unranked
+    (group,) = rank([first[0], second[0]])
+    assert "no row here has both. With 5 objects alone" in group.unranked and group.title.count("unseen") == 0
+    (group,) = rank([first[1], second[1]])
+    assert {row.ranks for row in group.rows} == {"-"} and "unseen, against" in group.title
+
+
+def test_two_methods_of_one_name_are_not_joined(base, benchmarks):
+    test, unseen = two_sets(base, "same", 1.0, 1.0)
+    about = unseen.result.submission.model_copy(update={"settings": {"weights_sha256": "1" * 64}})
+    other = replace(unseen, result=unseen.result.model_copy(update={"submission": about}))
+    with pytest.raises(SubmissionError, match=r"same-unseen.json both hold 'same'.* settings.weights_sha256 is None"):
+        rank([test, other])
+    with pytest.raises(SubmissionError, match="on the same data"):
+        rank([test, replace(test, path=base.path)])
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected"),
+    [([], 0), ([17], 0), ([0, 6, 12], 1), (range(36), 1), ([0, 50, 51], 1), ([0, 1, 2, 36], 2), (range(52), 2)],
+)
+def test_the_class_follows_from_the_frames(frames, expected):
+    assert frames_class(frames) == CLASSES[expected]
+
+
+def test_classes_and_what_was_told_are_tables_of_their_own(base):
+    errors = dict.fromkeys(EIGHT, 1.0)
+    entries = [entry_with_errors(base, errors, str(n), frames_used=list(range(n))) for n in (1, 3, 50)]
+    entries.append(entry_with_errors(base, errors, "told", uses_ground_truth_order=True))
+    groups = rank(entries)
+    assert [(group.key.frames, group.key.track) for group in groups] == [
+        (CLASSES[0], "metric"), (CLASSES[0], "oracle order"), (CLASSES[1], "metric"), (CLASSES[2], "metric")
+    ]  # fmt: skip
+
+
+def test_every_class_is_compared_with_the_best_trivial_row(base):
+    errors = dict.fromkeys(EIGHT, 10.0)
+    trivial = [entry_with_errors(base, errors | {EIGHT[0]: e}, f"constant {e}", method="constant") for e in (2.0, 90.0)]
+    liar = replace(entry_with_errors(base, dict.fromkeys(EIGHT, 0.1), "liar", method="constant"), provenance="verified")
+    rows = [entry_with_errors(base, dict.fromkeys(EIGHT, 0.9), str(n), frames_used=list(range(n))) for n in (1, 50)]
+    ratios = {row.entry.name: row.ratio for group in rank([*trivial, liar, *rows]) for row in group.rows}
+    assert ratios["1"] == ratios["50"] == pytest.approx(0.1)
+    assert ratios["constant 2.0"] == 1.0 and ratios["liar"] == pytest.approx(0.1 / 9)
+    assert {row.ratio for group in rank(rows) for row in group.rows} == {None}
+
+
+def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
+    entries = entries_of(base, {"=HYPERLINK(a)": [1.0] * 8, "b, c": [2.0] * 8})
+    paths = [tmp_path / f"{n}.json" for n in range(2)]
+    for entry, path in zip(entries, paths, strict=True):
+        write_result(entry.result, path)
+    monkeypatch.setenv("COLUMNS", "160")
+    files = ["--csv", str(tmp_path / "t.csv"), "--json", str(tmp_path / "t.json"), "--paper", "none", "--pairs"]
+    assert main(["leaderboard", *map(str, paths), *files]) == 0
+    printed = capsys.readouterr().out
+    assert "Pairs of these rows" in printed and "second is behind" in printed
+    (group,) = json.loads((tmp_path / "t.json").read_text())["groups"]
+    assert [(row["best_rank"], row["object_mae_mm"]) for row in group["rows"]] == [(1, 1.0), (2, 2.0)]
+    assert group["pairs"][0]["p"] == 2.0**-7 and group["pairs"][0]["behind"] and group["why_no_ranks"] is None
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "t.csv").read_text())))
+    assert [line["name"] for line in lines] == ["'=HYPERLINK(a)", "b, c"]
+    assert [float(line["object_mae_mm"]) for line in lines] == [1.0, 2.0]
+    assert lines[0]["ratio_to_trivial"] == "" and lines[0]["class"] == "one frame" and lines[1]["best_rank"] == "2"
+
+
+def test_pairs_over_the_objects_that_both_have():
+    (pair,) = pairs({"a": {"x": 1.0, "y": 2.0}, "b": {"y": 1.0, "z": 5.0}})
+    assert (pair.first, pair.second, pair.objects, pair.difference, pair.p) == ("b", "a", 1, 1.0, 1.0)
+    (pair,) = pairs({"a": {"x": 1.0}, "b": {"z": 5.0}})
+    assert (pair.objects, pair.p, pair.interval, pair.behind) == (0, 1.0, None, False)
+
+
+def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
+    """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
+    (row,) = rank([base])[0].rows
+    assert learned_from(base.result) == "" and uncertainty(base) == (None, None)
+    shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
+    assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
+    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5)
+    stated = SimpleNamespace(
+        uncertainty=SimpleNamespace(metrics=scores),
+        submission=SimpleNamespace(learned_from=SimpleNamespace(data="train-split")),
+    )
+    assert learned_from(stated) == "train-split"
+    assert uncertainty(SimpleNamespace(result=stated)) == (0.9, 1.5)
+
+
+def test_a_submission_may_say_that_it_was_given_the_order(base):
+    about = base.result.submission.model_dump(mode="json")
+    assert "uses_ground_truth_order" not in about
+    tracks = {}
+    for given in range(8):
+        flags = {
+            f"uses_ground_truth_{name}": bool(given >> bit & 1) for bit, name in enumerate(("range", "mask", "order"))
+        }
+        tracks[given] = Submission.model_validate({**about, **flags}).track
+    assert tracks == {
+        0: "metric", 1: "oracle range", 2: "oracle mask", 3: "oracle range + mask", 4: "oracle order",
+        5: "oracle range + order", 6: "oracle mask + order", 7: "oracle range + mask + order",
+    }  # fmt: skip
+    assert set(tracks.values()) == set(get_args(Track))
+    assert told(tracks[7]) == "the test sample's depth range, object mask and fringe order" and told("metric") == ""
+
+
+def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["leaderboard", "--paper", "oracle_order"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
+    assert "Reported by its authors (arXiv 2607.11928)" in printed
+    assert "oracle order: told the test sample's fringe order." in printed
+
+
+def test_results_of_an_earlier_protocol_keep_their_own_table(base):
+    errors = dict.fromkeys(EIGHT, 1.0)
+    entry = entry_with_errors(base, errors, "new")
+    old = replace(entry, result=entry.result.model_copy(update={"protocol_version": "0.9.0"}))
+    now, earlier = rank([old, entry])
+    assert (now.key.notes, len(earlier.key.notes)) == ([], 1) and "protocol 0.9.0" in earlier.title
+    assert "protocol" not in now.title
