@@ -42,12 +42,12 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
         "projector", response=response, pixel_blur_px=0.7, defocus_px=defocus_px, focus_m=1.6
     ).projector
     pattern, index = PatternLight.of(rig, light), rig.sequence.crossed_frames[0]
-    u, v = np.random.default_rng(3).uniform(200, 400, (2, 500))
+    u, v = np.random.default_rng(3).uniform(190, 250, (2, 500))
     distance_m = np.full(500, 2.1)
     out = np.empty((len(rig.sequence), 500))
     pattern.read(pattern.place(u, v, distance_m, rig, light), np.full(500, 2.0), out)
-    fine, image = 4, response_table(response)[family.image(912, 1140, 0)[150:450, 150:450]]
-    places = np.arange(299 * fine + 1) / fine
+    fine, image = 4, response_table(response)[family.image(912, 1140, 0)[150:290, 150:290]]
+    places = np.arange(139 * fine + 1) / fine
     whole = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=1)
     variance = light.pixel_blur_px**2 + (defocus_variance_px2(rig, light, distance_m)[0] if defocus_px else 0.0)
     area = [rig.projector_px_per_image_px(direction) ** 2 / 12 for direction in ("horizontal", "vertical")]
