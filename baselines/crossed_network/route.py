@@ -81,9 +81,9 @@ def decided_order(answers: Answers, scene: Scene, carriers: Carriers, inside: Ma
     psi = (scene.nearness * carriers.at(scene.crop).joint_gain)[grid, grid]
     further, nearer = scene.step_rad[:, grid, grid]
     phases = np.stack([psi + further, psi, psi + nearer]).astype(np.float32)
-    links = (link * np.float32(GRAPH * stride) for link in links_between(points))
+    link_x, link_y = (link * np.float32(GRAPH * stride) for link in links_between(points))
     cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
-    choice, _ = least_energy(cost, phases, *links, JUMP_RAD)
+    choice, _ = least_energy(cost, phases, link_x, link_y, JUMP_RAD)
     # A pixel takes the turn that is nearest to what its grid point chose.
     chosen_rad = repeated(of_choice(phases, choice), stride, inside.shape)
     own = scene.nearness * carriers.at(scene.crop).joint_gain
@@ -126,7 +126,7 @@ class CrossedNetRoute:
         chances = probabilities(answers)
         wrong = np.clip(1 - of_choice(chances, choice), LEAST_CHANCE, 1)
         np.put_along_axis(chances, choice[None], -1, axis=0)
-        rival = scene.nearness + of_choice(offers, chances.argmax(axis=0)) / joint
+        rival = (scene.nearness + of_choice(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
         seen.watch.done("order")
         return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong.astype(np.float32))

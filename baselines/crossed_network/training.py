@@ -89,8 +89,8 @@ def train_crossed_net(
     weights = out / WEIGHTS
     if weights.exists():
         finished = load_net(weights).config
-        scores = {key: float(value or 0) for key, value in finished.validation.items()}
-        return Trained(weights, finished.steps, finished.threshold, scores)
+        known = {key: float(value or 0) for key, value in finished.validation.items()}
+        return Trained(weights, finished.steps, finished.threshold, known)
     views = sum(len(group.views) for group in groups)
     with training.Display("rendering views", views, show) as display:
         render(groups, rig, out / VIEWS, workers, display.advance)

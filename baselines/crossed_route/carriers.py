@@ -49,8 +49,11 @@ class Carriers:
         infinity = near_rad - gain * near_q
         standoff = infinity + gain / (forward * rig.standoff_m + back_m)
         step = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)] for phase in standoff])
-        maps = wrapped(infinity), gain, forward
-        carriers = cls(rig, family, (slice(None), slice(None)), *(m.astype(np.float32) for m in maps), back_m, step)
+        everywhere = slice(None), slice(None)
+        carriers = cls(
+            rig, family, everywhere, wrapped(infinity).astype(np.float32), gain.astype(np.float32),
+            forward.astype(np.float32), back_m, step,
+        )  # fmt: skip
         span = float(np.median(carriers.joint_gain * np.abs(near_q - far_q)))
         if not span >= LEAST_RANGE_RAD:
             raise PredictionError(

@@ -94,7 +94,8 @@ class EmptySceneFit:
 def _robust(terms: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     """Least squares without outliers: the fitted values and the solution."""
     keep = np.ones(len(values), bool)
-    fitted = solution = values
+    fitted: NDArray = values
+    solution: NDArray = values
     for _ in range(ROUNDS):
         solution = np.linalg.lstsq(terms[keep], values[keep], rcond=None)[0]
         fitted = terms @ solution

@@ -51,7 +51,11 @@ def refined(
     """The fit to ``light`` (h, w), grey levels less ambient light, on the pixels ``inside``, from a first
     ``nearness``."""
     window = Window(WINDOW_PERIODS * carriers.period_px)
-    m, terms = window.moment, CURVED
+    terms = CURVED
+
+    def m(values: NDArray, along_x: int = 0, along_y: int = 0) -> NDArray:
+        return window.moment(values, along_x, along_y)
+
     raised, slope = fringes(carriers, nearness, contrast)
     # The moments of a quadratic's terms are too much alike for the elimination in single precision.
     weight = inside.astype(np.float64)

@@ -120,9 +120,9 @@ class CrossedRoute:
         beside = neighbours(found, index)
         watch.done("order")
 
-        def spread(values: NDArray) -> Image:
+        def spread(values: NDArray) -> NDArray:
             """Values of the grid at all pixels, each that of its grid point or of the nearest one inside."""
-            return repeated(values[..., *nearest], self.stride, (*values.shape[:-2], *grey.shape))
+            return repeated(values[..., nearest[0], nearest[1]], self.stride, (*values.shape[:-2], *grey.shape))
 
         nearest: tuple[NDArray, ...] = tuple(np.indices(points.shape))
         if points.any() and not points.all():
@@ -140,8 +140,8 @@ class CrossedRoute:
             carriers=carriers, shape=image.shape, grey=grey, background=background, inside=inside, fit=fit,
             phase_rad=phase_rad, modulation=spread(modulation), contrast=contrast, margin=spread(margin),
             evidence=spread(evidence), rival=spread(rival(found, index)),
-            candidates=Candidates(*(spread(values) for values in vars(beside).values())),
-            clipped_share=clipped_share, watch=watch,
+            candidates=Candidates(spread(beside.nearness), spread(beside.misfit_rad), spread(beside.exists)),
+            clipped_share=clipped_share.astype(np.float32), watch=watch,
         )  # fmt: skip
 
     def conclude(self, seen: CrossedObservation, wrong_chance: Image | None = None) -> CrossedMeasurement:
@@ -189,16 +189,18 @@ class CrossedRoute:
         unit = float(np.median(joint))
         on_object, psi, nearest = self.resampling.restored_phase((nearness * unit).astype(np.float64), known)
         depth_mm = Carriers.of(self.resampling.captured, self.family).depth_mm(psi / unit)
-        maps = {
-            name: np.where(on_object, nearest(getattr(measured, name)), 0).astype(np.float32)
-            for name in ("sigma_mm", "confidence", "wrong_chance", "brightness_grey")
-        }
-        size = self.resampling.captured.camera.width, self.resampling.captured.camera.height
-        reason = cv2.resize(measured.reason, size, interpolation=cv2.INTER_NEAREST_EXACT)
+
+        def restored(values: Image) -> Image:
+            return np.where(on_object, nearest(values), 0).astype(np.float32)
+
+        reason = nearest(measured.reason)
+        reason[~on_object] = CrossedReason.BACKGROUND
         counts = np.bincount(reason.ravel(), minlength=len(CrossedReason))
         return replace(
             measured, depth_mm=np.where(on_object, np.nan_to_num(depth_mm), 0).astype(np.float32), reason=reason,
-            counts={code.name.lower(): int(counts[code]) for code in CrossedReason}, **maps,
+            counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
+            sigma_mm=restored(measured.sigma_mm), confidence=restored(measured.confidence),
+            wrong_chance=restored(measured.wrong_chance), brightness_grey=restored(measured.brightness_grey),
         )  # fmt: skip
 
     def _reasons(
