@@ -200,7 +200,7 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
     hardware, views = describe_hardware(), list(plan.views.names)
     # What two sittings of a run must share. Their groups may differ: a later sitting can add a group.
     about = {
-        "tradeoff": 1, "package": __version__, "dataset": plan.opened.fingerprint, "views": views,
+        "tradeoff": 2, "package": __version__, "dataset": plan.opened.fingerprint, "views": views,
         "rules": asdict(rules), "cpu": hardware.cpu, "cores": hardware.cores,
     }  # fmt: skip
     cv2.setNumThreads(settings.threads)  # the phase route's filters take all threads by default; torch: see networks

@@ -212,8 +212,8 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
     for sample, scores in recomputed.per_sample.items():
         for key in protocol.UNCERTAINTY:
             first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
-            # The area between two curves is a small difference of large numbers.
-            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 0.0):
+            # The area between two curves is a small difference of large numbers, and a likelihood may be near 0.
+            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 1e-12):
                 texts = f"{_value_text(first)} in the result, {_value_text(second)} recomputed"
                 lines.append(f"{sample}: uncertainty.{key}: {texts}")
     return lines

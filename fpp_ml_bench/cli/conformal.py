@@ -40,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
     found = score.calibrate(args.calibration, dataset, args.calibrate, args.coverage, args.target)
     samples = score.write_calibrated(found, args.folder, dataset, args.split, args.out)
     share, most = f"{100 * found.coverage:g}%", 100 * score.largest_coverage(found.objects)
-    supports = f"{score.counted(found.objects)} can support at most {most:.1f}%"
-    print(f"{args.calibration}: {found.samples} samples; {supports}")
+    print(f"{args.calibration}: {found.samples} samples")
+    print(f"  {score.counted(found.objects)} can support at most {most:.1f}%")
     print(f"  {100 * found.before:.1f}% of the pixels are in their {share} interval as it was stated")
     print(
         f"  factor {found.factor:.4g}: the {share} interval of a new object's pixel holds in {share} of cases or more,"

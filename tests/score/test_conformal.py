@@ -18,7 +18,7 @@ def test_the_quantile_weighs_objects_alike_and_their_views_alike():
     for coverage, expected in ((0.16, 1.0), (0.18, 2.0), (0.27, 3.0), (0.6, 4.0), (0.62, 9.0), (2 / 3, 9.0)):
         assert conformal_quantile(scores, coverage) == expected, coverage
     with pytest.raises(
-        PredictionError, match=r"2 calibration objects support a coverage of at most 66.7%, 68% was asked"
+        PredictionError, match=r"2 calibration objects can support a coverage of at most 66.7%, 68% was asked"
     ):
         conformal_quantile(scores, 0.68)
 
@@ -68,7 +68,7 @@ def command(folders, dataset, out, *arguments):
 def test_the_command_scales_sigma_and_nothing_else(folders, dataset, tmp_path, capsys):
     assert command(folders, dataset, tmp_path / "out", "--coverage", "0.5") == 0
     said = capsys.readouterr().out
-    assert "2 samples; 1 calibration object can support at most 50.0%" in said
+    assert "1 calibration object can support at most 50.0%" in said
     found = calibrate(folders[1], dataset, coverage=0.5)
     # With one object, 50% need all of it: the factor is its largest score.
     assert found.factor * gaussian_quantile(0.5) == pytest.approx(4 * 3.5, rel=0.4)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from extended_precision import sample_scores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
@@ -9,82 +10,6 @@ from scored_dataset import disk_depth
 
 from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED, SINCE_2
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-
-LONG = np.longdouble
-
-
-def edges_of(target):
-    """Pixels beside a depth edge, from shifted copies: written anew from PROTOCOL.md."""
-    jump = 10.0 * 960 / target.shape[1]
-    marked = np.zeros(target.shape, bool)
-    for axis, length in enumerate(target.shape):
-        for place in range(length - 1):
-            first, second = (np.take(target, place + step, axis) for step in (0, 1))
-            crossed = ((first > 0) != (second > 0)) | ((first > 0) & (second > 0) & (np.abs(second - first) > jump))
-            for step in (0, 1):
-                index = [slice(None)] * 2
-                index[axis] = place + step
-                marked[tuple(index)] |= crossed
-    return marked
-
-
-def reference(prediction, target, band, void, unlit):
-    """All scores in float128 by sorting and masking; None for an empty set."""
-    error = prediction.astype(LONG) - target.astype(LONG)
-    inside, outside, edges = (target > 0) & ~void, (target == 0) & ~void, edges_of(target)
-    distance = ndimage.distance_transform_edt(~edges) if edges.any() else np.full(target.shape, np.inf)
-    valid = inside & (prediction > 0)
-
-    def mae(pixels):
-        return np.abs(error[pixels]).mean() if pixels.any() else None
-
-    def rmse(pixels):
-        return np.sqrt((error[pixels] ** 2).mean()) if pixels.any() else None
-
-    def share(part, whole):
-        return LONG(np.count_nonzero(part)) / np.count_nonzero(whole) if whole.any() else None
-
-    core, near = inside & (distance >= band), inside & (distance < band)
-    wide, deep = inside & (distance < 8), inside & (distance >= 8)
-    scores = {
-        "overall_mae_mm": mae(~void), "overall_rmse_mm": rmse(~void),
-        "object_mae_mm": mae(inside), "object_rmse_mm": rmse(inside),
-        "background_mae_mm": mae(outside), "background_rmse_mm": rmse(outside),
-        "object_interior_mae_mm": mae(core), "object_interior_rmse_mm": rmse(core),
-        "object_edge_mae_mm": mae(near), "object_edge_rmse_mm": rmse(near),
-        "object_valid_mae_mm": mae(valid), "object_interior_valid_mae_mm": mae(valid & core),
-        "object_edge_share": share(near, inside), "object_missing_share": share(inside & ~valid, inside),
-        "object_interior_missing_share": share(core & ~valid, core),
-        "object_wide_band_mae_mm": mae(wide), "object_wide_interior_mae_mm": mae(deep),
-        "object_wide_band_share": share(wide, inside),
-        "object_bias_mm": error[inside].mean() if inside.any() else None,
-        "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
-    }  # fmt: skip
-    dark = unlit > 0
-    far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
-    lit = dark & (prediction > 0)
-    scores["void_share"] = LONG(np.count_nonzero(void)) / void.size
-    if dark.any():
-        scores |= {"unlit_mae_mm": far[dark].mean(), "unlit_rmse_mm": np.sqrt((far[dark] ** 2).mean())}
-        scores["unlit_missing_share"] = share(dark & ~lit, dark)
-    if lit.any():
-        scores["unlit_valid_mae_mm"] = far[lit].mean()
-    ordered, signed = np.sort(np.abs(error[inside])), np.sort(error[inside])
-
-    def quantile(values, level):
-        place = LONG(level) * (values.size - 1)
-        low = int(np.floor(place))
-        high = min(low + 1, values.size - 1)
-        return values[low] + (values[high] - values[low]) * (place - low)
-
-    some = bool(ordered.size)
-    scores["object_median_mm"] = quantile(ordered, LONG(1) / 2) if some else None
-    scores["object_p95_mm"] = quantile(ordered, LONG(95) / 100) if some else None
-    scores["object_max_mm"] = ordered[-1] if some else None
-    for limit in (1, 2, 5, 10):
-        scores[f"object_within_{limit}mm_share"] = share(ordered <= limit, np.ones(ordered.size, bool))
-    scores["object_shift_free_mae_mm"] = np.abs(signed - quantile(signed, LONG(1) / 2)).mean() if some else None
-    return scores
 
 
 @st.composite
@@ -114,7 +39,7 @@ def cases(draw):
 @settings(max_examples=200, deadline=None)
 def test_every_score_agrees_with_float128_to_1e_minus_10(case):
     scores = score_sample(*case).metrics()
-    expected = reference(*case)
+    expected = sample_scores(*case)
     assert set(scores) == set(expected) and {*METRICS} - {*SINCE_2} <= set(scores) <= set(METRICS)
     scale = float(expected["object_mae_mm"] or 0)
     for key, value in expected.items():

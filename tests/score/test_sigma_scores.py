@@ -1,11 +1,10 @@
 """Scores of a stated uncertainty: against an independent computation in extended precision, and on known predictors."""
 
 import json
-from fractions import Fraction
 
-import mpmath
 import numpy as np
 import pytest
+from extended_precision import sigma_scores
 from scored_dataset import make_dataset, write_description
 
 from fpp_ml_bench.cli.evaluate import main
@@ -14,8 +13,6 @@ from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL, UNCERTAINTY
 from fpp_ml_bench.evaluation.report import write_report
 from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
 from fpp_ml_bench.evaluation.score import evaluate, score_sigma
-
-LONG = np.longdouble
 
 
 def case(number, pixels=(23, 31)):
@@ -28,54 +25,9 @@ def case(number, pixels=(23, 31)):
     return prediction.astype(np.float32), target.astype(np.float32), sigma.astype(np.float32), rng.random(pixels) < 0.1
 
 
-def quantile(coverage):
-    return LONG(mpmath.nstr(mpmath.sqrt(2) * mpmath.erfinv(mpmath.mpf(str(coverage))), 25))
-
-
-def left_out(values, order, share):
-    """Mean of ``values`` once ``share`` of them is left out, largest ``order`` first, equals in equal parts."""
-    weights, budget = np.zeros(values.size, LONG), share * values.size
-    for key in sorted(set(order), reverse=True):
-        group = order == key
-        count = int(np.count_nonzero(group))
-        taken = min(budget, Fraction(count))
-        budget -= taken
-        kept = 1 - taken / count
-        weights[group] = LONG(kept.numerator) / LONG(kept.denominator)
-    return (weights * values).sum() / weights.sum()
-
-
-def reference(prediction, target, sigma, void):
-    """Every score in extended precision, from PROTOCOL.md."""
-    inside = (target > 0) & ~void
-    depth, true, spread = (values[inside].astype(LONG) for values in (prediction, target, sigma))
-    error = np.abs(depth - true)
-    stated = (depth > 0) & (spread > 0)
-    scores = {"unstated_share": LONG(np.count_nonzero(~stated)) / stated.size}
-    unsure = np.where(stated, spread, np.inf)
-    for name, values, finish in (("mae_mm", error, lambda mean: mean), ("rmse_mm", error**2, np.sqrt)):
-        gaps = []
-        for step in range(20):
-            pair = [finish(left_out(values, order, Fraction(step, 20))) for order in (unsure, error)]
-            gaps.append(pair[0] - pair[1])
-            if step == 1:
-                scores[f"sure_{name}"] = pair[0]
-        scores[f"ause_{name}"] = sum(gaps) / 20
-    error, spread = error[stated], spread[stated]
-    for percent in COVERED:
-        scores[f"coverage_{percent}"] = LONG(np.count_nonzero(error <= quantile(percent / 100) * spread)) / error.size
-    ordered = np.sort(spread)
-    scores["sigma_mean_mm"] = spread.mean()
-    scores["sigma_median_mm"] = (ordered[(error.size - 1) // 2] + ordered[error.size // 2]) / 2
-    floored = np.maximum(spread, LONG("0.01"))
-    ratio = np.minimum(error / floored, LONG(10))
-    scores["nll"] = (np.log(floored) + np.log(2 * LONG("3.14159265358979323846")) / 2 + ratio**2 / 2).mean()
-    return scores
-
-
 @pytest.mark.parametrize("number", range(6))
 def test_every_score_agrees_with_extended_precision(number):
-    expected, computed = reference(*case(number)), score_sigma(*case(number)).scores
+    expected, computed = sigma_scores(*case(number)), score_sigma(*case(number)).scores
     assert set(expected) == set(computed) == set(UNCERTAINTY)
     for key, value in expected.items():
         assert computed[key] == pytest.approx(float(value), rel=1e-9), key

@@ -1,0 +1,120 @@
+"""A whole evaluation against one in extended precision that shares no code with it, and the perfect prediction."""
+
+import statistics
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from extended_precision import sample_scores, sigma_scores
+from scored_dataset import make_dataset, write_description
+
+from fpp_ml_bench.evaluation.protocol import METRICS, UNCERTAINTY
+from fpp_ml_bench.evaluation.score import evaluate
+
+SIZE = (48, 56)
+
+
+def flagged(depth):
+    """Every seventh row of the object unlit, every ninth column mixed, and flags that are not void."""
+    flags = np.full(depth.shape, 4 | 8, np.uint8)
+    flags[::7][depth[::7] > 0] |= 1
+    flags[:, ::9] |= 2
+    return flags
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE, flagged=flagged)
+
+
+def maps_of(dataset, sample, target):
+    """Target, void pixels and the depth of the unlit ones (0 elsewhere, or without an exact target)."""
+    depth, flags = dataset.depth_mm(sample), dataset.flags(sample)
+    exact = dataset.depth_mm(sample, "depth_exact")
+    true = depth if target == "depth" else np.where(depth > 0, exact, 0)
+    unlit = np.where(((flags & 1) > 0) & (target == "depth_exact"), exact, 0)
+    return true, (flags & 3) > 0, unlit
+
+
+def write(folder, dataset):
+    folder.mkdir()
+    for number, sample in enumerate(dataset.samples("test")):
+        rng, exact = np.random.default_rng(number), dataset.depth_mm(sample, "depth_exact")
+        sigma = rng.choice([0.0, 0.5, 1.0, 3.0], SIZE)
+        predicted = (exact + sigma * rng.normal(size=SIZE) + 300 * (rng.random(SIZE) < 0.02)) * (
+            rng.random(SIZE) < 0.95
+        )
+        np.save(folder / f"{sample}.npy", predicted.astype(np.float32))
+        np.save(folder / f"{sample}.sigma.npy", sigma.astype(np.float32))
+    write_description(folder)
+    return folder
+
+
+def exactly(values):
+    """Sum of floats without rounding, as a fraction."""
+    return sum(map(Fraction, values), Fraction(0))
+
+
+@pytest.mark.parametrize("target", ["depth", "depth_exact"])
+def test_every_score_of_an_evaluation(target, dataset, tmp_path):
+    folder = write(tmp_path / "p", dataset)
+    result = evaluate(folder, dataset, target=target)
+    rows, stated = {}, {}
+    for row in result.per_sample:
+        predicted, sigma = (np.load(folder / f"{row.sample}{suffix}") for suffix in (".npy", ".sigma.npy"))
+        true, void, unlit = maps_of(dataset, row.sample, target)
+        rows[row.sample] = sample_scores(predicted, true, 3, void, unlit)
+        stated[row.sample] = sigma_scores(predicted, true, sigma, void)
+        for key in METRICS:
+            expected, rounding = rows[row.sample].get(key), 1e-9 if "bias" in key else 0
+            assert getattr(row, key) == (expected and pytest.approx(float(expected), rel=1e-9, abs=rounding)), key
+        for key in UNCERTAINTY:
+            computed = getattr(result.uncertainty.per_sample[row.sample], key)
+            assert computed == pytest.approx(float(stated[row.sample][key]), rel=1e-9), key
+    for key in METRICS:
+        values = [float(row[key]) for row in rows.values() if row.get(key) is not None]
+        if values:
+            mean, rounding = float(exactly(values) / len(values)), 1e-9 if "bias" in key else 0
+            assert getattr(result.metrics, key) == pytest.approx(mean, rel=1e-9, abs=rounding), key
+            assert getattr(result.median, key) == pytest.approx(statistics.median(values), rel=1e-9, abs=rounding), key
+    for name in ("power_drill", "wooden_boards"):
+        views = [sample for sample in rows if sample.startswith(name)]
+        of_object = next(part for part in result.per_object if part.object == name)
+        mae = exactly(float(rows[view]["object_mae_mm"]) for view in views) / len(views)
+        assert of_object.metrics.object_mae_mm == pytest.approx(float(mae), rel=1e-9)
+        covered = exactly(float(stated[view]["coverage_95"]) for view in views) / len(views)
+        assert result.uncertainty.per_object[name].coverage_95 == pytest.approx(float(covered), rel=1e-9)
+    for key in UNCERTAINTY:
+        mean = float(exactly(float(scores[key]) for scores in stated.values()) / len(stated))
+        assert getattr(result.uncertainty.metrics, key) == pytest.approx(mean, rel=1e-9), key
+    sums = [Fraction(0), Fraction(0)]
+    for row in result.per_sample:
+        predicted, (true, void, _) = np.load(folder / f"{row.sample}.npy"), maps_of(dataset, row.sample, target)
+        inside = (true > 0) & ~void
+        errors = [
+            abs(Fraction(float(p)) - Fraction(float(t))) for p, t in zip(predicted[inside], true[inside], strict=True)
+        ]
+        sums[0], sums[1] = sums[0] + sum(errors), sums[1] + len(errors)
+    assert result.pooled.object_mae_mm == pytest.approx(float(sums[0] / sums[1]), rel=1e-9)
+
+
+@pytest.mark.parametrize("target", ["depth", "depth_exact"])
+@pytest.mark.parametrize("mode", ["standard", "paper"])
+def test_the_perfect_prediction_scores_0(mode, target, dataset, tmp_path):
+    folder = tmp_path / "p"
+    folder.mkdir()
+    for sample in dataset.samples("test"):
+        true, _, unlit = maps_of(dataset, sample, target)
+        np.save(folder / f"{sample}.npy", true + unlit)
+        np.save(folder / f"{sample}.sigma.npy", np.ones(SIZE))
+    write_description(folder)
+    result = evaluate(folder, dataset, target=target, mode=mode)
+    if mode == "paper":  # which knows unlit pixels as background only
+        assert result.metrics.object_rmse_mm == 0
+        return
+    for scores in (result.metrics, result.median, result.pooled, *result.per_sample):
+        errors = {value for key, value in scores.model_dump().items() if key.endswith("_mm")}
+        assert errors - {None} == {0.0}
+    uncertainty = result.uncertainty.metrics.model_dump()
+    assert {uncertainty[key] for key in UNCERTAINTY if key.startswith(("ause", "sure"))} == {0.0}
+    assert uncertainty["coverage_68"] == 1.0
