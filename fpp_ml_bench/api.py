@@ -292,7 +292,7 @@ def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[
     Returns
     -------
     list of Group
-        Each with its ``rows`` in order; ranks that an interval can't tell apart are tied.
+        Each with its ``rows`` in order of rank, the tests of all ``pairs``, and why rows have no rank (``unranked``).
 
     Raises
     ------

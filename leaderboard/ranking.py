@@ -128,15 +128,12 @@ def _no_ranks(key: GroupKey, rows: Sequence[Ranked], ranked: Sequence[Ranked], s
     """Why a table has no ranks; empty where it has."""
     if sort not in METRICS:
         return f"No ranks by {sort}: the order is that of the values."
-    objects = max(len(row.objects) for row in rows)
-    if not ranked and key.takes_unseen:
-        how = f"No ranks: they need the test objects and those of {UNSEEN}, and no row here has both."
-        reach = f" With {objects} objects alone the smallest p value of a test is {2.0 ** (1 - objects):g}, above 5%."
-        return how + (reach if objects < FEWEST_OBJECTS else "")
-    if objects < FEWEST_OBJECTS:
-        noun = "object" if objects == 1 else "objects"
-        return (
-            f"No ranks: with {objects} {noun} the smallest p value of a test is {2.0 ** (1 - objects):g}, above 5%. "
-            "Each row's interval is its own."
-        )
+    objects = max(len(row.objects) for row in ranked or rows)
+    smallest = f"With {objects} object{'s' * (objects != 1)} the smallest p value of a test is {2.0 ** (1 - objects):g}"
+    too_few = f" {smallest}, above 5%." if objects < FEWEST_OBJECTS else ""
+    if key.takes_unseen and len(ranked) < 2:
+        how_many = "no row here has both" if not ranked else "only one row here has both"
+        return f"No ranks: they need the test objects and those of {UNSEEN}, and {how_many}.{too_few}"
+    if too_few:
+        return f"No ranks.{too_few} Each row's interval is its own."
     return "" if len(ranked) > 1 else "No ranks: there are not two rows to compare."

@@ -26,7 +26,7 @@ PAPER_TITLES = (
     "Backgr. RMSE",
 )  # fmt: skip
 PAPER_TEXT_COLUMNS = 2
-PAIR_TITLES = ("First", "Second", "Second - first, mm", "95% interval", "p", "p, Holm", "Objects", "Verdict")
+PAIR_TITLES = ("First", "Second", "Second - first", "95% interval", "p", "p, Holm", "Objects", "Verdict")
 PAIR_TEXT_COLUMNS = 2
 _PLAIN = frozenset(" -,+()/%=.")
 

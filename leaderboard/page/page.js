@@ -51,14 +51,14 @@
     const search = document.getElementById("q").value.trim().toLowerCase();
     const chosen = selects.filter((select) => select.value);
     const boxes = all("input[name=provenance]", form);
-    const allowed = new Set(boxes.filter((box) => box.checked).map((box) => box.value));
+    const refused = boxes.filter((box) => !box.checked).map((box) => box.value);
     const shown = new Set();
     let count = 0;
     tables.forEach((table) => {
       const rows = all("tbody tr", table);
       rows.forEach((row) => {
         const data = row.dataset;
-        row.hidden = !(data.search.includes(search) && allowed.has(data.provenance)
+        row.hidden = !(data.search.includes(search) && !refused.includes(data.provenance)
           && chosen.every((select) => data[select.name] === select.value));
         if (!row.hidden) shown.add(row.id);
       });
@@ -69,7 +69,7 @@
     all("[data-of]").forEach((row) => { row.hidden = !shown.has(row.dataset.of); });
     const message = shown.size === count ? "" : shown.size + " of " + count + " rows shown";
     document.getElementById("shown").textContent = message;
-    const entries = { q: search, hide: boxes.filter((box) => !box.checked).map((box) => box.value).join(",") };
+    const entries = { q: search, hide: refused.join(",") };
     for (const select of selects) entries[select.name] = select.value;
     for (const [key, value] of Object.entries(entries)) value ? state.set(key, value) : state.delete(key);
   }

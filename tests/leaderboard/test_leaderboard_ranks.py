@@ -107,7 +107,7 @@ def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
     objects = EIGHT[:5]
     (group,) = rank(entries_of(base, {"a": [1.0] * 5, "b": [9.0] * 5}, objects))
     assert [row.ranks for row in group.rows] == ["-", "-"] and group.pairs == ()
-    assert "with 5 objects the smallest p value of a test is 0.0625" in group.unranked
+    assert "With 5 objects the smallest p value of a test is 0.0625" in group.unranked
     (group,) = rank(entries_of(base, {"a": [1.0] * 6, "b": [9.0] * 6}, EIGHT[:6]))
     assert [row.ranks for row in group.rows] == ["1", "2"] and group.unranked == ""
 
@@ -150,7 +150,9 @@ def test_a_row_without_the_unseen_objects_has_no_rank(base, benchmarks):
     assert [(row.entry.name, row.ranks) for row in group.rows] == [("a", "1"), ("b", "2"), ("c", "-"), ("d", "-")]
     assert "Rows without a result on the unseen objects have no rank" in group.unranked
     (group,) = rank([first[0], second[0]])
-    assert "no row here has both. With 5 objects alone" in group.unranked and group.title.count("unseen") == 0
+    assert "no row here has both. With 5 objects the smallest" in group.unranked and group.title.count("unseen") == 0
+    (group,) = rank([*first, second[0]])
+    assert "only one row here has both." in group.unranked and {row.ranks for row in group.rows} == {"-"}
     (group,) = rank([first[1], second[1]])
     assert {row.ranks for row in group.rows} == {"-"} and "unseen, against" in group.title
 

@@ -10,6 +10,7 @@ from chromium import Browser
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.leaderboard.page import page as page_module
 from fpp_ml_bench.leaderboard.page import write_page
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.reported import chosen_tables
@@ -233,21 +234,19 @@ def findings(browser, axe) -> list[str]:
 def ranked_page(tmp_path_factory):
     """A page with ranks, pairs and both test sets."""
     work = tmp_path_factory.mktemp("ranked")
-    base = read_entries([write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0, timing=timing(3.0))])[
-        0
-    ]
-    named = (
-        Benchmark("fpp-bench-full", 1, "full", 40, "f" * 64),
-        Benchmark("fpp-bench-unseen", 1, "unseen", 40, "e" * 64),
-    )
+    file = write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0, timing=timing(3.0))
+    (base,), full, unseen = read_entries([file]), "f" * 64, "e" * 64
+    named = (Benchmark("fpp-bench-full", 1, "full", 40, full), Benchmark("fpp-bench-unseen", 1, "unseen", 40, unseen))
     rows = []
     for number, name in enumerate(("first", "second", "third")):
-        for objects, data in ((5, "f" * 64), (20, "e" * 64)):
+        for objects, data in ((5, full), (20, unseen)):
             errors = {f"{data[0]} {n}": (1 + n) * (1 + number) for n in range(objects)}
             entry = entry_with_errors(base, errors, name, data, method="constant" if number == 2 else name)
             rows.append(replace(entry, path=work / f"{name}-{objects}.json"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark, "BENCHMARKS", named)
+        learned = {"first": "generated", "second": "train-split"}
+        patch.setattr(page_module, "learned_from", lambda result: learned.get(result.submission.name, ""))
         write_page(rank(rows), chosen_tables(None), work / "page")
     return work / "page" / "index.html"
 
@@ -260,6 +259,16 @@ def test_axe_finds_nothing(browser, axe, page, ranked_page):
     for path, width, dark in ((page, 1440, False), (ranked_page, 375, True), (own_page, 768, False)):
         browser.open(path, width, 900, dark)
         assert findings(browser, axe) == []
+
+
+def test_rows_by_what_they_learned_from(browser, ranked_page):
+    browser.open(ranked_page.resolve().as_uri() + "#learned=train-split")
+    assert browser.run(NAMES) == ["second"]
+    assert browser.run("document.querySelector('.ranking tbody tr:not([hidden]) th small').innerText") == (
+        "learned from: train-split"
+    )
+    browser.open(ranked_page.resolve().as_uri() + "#learned=not+said")
+    assert browser.run(NAMES) == ["third"]
 
 
 def test_ranks_parts_and_pairs_are_on_the_page(browser, ranked_page):
