@@ -19,8 +19,9 @@ import scipy.io
 from numpy.typing import NDArray
 from PIL import Image
 
-from fpp_ml_bench import calibration, decoding, optics
+from fpp_ml_bench import calibration, coding, decoding, optics
 from fpp_ml_bench.baselines import robustness
+from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.phase_route import PhaseMethod
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.loaders import captures, render
@@ -33,7 +34,11 @@ BOARD = f"projector: {{width: 1824, height: 1140}}\nsequence: {{vertical: {VERTI
 SEQUENCES = {
     "skull_2x3": f"{{vertical: {VERTICAL}}}",
     "skull_gray": "{order: [white, black, vertical], vertical: {scheme: gray, cell_px: 2, bits: 10}}",
+    "board": f"{{order: [vertical, horizontal], vertical: {VERTICAL}, horizontal: {HORIZONTAL}}}",
 }
+BOARD_MARGIN_MM = 15.0  # beyond the nearest and farthest corner of a pose, for the range that a frame is measured in
+WRONG_ORDER_MM = 30.0
+"""Half a period of the finer carrier is 40 mm and more of depth at these distances."""
 RANGE_MM = (300.0, 500.0)
 
 
@@ -52,12 +57,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         ours = calibrate(args.captures / "calibration", theirs, Path(scratch), args.out)
         cloud = scipy.io.loadmat(args.captures / "skull_gray" / "pointCloud.mat")["xyz"].astype(np.float64)
-        for name in SEQUENCES:
+        for name in ("skull_2x3", "skull_gray"):
             for who, found in (("authors", theirs), ("ours", ours)):
                 rig = rig_of(found, name, Path(scratch))
                 decode(args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}")
         twin(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
         one_frame(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
+        crossed_frames(args.captures / "calibration", rig_of(theirs, "board", Path(scratch)))
     return 0
 
 
@@ -211,6 +217,31 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
                   f"{in_range.sum():,} px, median error {median:.2f} mm, wrong orders (over {half_mm:.0f} mm) "
                   f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%; outside the object "
                   f"{(given & ~on_object).sum():,} px; {seconds:.1f} s")  # fmt: skip
+
+
+def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
+    """The crossed route on the mean of a vertical and a horizontal fringe of each board pose: a frame with both, on a
+    printed checkerboard. Against the depth that all twelve frames give, in the range that the board spans."""
+    for number in range(1, 7):
+        frames = captures.read_frames(folder / f"calseq{number}", count=len(rig.sequence)).frames
+        decoded = decoding.decode_stack(frames, rig, threads=2)
+        on_board = decoded.depth_mm > 0
+        near, far = np.percentile(decoded.depth_mm[on_board], (1, 99))
+        ranged = rig.with_range((float(near) - BOARD_MARGIN_MM, float(far) + BOARD_MARGIN_MM))
+        route = CrossedRoute(ranged)
+        vertical, horizontal = (np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]])
+                                for way in ("vertical", "horizontal"))  # fmt: skip
+        started = perf_counter()
+        measured = route.measure(coding.crossed_from_pair(horizontal, vertical), on_board)
+        seconds = perf_counter() - started
+        both = on_board & (measured.depth_mm > 0)
+        error = np.abs(measured.depth_mm - decoded.depth_mm)[both]
+        wrong = error > WRONG_ORDER_MM
+        confident = wrong & (measured.sigma_mm[both] < robustness.corruptions().confident_below * error)
+        print(f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to {ranged.working_range_mm[1]:.0f} "
+              f"mm: answered {100 * both.sum() / on_board.sum():.1f}% of {on_board.sum():,} px, median error "
+              f"{np.median(error):.2f} mm, wrong orders {100 * wrong.mean():.2f}%, confident errors "
+              f"{100 * confident.mean():.3f}%; {seconds:.1f} s")  # fmt: skip
 
 
 if __name__ == "__main__":
