@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines import TRIVIAL
 from fpp_ml_bench.baselines.diagnostics import VIEWS_PER_OBJECT, SceneSet, measure
 from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.baselines.networks import (
@@ -117,6 +118,8 @@ class Materials:
     def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneSet]:
         """The row's method, built again, and the scenes to measure it on. FppBenchError where it can't be built."""
         about = entry.result.submission
+        if about.method in TRIVIAL:
+            raise FppBenchError("a trivial method: it looks at no fringe")
         if about.method in METHODS:
             scenes = self.scenes_of(entry, anywhere=True)
             return load_method(about.method, scenes.dataset.rig, **_options(about.settings)), scenes

@@ -107,16 +107,17 @@ def _check_one_method(first: Entry, second: Entry) -> None:
     both = f"{files[0]} and {files[1]} both hold {printable(first.name)!r}"
     if first.result.dataset.fingerprint == second.result.dataset.fingerprint:
         raise SubmissionError(f"{both} on the same data; leave one out, or give one another name")
-    one, other = first.result.submission, second.result.submission
-    for what, a, b in (
-        ("method", one.method, other.method),
-        ("frames_used", sorted(one.frames_used), sorted(other.frames_used)),
-        ("settings.weights_sha256", one.settings.get("weights_sha256"), other.settings.get("weights_sha256")),
+    about_first, about_second = first.result.submission, second.result.submission
+    weights = "weights_sha256"
+    for what, of_first, of_second in (
+        ("method", about_first.method, about_second.method),
+        ("frames_used", sorted(about_first.frames_used), sorted(about_second.frames_used)),
+        (f"settings.{weights}", about_first.settings.get(weights), about_second.settings.get(weights)),
     ):
-        if a != b:
+        if of_first != of_second:
             raise SubmissionError(
-                f"{both}, on the test and on the unseen objects, but {what} is {printable(str(a))} and "
-                f"{printable(str(b))}; run both with the same method, or give one another name"
+                f"{both}, on the test and on the unseen objects, but {what} is {printable(str(of_first))} and "
+                f"{printable(str(of_second))}; run both with the same method, or give one another name"
             )
 
 

@@ -23,18 +23,18 @@ _SHADES = 6
 def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
     """What the template needs of each dataset: its title, notes on earlier data or rules, the pictures of all its rows,
     and its tables."""
-    found = []
+    datasets = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
         rows = [row for group in of_data for row in group.rows]
-        found.append({
+        datasets.append({
             "numbered": [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)],
             "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
             "title": data, "notes": of_data[0].key.notes, "figures": overview_figures(of_data, slugs),
             "targets": sorted({group.key.against for group in of_data}),
             "sections": [_section(group, _link(group, of_data)) for group in of_data],
         })  # fmt: skip
-    return found
+    return datasets
 
 
 def anchor(group: Group) -> str:
