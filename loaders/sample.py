@@ -52,9 +52,13 @@ class Flag(IntFlag):
 VOID = Flag.UNLIT | Flag.MIXED
 
 
-def void_pixels(flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Pixels that are void, neither object nor background, bool (H, W), of the `Flag`s of each."""
-    return (flags & np.uint8(VOID)) != 0
+def void_pixels(
+    flags: NDArray[np.uint8], depth_mm: NDArray | None = None, exact_mm: NDArray | None = None
+) -> NDArray[np.bool_]:
+    """Pixels that count in no score, bool of the shape of ``flags``: those flagged `VOID`; and, with both depths, the
+    surface (``exact_mm`` above 0) that is lit too weakly for the full sequence to decode it (``depth_mm`` 0)."""
+    void: NDArray[np.bool_] = (flags & np.uint8(VOID)) != 0
+    return void if depth_mm is None or exact_mm is None else void | ((exact_mm > 0) & (depth_mm == 0))
 
 
 @dataclass

@@ -31,6 +31,8 @@ from fpp_ml_bench.optics import Rig
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
 JUMP_RAD = 2.5  # jump of the joint phase between neighbours from which on it costs no more
+DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
+PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders
 LEAST_CHANCE = 1e-6  # of a wrong order, whatever the network answers
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
 
@@ -60,9 +62,11 @@ def network_answers(network: PhaseNet, scene: Scene, carriers: Carriers, lead: f
     return Answers(np.where(exists, order, -np.inf), inside, correction, SCALE_TO_SIGMA * np.exp(scale))
 
 
-def decided_mask(answers: Answers, threshold: float) -> Mask:
-    """Object pixels (h, w): those whose logit is above ``threshold``."""
-    return answers.object_logit > threshold
+def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
+    """Object pixels (h, w): those whose logit is above ``threshold``, and those of the measured route's mask whose
+    logit is at most `DENIED` below it."""
+    logit = answers.object_logit
+    return (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
 
 
 def probabilities(answers: Answers) -> Image:
@@ -115,8 +119,10 @@ class CrossedNetRoute:
     def conclude(self, seen: CrossedObservation, scene: Scene, answers: Answers) -> CrossedMeasurement:
         """The measurement from the network's answers."""
         joint = seen.carriers.joint_gain
-        inside = decided_mask(answers, self.threshold)
-        choice = decided_order(answers, scene, self.route.carriers, inside, self.route.stride)
+        inside = decided_mask(answers, scene, self.threshold)
+        # Orders are labelled on all that may be object: a hole in the mask must not part a surface.
+        perhaps = scene.inside | (answers.object_logit > self.threshold - PERHAPS)
+        choice = decided_order(answers, scene, self.route.carriers, perhaps, self.route.stride)
         offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
         nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint
         known = scene.share > LEAST_SHARE

@@ -151,7 +151,7 @@ def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float
     joint = part.joint_gain
     offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
     change = of_choice(offers, answers.logits.argmax(axis=0)) + answers.correction_rad
-    inside = decided_mask(answers, threshold)
+    inside = decided_mask(answers, scene, threshold)
     truth = scene.nearness + sample.missing_rad / joint
     true_mm, found_mm = part.depth_mm(truth)[target], part.depth_mm(scene.nearness + change / joint)[target]
     apart = np.abs(change - sample.missing_rad)[target]
@@ -172,9 +172,9 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
     invented background pixel are off by the same distance, each divided by the number of pixels of its kind."""
     costs = np.zeros(len(THRESHOLDS))
     for answer, sample in zip(answers, samples, strict=True):
-        object_px = max(int(sample.target.sum()), 1)
+        scene, object_px = sample.scene.single(), max(int(sample.target.sum()), 1)
         for number, threshold in enumerate(THRESHOLDS):
-            inside = decided_mask(answer, threshold)
+            inside = decided_mask(answer, scene, threshold)
             invented = (inside & ~sample.target & ~sample.void).sum()
             costs[number] += (sample.target & ~inside).sum() / object_px + invented / (pixels - object_px)
     return THRESHOLDS[int(costs.argmin())]

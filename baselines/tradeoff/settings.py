@@ -98,7 +98,8 @@ class PhotographedViews:
         return np.where(object_mask(row.depth_mm), np.asarray(row.depth_exact_mm), np.float32(0))
 
     def void(self, name: str) -> NDArray[np.bool_]:
-        return void_pixels(np.asarray(self._rows[name].flags))
+        row = self._rows[name]
+        return void_pixels(np.asarray(row.flags), row.depth_mm, row.depth_exact_mm)
 
     @cached_property
     def _rows(self) -> dict[str, Row]:

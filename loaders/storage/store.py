@@ -157,13 +157,17 @@ class DatasetFolder:
         return self._image(sample, DATA_GROUP, FLAGS)
 
     def void(self, sample: str) -> NDArray[np.bool_]:
-        """Pixels that count in no score, bool (H, W); see `loaders.sample.VOID`. None are in data without flags."""
-        return void_pixels(self.flags(sample)) if self.has_exact else np.zeros(self.size, dtype=bool)
+        """Pixels that count in no score, bool (H, W): those flagged so (`loaders.sample.VOID`), and surface that the
+        full sequence could not decode. None are in data without flags."""
+        if not self.has_exact:
+            return np.zeros(self.size, dtype=bool)
+        return void_pixels(self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT))
 
     def unlit_mm(self, sample: str) -> NDArray[np.float32]:
-        """Exact depth of the pixels that the camera sees and the projector does not light, float32 (H, W) in mm, 0
-        everywhere else. Raises `DatasetError` for data without flags."""
-        unlit = (self.flags(sample) & np.uint8(Flag.UNLIT)) != 0
+        """Exact depth of the surface that the camera sees and the projector does not light, or too weakly to decode it
+        from the full sequence, float32 (H, W) in mm, 0 everywhere else. Raises `DatasetError` for data without flags.
+        """
+        unlit = ((self.flags(sample) & np.uint8(Flag.UNLIT)) != 0) | ~object_mask(self.depth_mm(sample))
         return np.where(unlit, self.depth_mm(sample, DEPTH_EXACT), np.float32(0))
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:

@@ -32,6 +32,12 @@ def test_only_unlit_and_mixed_are_void():
     assert Flag.UNLIT | Flag.MIXED == VOID
 
 
+def test_surface_that_was_not_decoded_is_void_too():
+    flags = np.array([0, 0, 0, Flag.MIXED], np.uint8)
+    depth_mm, exact_mm = np.array([1800.0, 0.0, 0.0, 1800.0]), np.array([1800.5, 1800.5, 0.0, 1800.5])
+    assert void_pixels(flags, depth_mm, exact_mm).tolist() == [False, True, False, True]
+
+
 def test_they_count_in_no_set_and_their_share_is_reported(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
     for sample in dataset.samples("test"):  # whatever is predicted there
