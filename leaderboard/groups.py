@@ -29,7 +29,8 @@ EARLIER_PROTOCOL_NOTE = (
 ONE_FRAME, FEW_FRAMES, FULL_SEQUENCE = CLASSES = ("one frame", "few frames, no code", "full sequence")
 """What a method captures: at most one frame; several but no Gray code; frames with Gray code."""
 TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
-"""The benchmarks whose test splits make one row together."""
+COMPLETES = {UNSEEN: TEST, "fpp-bench-crossed-unseen": "fpp-bench-crossed"}
+"""Sets of unseen objects, and the benchmark whose test split each makes one row with."""
 
 
 def frames_class(frames_used: Sequence[int]) -> str:
@@ -59,10 +60,7 @@ class GroupKey:
     @classmethod
     def of(cls, result: Result) -> "GroupKey":
         data, frames = result.dataset, frames_class(result.submission.frames_used)
-        unseen, test = current_benchmark(UNSEEN), current_benchmark(TEST)
-        fingerprint = data.fingerprint
-        if unseen is not None and test is not None and (fingerprint, data.split) == (unseen.fingerprint, "test"):
-            fingerprint = test.fingerprint
+        fingerprint = _completed().get(data.fingerprint, data.fingerprint) if data.split == "test" else data.fingerprint
         return cls(
             frames, result.track, result.mode, data.split, result.target, fingerprint, (data.size[0], data.size[1]),
             result.edge_band_px, result.protocol_version,
@@ -71,8 +69,7 @@ class GroupKey:
     @property
     def takes_unseen(self) -> bool:
         """Whether a row of this group has a result on the unseen objects beside that on the test objects."""
-        test = current_benchmark(TEST)
-        return test is not None and (self.fingerprint, self.split) == (test.fingerprint, "test")
+        return self.split == "test" and self.fingerprint in _completed().values()
 
     @property
     def is_legacy(self) -> bool:
@@ -165,14 +162,19 @@ class Ranked:
         return {name: fmean(values) for name, values in views.items()}
 
     def on(self, benchmark: str) -> Entry | None:
-        """The part of it on `TEST` or `UNSEEN`."""
+        """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever their frames are."""
         parts = [entry for entry in (self.entry, self.unseen) if entry is not None]
         return next((e for e in parts if (_is_unseen(e) == (benchmark == UNSEEN))), None)
 
 
+def _completed() -> dict[str, str]:
+    """Fingerprints of the sets of unseen objects, and of the benchmark that each completes."""
+    pairs = ((current_benchmark(unseen), current_benchmark(test)) for unseen, test in COMPLETES.items())
+    return {unseen.fingerprint: test.fingerprint for unseen, test in pairs if unseen is not None and test is not None}
+
+
 def _is_unseen(entry: Entry) -> bool:
-    unseen = current_benchmark(UNSEEN)
-    return unseen is not None and entry.result.dataset.fingerprint == unseen.fingerprint
+    return entry.result.dataset.fingerprint in _completed()
 
 
 def joined(entries: Sequence[Entry]) -> tuple[Entry, Entry | None]:

@@ -12,7 +12,7 @@ from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 @dataclass(frozen=True)
 class Benchmark:
     """A named dataset: ``name``, ``version``, the SHA-256 ``fingerprint`` of its content (64 hex digits), and the
-    ``preset``, image ``size`` in px and ``light`` that build it."""
+    ``preset``, image ``size`` in px, ``light`` and ``rig`` that build it."""
 
     name: str
     version: int
@@ -20,6 +20,7 @@ class Benchmark:
     size: int
     fingerprint: str
     light: str = "paper"
+    rig: str = "paper"
 
     @property
     def title(self) -> str:
@@ -55,6 +56,23 @@ BENCHMARKS = (
         "23ee324d806d73b97d40e9ffe849f2be7e1efb61985312d9ea7adc03b8d10644",
         "hard",
     ),
+    # The same objects and views with crossed fringes.
+    Benchmark(
+        "fpp-bench-crossed",
+        1,
+        "full",
+        FULL_SIZE,
+        "526914ee31b78a34f41cd050f3e63707fa4eaf33824cdef43f80098a3721ba24",
+        rig="crossed",
+    ),
+    Benchmark(
+        "fpp-bench-crossed-unseen",
+        1,
+        "unseen",
+        FULL_SIZE,
+        "b197093e8930f767ccab588ea8772de7e1256f045a0239ff9013d3050fedc9bc",
+        rig="crossed",
+    ),
 )
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 EARLIER = (
@@ -86,7 +104,7 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     content = (manifest.settings, manifest.rig, manifest.stored)
     light = manifest.settings.get("light", {}).get("name")
     for benchmark in (benchmark for benchmark in BENCHMARKS if benchmark.light == light):
-        settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light)
+        settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
         if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
             return benchmark
     return None

@@ -32,7 +32,7 @@ def test_names_and_fingerprints_are_told_apart():
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
 def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
     manifest = assembly_of(
-        preset_settings(benchmark.preset, benchmark.size, benchmark.light)
+        preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
     ).manifest  # no rows yet: other bytes
     assert intended_benchmark(manifest) is benchmark
     as_expected, sentence = benchmark_sentence(manifest)
@@ -60,7 +60,7 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     assert "benchmark: a dataset of its own" in capsys.readouterr().out
     known = replace(BENCHMARKS[0], name="fpp-bench-tiny", fingerprint=manifest.fingerprint)
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
-    monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light: settings)
+    monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light, rig: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: this is fpp-bench-tiny version 1" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json"]) == 0
