@@ -150,9 +150,12 @@ def test_the_search_reaches_far_and_proposes_the_finest_of_the_safe():
     assert "none has at most" in none.reason and none.proposed is none.front[0]
 
 
-def test_the_crossed_rig_has_the_proposed_pair():
-    proposed = search(PAPER, Assumptions()).proposed.crossed
-    assert (CROSSED.pitches_px, CROSSED.angles_deg) == (proposed.pitches_px, proposed.angles_deg)
+def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_the_range():
+    (whole,) = describe(PAPER, [CROSSED], Assumptions())
+    (most,) = describe(PAPER.with_range((1500.0, 2050.0)), [CROSSED], Assumptions())
+    (paper,) = describe(PAPER, [Crossed((18.0, 18.0))], Assumptions())
+    assert most.rival_rad > 1.7 > 0.95 < whole.rival_rad and whole.background_rad > 0.85
+    assert whole.noise_mm == pytest.approx(paper.noise_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 4
 
 
 def test_what_can_not_be_searched_is_said():
