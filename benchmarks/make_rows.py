@@ -4,10 +4,13 @@
     python benchmarks/make_rows.py data/full --work rows-work
     fpp-bench build data/unseen --preset unseen
     python benchmarks/make_rows.py data/unseen --work rows-unseen --training data/full
+    fpp-bench build data/crossed --preset full --rig crossed
+    python benchmarks/make_rows.py data/crossed --work rows-crossed
     fpp-bench leaderboard --readme README.md
     fpp-bench leaderboard --page page
 
-A dataset without a training split is the set of unseen objects; its rows are called ``NAME-unseen.json``.
+A dataset without a training split is the set of unseen objects; its rows are called ``NAME-unseen.json``. One with
+crossed fringes has the methods for them.
 
 Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
 machine. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
@@ -59,6 +62,15 @@ METHODS: dict[str, tuple[object, ...]] = {
 compared with them. The middle of the range is the standoff, so it is no row of its own."""
 
 
+CROSSED: dict[str, tuple[object, ...]] = {
+    "crossed": ("crossed",),
+    "crossed-net": ("crossed-net",),
+    "crossed-constant-standoff": ("constant", "--at", "standoff"),
+    "crossed-constant-training-mean": ("constant", "--at", "training-mean"),
+}
+"""The same for datasets with crossed fringes; scored against the exact depth."""
+
+
 def run(command: str, *words: object) -> None:
     """Run a command; exit where it fails."""
     arguments = [str(word) for word in words]
@@ -71,12 +83,13 @@ def run(command: str, *words: object) -> None:
 def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None) -> None:
     """Predictions, time, result, row and picture of a setting."""
     predictions, result = work / name, work / f"{name}.json"
-    method, *options = METHODS[name]
+    method, *options = (METHODS | CROSSED)[name]
     options += ["--training", training] if training is not None and method == "nearest" else []
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
-    target = "depth_exact" if method == "classical" or name.endswith("-exact") else "depth"
+    exact = method == "classical" or name.endswith("-exact") or name in CROSSED
+    target = "depth_exact" if exact else "depth"
     run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--json", result)
     run("fpp-bench", "leaderboard", result, "--row", row, "--provenance", "measured here")
     write_sheet(read_result(result), DatasetFolder(dataset), predictions, row.with_suffix(".png"))
@@ -89,7 +102,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, help="dataset folder with all frames")
     parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
-    parser.add_argument("--only", nargs="+", choices=METHODS, metavar="NAME", help="only these rows")
+    parser.add_argument("--only", nargs="+", choices=METHODS | CROSSED, metavar="NAME", help="only these rows")
     parser.add_argument("--training", type=Path, help="for nearest: the dataset with the training split")
     parser.add_argument("--repeats", type=int, default=40, help="timed runs of each method")
     args = parser.parse_args()
@@ -97,8 +110,9 @@ def main() -> None:
         parser.error(f"{args.work} is not empty")
     args.work.mkdir(parents=True, exist_ok=True)
     args.out.mkdir(parents=True, exist_ok=True)
-    suffix = "" if "train" in DatasetFolder(args.dataset).splits else "-unseen"
-    for name in args.only or METHODS:
+    opened = DatasetFolder(args.dataset)
+    suffix = "" if "train" in opened.splits else "-unseen"
+    for name in args.only or (METHODS if opened.rig.crossed is None else CROSSED):
         row = args.out / f"{name}{suffix}.json"
         make_row(args.dataset, args.work, row, name, args.repeats, args.training)
 

@@ -83,6 +83,11 @@ def _phase_net(submission: Submission) -> str:
     return f"{printable(submission.settings['weights'])}, 1 {_direction(submission)}{shading}"
 
 
+def _crossed(submission: Submission) -> str:
+    frames = "1 frame" if len(submission.frames_used) == 1 else "mean of 2"
+    return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
+
+
 def _network(submission: Submission) -> str:
     settings = submission.settings
     network = _NETWORKS[str(settings["network"])]
@@ -111,5 +116,7 @@ _METHODS = {
     "classical": ("Classical ", _classical),
     "phase": ("Phase route, ", _phase),
     "phase-net": ("Phase route, ", _phase_net),
+    "crossed": ("Crossed fringes ", _crossed),
+    "crossed-net": ("Crossed fringes, ", _crossed),
 }
 """How the names of each method's submissions begin, and what makes the short name."""

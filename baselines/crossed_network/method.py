@@ -1,6 +1,7 @@
 """crossed-net as a method of ``fpp-bench predict``: one crossed frame, metric depth, nothing told."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks import torch_threads
 from fpp_ml_bench.baselines.phase_network import NetFile, load_net
 from fpp_ml_bench.baselines.phase_route import Periods
+from fpp_ml_bench.baselines.training import NetConfig
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import Rig
 
@@ -46,7 +48,7 @@ class CrossedNetMethod(Method):
         self.route = CrossedNetRoute(
             rig, self.file.network, config.threshold, config.lead, Settings(min_confidence), periods
         )
-        self.weights_config = config
+        self.weights_config: NetConfig = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         more = "" if config.name == DEFAULT else f" ({config.name})"
@@ -55,6 +57,13 @@ class CrossedNetMethod(Method):
             "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
             "mask_threshold": config.threshold, "order_lead": config.lead, "threads": threads,
         }  # fmt: skip
+
+    @property
+    def learned_from(self) -> dict[str, Any]:
+        """Views that its training renders of the training objects."""
+        recipe = self.weights_config.recipe
+        lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
+        return {"data": "generated", "versions": [lights]}
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""

@@ -124,7 +124,8 @@ def train_crossed_net(
     config = training.NetConfig(
         name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
         options=network.options, threshold=threshold, lead=lead, period_px={"crossed": carriers.period_px},
-        dataset_fingerprint=fingerprint, steps=recipe.steps, recipe=described, validation=dict(means),
+        dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("crossed-net views", 1),
+        steps=recipe.steps, recipe=described, validation=dict(means),
     )  # fmt: skip
     save_net(weights, network, config)
     (out / training.CHECKPOINT).unlink(missing_ok=True)
