@@ -130,7 +130,8 @@ def _digest(condition: Condition, frames: tuple[int, ...]) -> str:
     described = condition.settings.describe()
     del described["objects"]
     moving = frames if described["light"]["motion_mm"] else ()
-    text = json.dumps([__version__, condition.size, described, moving], sort_keys=True)
+    rig = [] if condition.rig == "paper" else [condition.rig]
+    text = json.dumps([__version__, condition.size, described, moving, *rig], sort_keys=True)
     return blake2b(text.encode(), digest_size=8).hexdigest()
 
 

@@ -92,6 +92,14 @@ def test_a_frame_is_that_of_the_dataset_whatever_else_is_asked_for():
     assert np.array_equal(clean[0], frames(CLEAN, 0)[0]) and clean[1] is None and clean[18] is not None
 
 
+def test_frames_of_two_rigs_are_kept_apart(tmp_path):
+    plain, crossed = condition(CLEAN, 0), Condition(CLEAN, 0, (OBJECT,), SIZE, "crossed")
+    assert plain.key(ONE_FRAME) != crossed.key(ONE_FRAME)
+    cache = FrameCache(tmp_path)
+    first, second = (cache.frames(one, OBJECT, "A0", ONE_FRAME)[0] for one in (plain, crossed))
+    assert not np.array_equal(first, second)
+
+
 def test_read_noise_is_in_grey_levels():
     camera = RULES.axes["read-noise"].light(RULES.clean, 3).camera
     assert camera.read_noise_e / (camera.full_well_e / 255) == pytest.approx(4)
