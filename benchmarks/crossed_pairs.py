@@ -16,7 +16,7 @@ from fpp_ml_bench.coding import Crossed
 from fpp_ml_bench.constants import MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import VOID
-from fpp_ml_bench.optics import crossed_rig, paper_rig
+from fpp_ml_bench.optics import paper_rig
 
 PAIRS = (
     "18,18,0,90", "18,14,0,90", "18,18,144.6,54.6", "14,14,142.7,52.7", "16,18,25,105", "18,27,25,160", "10,12,30,75",
@@ -35,7 +35,7 @@ def main() -> int:
     for text in args.pair or PAIRS:
         first, second, angle, other = map(float, text.split(","))
         family = Crossed((first, second), (angle, other))
-        rig = paper_rig().with_crossed(family) if family != crossed_rig().crossed else crossed_rig()
+        rig = paper_rig().with_crossed(family)
         route = CrossedRoute(rig)
         light = render.load_light(args.light)
         studio = render.Studio(render.BuildSettings(rig, tuple(objects), light=light))

@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
 from fpp_ml_bench.baselines.crossed_route import (
+    JUMP_RAD,
     Carriers,
     CrossedMeasurement,
     CrossedObservation,
@@ -30,7 +31,6 @@ from fpp_ml_bench.baselines.phase_route import (
 from fpp_ml_bench.optics import Rig
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
-JUMP_RAD = 2.5  # jump of the joint phase between neighbours from which on it costs no more
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
 PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders
 LEAST_CHANCE = 1e-6  # of a wrong order, whatever the network answers
@@ -58,8 +58,13 @@ def network_answers(network: PhaseNet, scene: Scene, carriers: Carriers, lead: f
     with torch.inference_mode():
         batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
         order, inside, correction, scale = (out[0, ..., :height, :width].numpy() for out in network(batch))
-    order = order + np.array([0, lead, 0], np.float32)[:, None, None]
-    return Answers(np.where(exists, order, -np.inf), inside, correction, SCALE_TO_SIGMA * np.exp(scale))
+    answers = Answers(np.where(exists, order, -np.inf), inside, correction, SCALE_TO_SIGMA * np.exp(scale))
+    return with_lead(answers, lead)
+
+
+def with_lead(answers: Answers, lead: float) -> Answers:
+    """``answers`` with ``lead`` added to the base's logit."""
+    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:

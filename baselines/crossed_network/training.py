@@ -17,11 +17,11 @@ import numpy as np
 
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.crossed_network.route import Answers, decided_mask, network_answers
+from fpp_ml_bench.baselines.crossed_network.route import Answers, decided_mask, network_answers, with_lead
 from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, samples_of
 from fpp_ml_bench.baselines.crossed_network.views import Group, groups_of, read, render
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedRoute
-from fpp_ml_bench.baselines.phase_network import PhaseNet, WindowRecipe, WindowTraining, load_net, save_net
+from fpp_ml_bench.baselines.phase_network import TYPICAL_MM, PhaseNet, WindowRecipe, WindowTraining, load_net, save_net
 from fpp_ml_bench.baselines.phase_route import of_choice
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.optics import Rig, crossed_rig
@@ -30,8 +30,7 @@ WEIGHTS, VIEWS = "crossed-net.safetensors", "views"
 THRESHOLDS = tuple(float(value) for value in np.arange(-6, 2.01, 0.5))
 """Mask logits that are tried on the validation views."""
 LEADS = tuple(float(value) for value in range(6))
-TYPICAL_MM, TOLERANCE_MM = 1800.0, 0.3
-"""Depth error that a missed or invented pixel counts with; sums of errors this close to the least count as equal."""
+TOLERANCE_MM = 0.3  # sums of object and background error this close to the least count as equal
 VALIDATED_SHARE = 3  # every so many-th validation view is scored during training
 
 
@@ -136,12 +135,6 @@ def train_crossed_net(
 
 def _described(groups: list[Group]) -> list[Any]:
     return [[group.name, group.split, group.light.model_dump(mode="json"), group.views] for group in groups]
-
-
-def with_lead(answers: Answers, lead: float) -> Answers:
-    """``answers`` with ``lead`` added to the base's logit."""
-    added = np.array([0, lead, 0], np.float32)[:, None, None]
-    return Answers(answers.logits + added, answers.object_logit, answers.correction_rad, answers.sigma_rad)
 
 
 def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float]:

@@ -6,5 +6,6 @@ from .observation import CrossedMeasurement as CrossedMeasurement
 from .observation import CrossedObservation as CrossedObservation
 from .observation import CrossedReason as CrossedReason
 from .observation import Settings as Settings
+from .orders import JUMP_RAD as JUMP_RAD
 from .refinement import fringes as fringes
 from .route import CrossedRoute as CrossedRoute

@@ -7,6 +7,7 @@ working range; `Carriers.depth_mm` corrects it.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,7 +84,7 @@ class Carriers:
         """The longer of `periods_px`: windows have a size in it."""
         return float(self.periods_px.max())
 
-    @property
+    @cached_property
     def joint_gain(self) -> Image:
         """Change in rad of both phases together, as the length of a vector, a unit of q, (h, w)."""
         return np.hypot(*self.gain)  # type: ignore[no-any-return]

@@ -1,6 +1,7 @@
 """The route: frame -> both carriers -> mask -> candidates -> order -> fit of the nearness -> depth and its reasons."""
 
 from dataclasses import replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -181,6 +182,11 @@ class CrossedRoute:
         )  # fmt: skip
         return self._restored(measured) if self.resampling.needed else measured
 
+    @cached_property
+    def _captured(self) -> Carriers:
+        """The carriers of the captured images."""
+        return Carriers.of(self.resampling.captured, self.family)
+
     def _restored(self, measured: CrossedMeasurement) -> CrossedMeasurement:
         """The measurement in the size of the captured image."""
         joint, known = self.carriers.joint_gain, measured.depth_mm > 0
@@ -188,7 +194,7 @@ class CrossedRoute:
         # The joint gain changes slowly over the image: its middle will do as a unit.
         unit = float(np.median(joint))
         on_object, psi, nearest = self.resampling.restored_phase((nearness * unit).astype(np.float64), known)
-        depth_mm = Carriers.of(self.resampling.captured, self.family).depth_mm(psi / unit)
+        depth_mm = self._captured.depth_mm(psi / unit)
 
         def restored(values: Image) -> Image:
             return np.where(on_object, nearest(values), 0).astype(np.float32)

@@ -13,7 +13,9 @@ from .route import Levers as Levers
 from .route import NetworkRoute as NetworkRoute
 from .samples import companions as companions
 from .samples import united as united
+from .training import TYPICAL_MM as TYPICAL_MM
 from .training import Recipe as Recipe
+from .training import Trained as Trained
 from .training import train_phase_net as train_phase_net
 from .window_training import WindowRecipe as WindowRecipe
 from .window_training import WindowTraining as WindowTraining

@@ -30,7 +30,7 @@ THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
 LEADS = tuple(float(value) for value in range(8))
 """Leads of the base order (see `network_answers`) that are tried on the validation split."""
-_TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
+TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
 """Depth error that a missed or invented pixel counts with; errors this close to the least count as equal."""
 
 
@@ -118,7 +118,7 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
         for number, threshold in enumerate(THRESHOLDS):
             is_object = decided_mask(answer, scene, threshold)
             missed, invented = (sample.target & ~is_object).sum(), (is_object & ~sample.target).sum()
-            costs[number] += _TYPICAL_MM * (missed / inside + invented / (pixels - inside))
+            costs[number] += TYPICAL_MM * (missed / inside + invented / (pixels - inside))
     means = costs / len(samples)
     return THRESHOLDS[int(np.flatnonzero(means < means.min() + _TOLERANCE_MM)[0])]
 

@@ -81,14 +81,7 @@ def _phase_net(args: argparse.Namespace) -> int:
         recipe, args.dataset, args.out, extra=args.extra, start=args.start, minutes=args.minutes, show=True,
         print_line=print,
     )  # fmt: skip
-    if trained.weights is None:
-        done = f"{trained.steps} of {recipe.steps} steps"
-        print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")
-        return CHECK_FAILED
-    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
-    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-    print(f"next: fpp-bench predict phase-net {args.dataset} --weights {trained.weights} --out predictions")
-    return 0
+    return _window_training_said(args, recipe.steps, trained)
 
 
 def _crossed_net(args: argparse.Namespace) -> int:
@@ -103,11 +96,19 @@ def _crossed_net(args: argparse.Namespace) -> int:
     trained = crossed_network.train_crossed_net(
         recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
     )  # fmt: skip
+    return _window_training_said(args, recipe.steps, trained)
+
+
+def _window_training_said(
+    args: argparse.Namespace, steps: int, trained: "phase_network.Trained | crossed_network.Trained"
+) -> int:
+    """Print how the training of phase-net or crossed-net ended; the exit status."""
     if trained.weights is None:
-        done = f"{trained.steps} of {recipe.steps} steps"
+        done = f"{trained.steps} of {steps} steps"
         print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")
         return CHECK_FAILED
     scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
     print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-    print(f"next: fpp-bench predict crossed-net DATASET --weights {trained.weights} --out predictions")
+    dataset = args.dataset or "DATASET"
+    print(f"next: fpp-bench predict {args.recipe} {dataset} --weights {trained.weights} --out predictions")
     return 0

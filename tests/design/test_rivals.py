@@ -154,7 +154,7 @@ def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_
     (whole,) = describe(PAPER, [CROSSED], Assumptions())
     (most,) = describe(PAPER.with_range((1500.0, 2050.0)), [CROSSED], Assumptions())
     (paper,) = describe(PAPER, [Crossed((18.0, 18.0))], Assumptions())
-    assert most.rival_rad > 1.7 > 0.95 < whole.rival_rad and whole.background_rad > 0.85
+    assert most.rival_rad > 1.7 and whole.rival_rad > 0.95 and whole.background_rad > 0.85
     assert whole.noise_mm == pytest.approx(paper.noise_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 4
 
 
