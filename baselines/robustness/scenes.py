@@ -21,7 +21,7 @@ from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corrupt
 from fpp_ml_bench.baselines.robustness.scores import Truth
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.render import BuildSettings, SolidMesh, Studio, solid_mesh
 from fpp_ml_bench.optics import NAMED_RIGS
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
@@ -82,7 +82,7 @@ class FrameCache:
                 missing.append(index)
         if not missing:
             return out
-        mesh = solid_mesh(name)
+        mesh = _mesh(name)
         if studio.light.motion_mm:
             middle = (len(wanted) - 1) / 2
             studio.expose_moving(mesh, view, {index: wanted.index(index) - middle for index in missing})
@@ -100,7 +100,7 @@ class FrameCache:
         file = self._file(clean, (), f"{sample_name(name, view)}-truth")
         kept = _load(file, (2, *shape), np.dtype(np.float32))
         if kept is None:
-            scene = studio.trace(solid_mesh(name), view)
+            scene = studio.trace(_mesh(name), view)
             depth_mm = np.zeros(shape, dtype=np.float32)
             depth_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
             truth = Truth.of(depth_mm, studio.flags(scene)[0])
@@ -133,6 +133,12 @@ def _digest(condition: Condition, frames: tuple[int, ...]) -> str:
     rig = [] if condition.rig == "paper" else [condition.rig]
     text = json.dumps([__version__, condition.size, described, moving, *rig], sort_keys=True)
     return blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+@lru_cache(maxsize=max(map(len, SETS.values())))
+def _mesh(name: str) -> SolidMesh:
+    """An object of a set; what its light takes from the mesh alone is kept with it."""
+    return solid_mesh(name)
 
 
 @lru_cache(maxsize=2)

@@ -1,6 +1,7 @@
 """The light of a scene: what the projector, its further bounces and other lamps give to the object and the plane."""
 
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +24,12 @@ from fpp_ml_bench.loaders.render.textures import material_of
 from fpp_ml_bench.optics import Rig
 from fpp_ml_bench.skipping import skipping_enabled
 
+_SURFELS: WeakKeyDictionary[SolidMesh, Surfels] = WeakKeyDictionary()
+"""Surfels live as long as their mesh, for its other views and lights."""
+
 
 class Lighting:
-    """A light in a rig's empty scene, the background plane, ready for objects. The latest object's surfels are kept
-    for its other views."""
+    """A light in a rig's empty scene, the background plane, ready for objects."""
 
     def __init__(self, rig: Rig, light: Light, pattern: PatternLight) -> None:
         self.rig, self.light, self.pattern = rig, light, pattern
@@ -36,7 +39,6 @@ class Lighting:
         self._empty = self._plane()
         self.modes, self.mix = pattern.modes(rig.sequence)
         self._returned = PlaneLight.of(rig, light, self.modes) if light.bounces.interreflection else None
-        self._surfels: tuple[SolidMesh, Surfels] | None = None
 
     def _plane(self, occluder: TracedObject | None = None) -> LitPixels:
         return light_surface(self._points_m, self._normals, self.rig, self.light, self.pattern, occluder=occluder)
@@ -68,9 +70,9 @@ class Lighting:
         """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be ``traced``."""
         surfels = None
         if self.light.bounces.interreflection or self.light.bounces.ambient_occlusion:
-            if self._surfels is None or self._surfels[0] is not mesh:
-                self._surfels = mesh, Surfels.of(mesh)
-            surfels = self._surfels[1]
+            surfels = _SURFELS.get(mesh)
+            if surfels is None:
+                surfels = _SURFELS[mesh] = Surfels.of(mesh)
         upon = ObjectLight(self, mesh, traced, degrees, offset_m, surfels, None)
         if surfels is None or self._returned is None:
             return upon

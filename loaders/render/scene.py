@@ -162,10 +162,10 @@ def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> floa
     return exposure * camera.reference_grey / 2 * (rig.working_range_mm[0] / depth_mm) ** 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SolidMesh:
     """Triangles of one object: ``vertices_m`` float64 (V, 3) in object coordinates, ``faces`` int32 (F, 3), and the
-    albedo of its own that a user's mesh may have, by triangle."""
+    albedo of its own that a user's mesh may have, by triangle. Equal to itself alone."""
 
     name: str
     vertices_m: NDArray[np.float64]

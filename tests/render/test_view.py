@@ -336,12 +336,23 @@ def test_stages_that_are_off_are_not_asked(monkeypatch):
         monkeypatch.setattr(module, name, never)
     for name in ("mixed_pixels", "blur_image", "vignetting"):
         monkeypatch.setattr(view, name, never)
-    studio(rig=SMALL).photograph(BALL, "A0")
+    ball = replace(BALL)  # nothing is kept of this one
+    studio(rig=SMALL).photograph(ball, "A0")
     for light in (DIRECT.changed("bounces", interreflection=True), DIRECT.changed("bounces", ambient_occlusion=True),
                   DIRECT.changed("camera", rays_across=2), DIRECT.changed("camera", blur_px=1.0),
                   DIRECT.changed("camera", falloff=2)):  # fmt: skip
         with pytest.raises(AssertionError, match="a stage that is off"):
-            studio(light, rig=SMALL).photograph(BALL, "A0")
+            studio(light, rig=SMALL).photograph(ball, "A0")
+
+
+def test_an_object_is_cut_into_surfels_once_for_all_its_views_and_lights(monkeypatch):
+    made, of = [], lighting.Surfels.of
+    monkeypatch.setattr(lighting.Surfels, "of", lambda mesh: made.append(mesh) or of(mesh))
+    ball = replace(BALL)
+    for light in (named_light("paper"), named_light("workshop")):
+        for degrees in ("A0", "A60"):
+            studio(light, rig=SMALL).photograph(ball, degrees)
+    assert made == [ball]
 
 
 @pytest.mark.parametrize("stored", ["single_shot", "all"])
