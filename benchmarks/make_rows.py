@@ -13,7 +13,7 @@ A dataset without a training split is the set of unseen objects; its rows are ca
 crossed fringes has the methods for them.
 
 Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
-machine. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
+machine. Phase reliance and robustness, which other commands measured, stay in the row of a method that has not changed. Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself
 decoded from the full sequence, the phase routes against ``depth``, as the paper's networks are, the trivial ones
 against both.
 """
@@ -27,6 +27,8 @@ from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.evaluation.report import write_sheet
 from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.leaderboard.measured import write_reliance, write_robustness
+from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 ROWS = Path(__file__).resolve().parent.parent / "leaderboard" / "rows"
@@ -91,8 +93,26 @@ def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, trai
     exact = method == "classical" or name.endswith("-exact") or name in CROSSED
     target = "depth_exact" if exact else "depth"
     run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--json", result)
+    before = read_entry(row) if row.exists() else None
     run("fpp-bench", "leaderboard", result, "--row", row, "--provenance", "measured here")
+    keep_measured(before, row)
     write_sheet(read_result(result), DatasetFolder(dataset), predictions, row.with_suffix(".png"))
+
+
+def keep_measured(before: Entry | None, row: Path) -> None:
+    """Write the reliance and robustness of ``before`` into the row again, if it is of the same method."""
+    if before is None or _method_of(before) != _method_of(read_entry(row)):
+        return
+    if before.result.reliance is not None:
+        write_reliance(read_entry(row), before.result.reliance)
+    for block in (before.result.robustness or {}).values():
+        write_robustness(read_entry(row), block)
+
+
+def _method_of(entry: Entry) -> tuple[object, ...]:
+    about = entry.result.submission
+    settings = {key: value for key, value in about.settings.items() if key != "threads"}
+    return about.method, about.frames_used, about.units, settings
 
 
 def main() -> None:
