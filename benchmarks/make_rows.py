@@ -13,9 +13,10 @@ A dataset without a training split is the set of unseen objects; its rows are ca
 crossed fringes has the methods for them.
 
 Every step is a command of the package, printed before it runs. The same data gives the same scores; times depend on the
-machine. Phase reliance and robustness, which other commands measured, stay in the row of a method that has not changed. Rows are scored on the test split: the classical method against the
-exact depth, because ``depth`` is itself decoded from the full sequence, the phase routes against ``depth``, as the
-paper's networks are, the trivial ones against both.
+machine. Phase reliance and robustness, which other commands measured, stay in the row of a method that has not changed.
+
+Rows are scored on the test split: the classical method against the exact depth, because ``depth`` is itself decoded
+from the full sequence, the phase routes against ``depth``, as the paper's networks are, the trivial ones against both.
 """
 
 import argparse
