@@ -39,7 +39,8 @@ class Scene:
     sigmas, 0 where no plane is ``shown``; ``inside``: mask of the measured route; ``nearness`` float32: of the fit;
     ``share``: of its window that lies on the object; ``window_rad`` (2): phases of the first windows less the fit's;
     ``modulation`` (2) of these, over that of the fit; ``step_rad`` (2): joint phase of a turn further and nearer, less
-    the base's; ``misfit_rad`` (3) and ``exists`` (3): of further, base and nearer; ``contrast`` of both carriers."""
+    the base's; ``misfit_rad`` (3) and ``exists`` (3): of further, base and nearer; ``contrast`` of both carriers;
+    ``strength``: the object's median modulation in sigmas of the noise."""
 
     crop: Crop
     light: Image
@@ -55,6 +56,7 @@ class Scene:
     misfit_rad: Image
     exists: Mask
     contrast: tuple[float, float]
+    strength: float
 
     @classmethod
     def of(cls, seen: CrossedObservation) -> "Scene":
@@ -76,6 +78,7 @@ class Scene:
             window_rad=wrapped(seen.phase_rad - carriers.phases(fit.nearness)).astype(np.float32),
             modulation=np.clip(np.stack(modulation), 0, 4).astype(np.float32), step_rad=steps.astype(np.float32),
             misfit_rad=found.misfit_rad, exists=found.exists, contrast=seen.contrast,
+            strength=float(level * np.mean(seen.contrast) / background.noise_grey),
         )  # fmt: skip
 
     def window(self, rows: slice, columns: slice) -> "Scene":

@@ -10,7 +10,7 @@ import pytest
 from fpp_ml_bench.baselines import load_method
 from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, train_crossed_net, training, views
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
-from fpp_ml_bench.baselines.crossed_network.route import Answers, CrossedNetRoute
+from fpp_ml_bench.baselines.crossed_network.route import Answers, CrossedNetRoute, decided_mask, threshold_in
 from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of, samples_of
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network import IGNORED, load_net
@@ -176,3 +176,16 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert not sample_of(view, route()).target.any()
     with pytest.raises(TrainingError, match=r"delete it"):
         next(views.read(tmp_path, GROUPS, "train"))
+
+
+def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:
+    scene = samples[0].scene.single()
+    assert scene.strength > 25  # the light paper
+    limits = [threshold_in(replace(scene, strength=strength), -0.5) for strength in (0.0, 5.0, 20.0, 40.0, 200.0)]
+    assert limits == pytest.approx([-2.0, -2.0, -0.5, 1.0, 1.0])
+    logit = np.full(scene.inside.shape, -1.0, np.float32)
+    answers = Answers(np.zeros((3, *logit.shape), np.float32), logit, 0 * logit, 0 * logit)
+    outside = ~scene.inside
+    assert decided_mask(answers, replace(scene, strength=5.0), -0.5).all()
+    assert not decided_mask(answers, replace(scene, strength=50.0), -0.5)[outside].any()
+    assert np.array_equal(decided_mask(answers, scene, -0.5), scene.inside)  # what was measured stays
